@@ -1,0 +1,1 @@
+"""CaRTS: correct a robot's kinematics from what its camera sees."""

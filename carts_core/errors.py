@@ -1,0 +1,24 @@
+"""The errors that the project raises on purpose.
+
+Each message says what was given, what is allowed and what to do.
+"""
+
+
+class CartsError(Exception):
+    """Root of every error that is meant to be read by a person."""
+
+
+class RobotError(CartsError):
+    """A URDF, one of its meshes or a joint name is not usable."""
+
+
+class SequenceError(CartsError):
+    """A sequence file, or something it points at, is not usable."""
+
+
+class WeightsError(CartsError):
+    """A weights file is missing, unreadable or of another network."""
+
+
+class SettingsError(CartsError):
+    """A setting is out of its range or contradicts another one."""

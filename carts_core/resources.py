@@ -1,0 +1,35 @@
+"""Where the shipped files are: beside the packages in a checkout, inside `carts_core` in a wheel."""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _shipped(name: str) -> Path:
+    inside_wheel = _PACKAGE / name
+    return inside_wheel if inside_wheel.is_dir() else _PACKAGE.parent / name
+
+
+def sample_data_dir() -> Path:
+    """Folder with the shipped robot, sequence and weights."""
+    return _shipped("sample_data")
+
+
+def static_dir() -> Path:
+    """Folder with what the page serves: script, style, help, icons."""
+    return _shipped("static")
+
+
+def sample_sequence() -> Path:
+    """The shipped sequence file."""
+    return sample_data_dir() / "sequence" / "sequence.toml"
+
+
+def shipped_robot() -> Path:
+    """URDF of the shipped PSM with a Large Needle Driver."""
+    return sample_data_dir() / "robots" / "psm_lnd" / "psm_lnd.urdf"
+
+
+def shipped_weights() -> Path:
+    """Weights of the shipped feature network."""
+    return sample_data_dir() / "weights" / "features.safetensors"
