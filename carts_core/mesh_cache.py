@@ -1,0 +1,63 @@
+"""Decimated link meshes on disk, so that a robot loads slowly only once."""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from .meshes import LinkMesh
+
+_VERSION = 1
+
+
+def cache_dir() -> Path:
+    """Folder of the cache: `$CARTS_CACHE`, else `$XDG_CACHE_HOME/carts`, else `~/.cache/carts`."""
+    if configured := os.environ.get("CARTS_CACHE"):
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "carts"
+
+
+def fingerprint(files: Iterable[Path], *settings: object) -> str:
+    """Key that changes when a file's content, a setting or the cache's format changes."""
+    digest = hashlib.sha256(repr((_VERSION, settings)).encode())
+    for file in files:
+        digest.update(str(file.name).encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def read(key: str) -> tuple[LinkMesh, ...] | None:
+    """Meshes stored under `key`, or None when there are none (or the file is damaged)."""
+    try:
+        with np.load(cache_dir() / f"{key}.npz", allow_pickle=False) as stored:
+            return tuple(
+                LinkMesh(
+                    int(stored[f"{i}_link"]),
+                    stored[f"{i}_vertices"],
+                    stored[f"{i}_normals"],
+                    stored[f"{i}_faces"],
+                    stored[f"{i}_color"],
+                )
+                for i in range(int(stored["count"]))
+            )
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def write(key: str, meshes: tuple[LinkMesh, ...]) -> None:
+    """Store `meshes` under `key`; a cache that cannot be written is no error."""
+    arrays: dict[str, np.ndarray] = {"count": np.array(len(meshes))}
+    for i, mesh in enumerate(meshes):
+        for field in ("link", "vertices", "normals", "faces", "color"):
+            arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
+    try:
+        folder = cache_dir()
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as handle:
+            np.savez(handle, allow_pickle=False, **arrays)
+        os.replace(handle.name, folder / f"{key}.npz")
+    except OSError:
+        return
