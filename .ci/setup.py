@@ -1,0 +1,134 @@
+"""Create .venv and install the project into it, once: a stamp file decides, so that a second run needs no network.
+
+Usage: python3 .ci/setup.py [--dev]
+
+Only the standard library is used, and the first lines run on any Python 3, so that an interpreter that is too old
+gets a sentence instead of a syntax error.
+
+TORCH_INDEX chooses where torch comes from: a package index URL, or `pypi`. Without it, a Linux machine with no NVIDIA
+driver takes the CPU build from PyTorch's own index, because the one on PyPI brings gigabytes of CUDA libraries.
+"""
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+VENV_PYTHON = VENV / "bin" / "python"
+OLDEST = (3, 11)
+TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+WARMUP = "carts_core.rendering.warmup"
+
+
+def say(text):
+    print("[setup] " + text, flush=True)
+
+
+def run(*command):
+    """Run a command; stop with its status, and without a traceback, where it fails."""
+    status = subprocess.call([str(part) for part in command], cwd=str(ROOT))
+    if status != 0:
+        sys.exit("[setup] failed (exit status {}): {}".format(status, " ".join(str(part) for part in command)))
+
+
+def output(*command):
+    """What a command prints, or None where it cannot be run."""
+    try:
+        return subprocess.check_output([str(part) for part in command], stderr=subprocess.DEVNULL).decode().strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def require_a_recent_python():
+    """Hand over to a newer interpreter on the PATH where this one is too old."""
+    if sys.version_info >= OLDEST:
+        return
+    for name in ("python3.13", "python3.12", "python3.11", "python3.14"):
+        newer = shutil.which(name)
+        if newer:
+            say("{} is Python {}; using {}".format(sys.executable, platform.python_version(), newer))
+            os.execv(newer, [newer] + sys.argv)
+    sys.exit(
+        "[setup] Python {} was found at {}, but CaRTS needs {}.{} or newer. Install one and name it, for example:\n"
+        "        make view PYTHON=python3.12".format(platform.python_version(), sys.executable, *OLDEST)
+    )
+
+
+def create_venv():
+    """Create .venv, or create it anew where its interpreter is gone or too old (an upgraded system)."""
+    version = output(VENV_PYTHON, "-c", "import sys; print(*sys.version_info[:2])")
+    if version is not None and tuple(int(part) for part in version.split()) >= OLDEST:
+        return
+    say("creating {} with Python {}".format(VENV, platform.python_version()))
+    if output(sys.executable, "-c", "import ensurepip") is None:
+        # Debian and Ubuntu package venv's half of Python apart from the interpreter.
+        package = "python{}.{}-venv".format(*sys.version_info[:2])
+        if subprocess.call([str(ROOT / ".ci" / "apt"), package]) != 0:
+            sys.exit("[setup] this Python cannot create virtual environments; run: sudo apt-get install " + package)
+    run(sys.executable, "-m", "venv", "--clear", VENV)
+
+
+def stamp(extras):
+    """The file whose presence says that exactly this was installed, by this interpreter, from this folder."""
+    digest = hashlib.sha256()
+    for name in ("pyproject.toml", "constraints.txt", ".ci/setup.py"):
+        digest.update((ROOT / name).read_bytes())
+    digest.update(str(output(VENV_PYTHON, "-VV")).encode())
+    digest.update(str(ROOT).encode())
+    digest.update(os.environ.get("TORCH_INDEX", "").encode())
+    return VENV / ".installed-{}-{}".format(extras or "base", digest.hexdigest()[:16])
+
+
+def torch_index():
+    """The index to take torch from, or None for pip's own default."""
+    chosen = os.environ.get("TORCH_INDEX", "")
+    if chosen:
+        return None if chosen == "pypi" else chosen
+    has_nvidia = Path("/proc/driver/nvidia").exists() or shutil.which("nvidia-smi")
+    if sys.platform != "linux" or has_nvidia:
+        return None
+    try:
+        # Asked for first, since pip would retry an index that is out of reach for minutes.
+        urllib.request.urlopen(TORCH_CPU_INDEX + "/torch/", timeout=5).close()
+    except (OSError, ValueError):
+        say("{} cannot be reached; torch comes from pip's default index".format(TORCH_CPU_INDEX))
+        return None
+    return TORCH_CPU_INDEX
+
+
+def install(extras):
+    pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "-c", "constraints.txt")
+    index = torch_index()
+    if index is not None:
+        say("torch comes from {}".format(index))
+        run(*pip, "--no-deps", "--index-url", index, "torch")
+    run(*pip, "-e", ".[{}]".format(extras) if extras else ".")
+    if (ROOT / (WARMUP.replace(".", "/") + ".py")).is_file():
+        say("compiling the kernels, so that the first page does not wait for them")
+        run(VENV_PYTHON, "-m", WARMUP)
+
+
+def main():
+    if sys.argv[1:] not in ([], ["--dev"]):
+        sys.exit(__doc__)
+    extras = "dev" if "--dev" in sys.argv else ""
+    require_a_recent_python()
+    create_venv()
+    done = stamp(extras)
+    # Whoever has the development tools has everything else as well.
+    if done.exists() or stamp("dev").exists():
+        return
+    say("installing CaRTS into {} (some minutes and about 2 GB, only this once)".format(VENV))
+    install(extras)
+    done.touch()
+    say("installed")
+
+
+if __name__ == "__main__":
+    main()

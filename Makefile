@@ -1,0 +1,51 @@
+# Everything starts here; `make` alone lists it. Settings:
+#   PYTHON       the interpreter that .venv is created with (3.11 or newer)
+#   TORCH_INDEX  where torch comes from: an index URL, or `pypi`; see .ci/setup.py for the default
+#   SEQUENCE     what `make view` opens; the shipped sample without it
+#   ARGS         further arguments of `carts view` or pytest
+
+PYTHON ?= python3
+BIN := .venv/bin
+# pyright asks the network for a newer version of itself, unless told not to.
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help view test lint format bench wheel setup setup-dev clean
+
+help: ## List these targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+view: setup ## Open the shipped sequence in the browser (or SEQUENCE=path/to/sequence.toml)
+	@$(BIN)/carts view $(SEQUENCE) $(ARGS)
+
+test: setup-dev ## Check the style and run the tests, browser included
+	$(BIN)/ruff check
+	chromium=$$($(BIN)/python .ci/chromium.py) && \
+	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m "not slow and not gpu" $(ARGS)
+
+lint: setup-dev ## Check style, formatting and types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+format: setup-dev ## Format the code and fix what can be fixed
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+bench: setup-dev ## Run the slow tests and print the measurements
+	chromium=$$($(BIN)/python .ci/chromium.py) && \
+	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m slow $(ARGS)
+	$(BIN)/python -m carts_core.bench
+	$(BIN)/python -m carts_viewer.bench
+
+wheel: setup-dev ## Build the sdist and the wheel into dist/
+	$(BIN)/python -m hatchling build -t sdist -t wheel
+
+setup: ## Install into .venv, if that was not done yet
+	@$(PYTHON) .ci/setup.py
+
+setup-dev: ## The same with the development tools
+	@$(PYTHON) .ci/setup.py --dev
+
+clean: ## Remove built packages and tool caches (.venv stays)
+	rm -rf dist .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,149 @@
+"""What a user installs: the wheel holds everything, works outside the checkout, and its papers agree."""
+
+import re
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path, PurePosixPath
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SHIPPED = ("static", "sample_data")
+
+
+def _run(*command: str | Path, cwd: Path) -> str:
+    finished = subprocess.run(
+        [str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False, timeout=240
+    )
+    assert finished.returncode == 0, f"{command} failed:\n{finished.stdout}\n{finished.stderr}"
+    return finished.stdout
+
+
+def _build(target: str, source: Path, destination: Path) -> Path:
+    """Build a distribution from a source tree, with the hatchling that is installed and so without a network."""
+    _run(sys.executable, "-m", "hatchling", "build", "-t", target, "-d", destination, cwd=source)
+    (built,) = destination.iterdir()
+    return built
+
+
+def _shipped_files() -> set[PurePosixPath]:
+    """Every file of the checkout that belongs into the wheel, by its path in the checkout."""
+    files = (path for name in SHIPPED for path in (ROOT / name).rglob("*") if path.is_file())
+    return {PurePosixPath(path.relative_to(ROOT)) for path in files if path.name != ".DS_Store"}
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fresh virtual environment with the wheel in it, which reads the dependencies from the present one.
+
+    A line in a .pth file adds a folder without obeying the .pth files in it, so the editable checkout stays unseen.
+    """
+    folder = tmp_path_factory.mktemp("fresh") / "venv"
+    _run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
+    site_packages = Path(
+        _run(_python(folder), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip()
+    )
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    pip = (sys.executable, "-m", "pip", "--python", _python(folder), "install", "--no-index", "--no-deps")
+    _run(*pip, "--ignore-installed", "--disable-pip-version-check", wheel, cwd=folder.parent)
+    return folder
+
+
+def _python(environment: Path) -> Path:
+    return environment / "bin" / "python"
+
+
+def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    shipped = _shipped_files()
+    assert shipped
+    missing = {str(path) for path in shipped if f"carts_core/{path}" not in inside}
+    assert not missing
+
+
+def test_the_wheel_holds_both_packages_typed_and_the_licence_but_no_tests(wheel: Path) -> None:
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    assert {"carts_core/py.typed", "carts_viewer/py.typed", "carts_core/cli.py", "carts_viewer/app.py"} <= inside
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in inside)
+    assert {PurePosixPath(name).parts[0] for name in inside if ".dist-info/" not in name} == {
+        "carts_core",
+        "carts_viewer",
+    }
+    assert not [name for name in inside if "__pycache__" in name]
+
+
+def test_the_sdist_builds_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    (tmp_path / "wheel").mkdir()
+    rebuilt = _build("wheel", source, tmp_path / "wheel")
+    assert set(zipfile.ZipFile(rebuilt).namelist()) == set(zipfile.ZipFile(wheel).namelist())
+
+
+def test_the_installed_command_describes_itself(environment: Path, tmp_path: Path) -> None:
+    printed = _run(environment / "bin" / "carts", "--help", cwd=tmp_path)
+    for command in ("view", "optimize", "evaluate", "render", "synthesize", "train"):
+        assert command in printed
+
+
+def test_the_installed_wheel_opens_its_own_sample_and_weights(environment: Path, tmp_path: Path) -> None:
+    program = """
+from pathlib import Path
+import carts_core, carts_viewer
+from carts_core.data import Sequence
+from carts_core.features import FeatureExtractor
+from carts_core.resources import sample_sequence, shipped_robot, shipped_weights, static_dir
+
+sequence = Sequence.open(sample_sequence())
+frame = sequence.frame(0)
+FeatureExtractor.load()
+assert len(sequence) > 0 and frame.images
+modules = (carts_core.__file__, carts_viewer.__file__)
+for path in (*modules, sample_sequence(), shipped_robot(), shipped_weights(), static_dir()):
+    assert Path(path).exists(), path
+    print(path)
+"""
+    for line in _run(_python(environment), "-c", program, cwd=tmp_path).splitlines():
+        if line.startswith("/"):
+            assert Path(line).is_relative_to(environment), line
+
+
+def test_every_direct_dependency_is_pinned_within_its_bounds() -> None:
+    pins = {}
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith("#"):
+            name, version = line.split("==")
+            pins[canonicalize_name(name)] = version
+    extras = (requirement for extra in PROJECT["optional-dependencies"].values() for requirement in extra)
+    for text in (*PROJECT["dependencies"], *extras):
+        requirement = Requirement(text)
+        if requirement.name != PROJECT["name"]:
+            assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), text
+
+
+def test_the_version_is_the_same_wherever_it_is_written() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.findall(r"^## \[(\d[^\]]*)\]", changelog, flags=re.MULTILINE)
+    assert str(citation["version"]) == PROJECT["version"]
+    assert citation["license"] == PROJECT["license"]
+    assert not released or released[0] == PROJECT["version"]

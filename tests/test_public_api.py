@@ -1,0 +1,160 @@
+"""The public face of the library: every name imports, every public thing is documented, and the seam to the viewer
+and a few safety rules hold for every file."""
+
+import ast
+import importlib
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import carts_core
+import carts_viewer
+
+PACKAGES = (carts_core, carts_viewer)
+MODULES = sorted(
+    name
+    for package in PACKAGES
+    for name in (
+        package.__name__,
+        *(module.name for module in pkgutil.walk_packages(package.__path__, package.__name__ + ".")),
+    )
+    if not name.endswith("__main__")
+)
+CORE_MODULES = [name for name in MODULES if name.split(".")[0] == "carts_core"]
+SOURCES = sorted(path for package in PACKAGES for path in Path(package.__path__[0]).rglob("*.py"))
+# The one place where the core reaches for the app: `carts view`, when it is called and not before.
+COMMAND_LINE = "cli.py"
+
+
+def _named(path: Path) -> str:
+    return path.relative_to(Path(carts_core.__path__[0]).parent).as_posix()
+
+
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def _imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Every module that is imported anywhere below, absolute, with its line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield node.module, node.lineno
+
+
+def _public_definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.AST]]:
+    """Public functions and classes, and the public methods of those classes, but no overloads or setters."""
+    for node in body:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
+            continue
+        decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
+        if any(name.endswith(("overload", "override", ".setter")) for name in decorators):
+            continue
+        yield prefix + node.name, node
+        if isinstance(node, ast.ClassDef):
+            yield from _public_definitions(node.body, f"{prefix}{node.name}.")
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_module_imports_with_all_its_public_names(module: str) -> None:
+    imported = importlib.import_module(module)
+    for name in getattr(imported, "__all__", ()):
+        assert hasattr(imported, name), f"{module}.__all__ names {name}, which is not there"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if hasattr(importlib.import_module(name), "__path__")])
+def test_every_name_that_a_package_imports_is_re_exported_on_purpose(module: str) -> None:
+    """`from ._x import Y as Y` or `__all__` says that a name is public; a plain import leaves it open."""
+    package = importlib.import_module(module)
+    declared = set(getattr(package, "__all__", ()))
+    assert package.__file__ is not None
+    for node in _tree(Path(package.__file__)).body:
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        for alias in node.names:
+            assert alias.name != "*", f"{module} re-exports everything of {node.module}"
+            name = alias.asname or alias.name
+            on_purpose = alias.asname == alias.name or name in declared or name.startswith("_")
+            assert on_purpose, f"{module} imports {name} without saying whether it is public"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=_named)
+def test_every_public_function_class_and_method_has_a_docstring(path: Path) -> None:
+    tree = _tree(path)
+    missing = [
+        f"{_named(path)}:{node.lineno} {name}"
+        for name, node in _public_definitions(tree.body)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not ast.get_docstring(node)
+    ]
+    assert not missing, "without a docstring: " + ", ".join(missing)
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path.is_relative_to(carts_core.__path__[0])], ids=_named)
+def test_the_core_does_not_know_the_viewer(path: Path) -> None:
+    tree = _tree(path)
+    if path.name == COMMAND_LINE:
+        # Bodies of functions run when they are called; what remains runs on import.
+        tree.body = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
+    wrong = [
+        f"{_named(path)}:{line} imports {name}"
+        for name, line in _imports(tree)
+        if name.split(".")[0] in {"viser", "carts_viewer"}
+    ]
+    assert not wrong, ", ".join(wrong)
+
+
+def test_importing_the_whole_core_loads_no_web_toolkit() -> None:
+    imports = "; ".join(f"import {name}" for name in CORE_MODULES)
+    check = "import sys; loaded = {'viser', 'carts_viewer'} & set(sys.modules); assert not loaded, loaded"
+    finished = subprocess.run(
+        [sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=False, timeout=240
+    )
+    assert finished.returncode == 0, finished.stderr
+
+
+def _hazards(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Lines that could run code from a data file, or open the server to the network."""
+    for name, line in _imports(tree):
+        if name.split(".")[0] in {"pickle", "dill", "cloudpickle", "shelve", "marshal"}:
+            yield line, f"imports {name}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in {"eval", "exec", "torch.load", "os.system"}:
+                yield node.lineno, f"calls {called}"
+            for keyword in node.keywords:
+                on = isinstance(keyword.value, ast.Constant) and keyword.value.value is True
+                if on and keyword.arg in {"allow_pickle", "shell"}:
+                    yield node.lineno, f"passes {keyword.arg}=True"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "0.0.0.0" in node.value:
+            yield node.lineno, "names the address of every network interface"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=_named)
+def test_no_file_runs_code_from_data_or_listens_on_every_interface(path: Path) -> None:
+    assert [f"{_named(path)}:{line} {what}" for line, what in _hazards(_tree(path))] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "torch.load(path)",
+        "eval(text)",
+        "np.load(path, allow_pickle=True)",
+        "subprocess.run(text, shell=True)",
+        "serve(host='0.0.0.0')",
+    ],
+)
+def test_the_safety_check_notices_what_it_is_there_for(line: str) -> None:
+    assert list(_hazards(ast.parse(line)))
+
+
+def test_the_safety_check_leaves_evaluation_mode_alone() -> None:
+    assert not list(_hazards(ast.parse("network.eval()")))
