@@ -1,0 +1,8 @@
+"""Differentiable rendering: hard visibility, sparse shading, silhouette gradient."""
+
+from .renderer import Renderer as Renderer
+from .renderer import Rendering as Rendering
+from .visibility_numba import visibility_numba as visibility
+from .visibility_torch import visibility_torch as visibility_torch
+
+__all__ = ["Renderer", "Rendering", "visibility", "visibility_torch"]
