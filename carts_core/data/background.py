@@ -1,0 +1,86 @@
+"""The mean background BG_m of the paper, estimated from a recording when it is not given."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from ..errors import SequenceError
+
+FRAMES = 30
+"""How many frames, spread evenly over the recording, the estimate looks at."""
+
+MARGIN = 15 / 640
+"""How far round an arm's silhouette pixels are not trusted, as a share of the image's width."""
+
+_COVERED = 256
+_ROWS_AT_ONCE = 64
+
+
+def spread(length: int, count: int = FRAMES) -> list[int]:
+    """At most `count` different frame numbers, evenly spread over `length`."""
+    return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
+
+
+def widen(silhouette: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """A silhouette with the margin that measured kinematics are off by."""
+    radius = max(1, round(MARGIN * silhouette.shape[1]))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate(silhouette.astype(np.uint8), disc).astype(bool)
+
+
+def estimate_background(
+    views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Median of every pixel over the views in which it is not covered.
+
+    A pixel that is covered in every view is filled in from its surroundings.
+
+    Args:
+        views: images with what covers the background in each.
+
+    Raises:
+        SequenceError: the whole image is covered in every view.
+    """
+    images, covers = (np.stack(arrays) for arrays in zip(*views, strict=True))
+    seen = (~covers).sum(0)
+    if not seen.any():
+        raise SequenceError(
+            "the background cannot be estimated: the arms, as measured, cover every pixel of every frame. "
+            "Check T_camera_world and the units of the joints, or give a `background` image."
+        )
+    result = np.empty(images.shape[1:], np.uint8)
+    # Covered values are sorted behind all others, so the median of the rest is in the middle of the first `seen`.
+    for top in range(0, images.shape[1], _ROWS_AT_ONCE):
+        rows = slice(top, top + _ROWS_AT_ONCE)
+        values = np.where(covers[:, rows, :, None], np.uint16(_COVERED), images[:, rows])
+        values.sort(axis=0)
+        middle = np.maximum(seen[rows] - 1, 0)[None, :, :, None] / 2
+        low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]
+        high = np.take_along_axis(values, np.ceil(middle).astype(np.intp), 0)[0]
+        result[rows] = np.minimum((low + high + 1) // 2, 255).astype(np.uint8)
+    return fill(result, seen == 0)
+
+
+def fill(
+    image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """`image` with the pixels of `hole` blended in smoothly from around it (pull-push over a pyramid)."""
+    if not hole.any():
+        return image
+    weight = (~hole).astype(np.float32)
+    smooth = _pull_push(image.astype(np.float32) * weight[..., None], weight)
+    return np.where(hole[..., None], np.clip(np.rint(smooth), 0, 255).astype(np.uint8), image)
+
+
+def _pull_push(weighted: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Mean colours where `weight` is positive, those of the next coarser level where it is 0."""
+    height, width = weight.shape
+    mean = weighted / np.maximum(weight, 1e-6)[..., None]
+    if weight.all() or min(height, width) < 2:
+        return mean
+    coarse = _pull_push(cv2.pyrDown(weighted), cv2.pyrDown(weight))
+    coarse = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    trust = np.minimum(weight * 4.0, 1.0)[..., None]
+    return trust * mean + (1.0 - trust) * coarse

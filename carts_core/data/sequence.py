@@ -1,0 +1,238 @@
+"""A recording: frames with images, measured joint positions, and where known masks and truth."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from ..errors import SequenceError
+from ..rendering import Renderer
+from ..scene import Scene
+from .background import estimate_background, spread, widen
+from .description import CameraInput, Description, read_description
+from .images import read_image, read_mask
+from .toml_table import closest
+
+CACHE_BYTES = 192 * 2**20
+"""Memory for decoded images and masks of one sequence."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a sequence in one domain. The arrays are the receiver's own copies."""
+
+    index: int
+    """0-based position in the sequence."""
+    frame_id: str
+    """The row's own name, say "001"."""
+    domain: str
+    images: dict[str, UInt8[np.ndarray, "height width 3"]]
+    """Camera -> RGB image, undistorted."""
+    measured: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm -> joint positions [rad, m] in the order of `Robot.joint_names`; unmeasured joints are at their default."""
+    truth: dict[str, Float[np.ndarray, " dofs"]] | None
+    """Arm -> true joint positions, None where the sequence has none."""
+    masks: dict[str, Bool[np.ndarray, "height width"]] | None
+    """Camera -> instrument mask, undistorted; None where no camera has a mask in this frame."""
+    timestamp: float | None
+    """[s]"""
+
+
+class Sequence:
+    """A recording that a sequence file describes. Made by `Sequence.open`; safe to use from several threads.
+
+    Attributes:
+        path: the sequence file.
+        name: its name for people.
+        scene: arms and cameras as calibrated, cameras without distortion.
+        domains: the variants of every image; the first is the default.
+        frame_ids: name of every frame.
+        timestamps: [frames] [s], or None.
+        measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
+        measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
+        truth: arm -> true joint positions of all frames, or None; only the arms that have one.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self.path = description.path
+        self.name = description.name
+        self.scene: Scene = description.scene
+        self.domains = description.domains
+        self.frame_ids = description.frame_ids
+        self.timestamps = description.timestamps
+        self.measured_joints = {name: arm.measured_joints for name, arm in description.arms.items()}
+        self.measured = {name: arm.measured for name, arm in description.arms.items()}
+        truth = {name: arm.truth for name, arm in description.arms.items() if arm.truth is not None}
+        self.truth = truth or None
+        self._cameras = description.cameras
+        self._cache = _ByteBudget(CACHE_BYTES)
+        self._backgrounds: dict[tuple[str, str], np.ndarray] = {}
+        self._background_lock = threading.Lock()
+
+    @staticmethod
+    def open(path: Path | str, *, progress: Callable[[str], None] | None = None) -> "Sequence":
+        """Read a sequence file (`docs/sequence_format.md`); images are decoded later, when asked for.
+
+        Args:
+            path: the TOML file.
+            progress: called with a line for people now and then.
+
+        Raises:
+            SequenceError: the file or something it points at is missing or wrong.
+            RobotError: a robot or one of its meshes is missing or wrong.
+        """
+        return Sequence(read_description(Path(path), progress))
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    def __repr__(self) -> str:
+        cameras = ", ".join(self._cameras)
+        return f"Sequence({self.name!r}, {len(self)} frames, cameras {cameras}, domains {', '.join(self.domains)})"
+
+    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
+        """One frame with the images of some cameras (all by default), in a domain (the first by default).
+
+        Raises:
+            SequenceError: there is no such frame, domain or camera, or an image is missing, damaged or of a wrong size.
+        """
+        if not 0 <= index < len(self):
+            raise SequenceError(f"{self.path} has no frame number {index}; its frames are 0 to {len(self) - 1}.")
+        domain = self._domain(domain)
+        names = tuple(self._cameras) if cameras is None else tuple(cameras)
+        masks = {name: mask for name in names if (mask := self._mask(name, domain, index)) is not None}
+        return Frame(
+            index=index,
+            frame_id=self.frame_ids[index],
+            domain=domain,
+            images={name: self._image(name, domain, index).copy() for name in names},
+            measured={arm: positions[index].copy() for arm, positions in self.measured.items()},
+            truth=None if self.truth is None else {arm: rows[index].copy() for arm, rows in self.truth.items()},
+            masks=masks or None,
+            timestamp=None if self.timestamps is None else float(self.timestamps[index]),
+        )
+
+    def has_masks(self, camera: str, domain: str | None = None) -> bool:
+        """Whether the sequence file gives masks for a camera (in a domain).
+
+        Raises:
+            SequenceError: there is no such domain or camera.
+        """
+        return self._domain(domain) in self._camera(camera).masks
+
+    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
+        """The mean background BG_m: what the camera sees where no arm is, RGB, undistorted.
+
+        It is the image that the sequence file names, else the median over the recording of what the arms, as measured,
+        do not cover. The first call may take seconds.
+
+        Raises:
+            SequenceError: there is no such domain or camera, or an image is not usable.
+        """
+        domain = self._domain(domain)
+        entry = self._camera(camera)
+        with self._background_lock:
+            if (camera, domain) not in self._backgrounds:
+                self._backgrounds[camera, domain] = self._make_background(entry, domain)
+            return self._backgrounds[camera, domain].copy()
+
+    def _make_background(self, entry: CameraInput, domain: str) -> np.ndarray:
+        camera = entry.camera
+        if domain in entry.background:
+            path = entry.background[domain]
+            image = read_image(path)
+            self._check_size(image, camera.name, f"background {path}")
+            return camera.undistort(image)
+        renderer = Renderer(self.scene, width=camera.width, height=camera.height, cameras=[camera.name])
+        indices = spread(len(self))
+        arm_ids = (
+            renderer.segment(self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}))[0]
+            for index in indices
+        )
+        try:
+            return estimate_background(
+                (self._image(camera.name, domain, index), widen(ids >= 0))
+                for index, ids in zip(indices, arm_ids, strict=True)
+            )
+        except SequenceError as error:
+            raise SequenceError(f"{self.path}: camera {camera.name!r}: {error}") from error
+
+    def _image(self, camera: str, domain: str, index: int) -> np.ndarray:
+        entry = self._camera(camera)
+
+        def decode() -> np.ndarray:
+            source = entry.images[domain]
+            image = source.read(index)
+            self._check_size(image, camera, f"image {source.name(index)}")
+            return entry.camera.undistort(image)
+
+        return self._cache.get(("image", camera, domain, index), decode)
+
+    def _mask(self, camera: str, domain: str, index: int) -> np.ndarray | None:
+        entry = self._camera(camera)
+        path = entry.masks[domain][index] if domain in entry.masks else None
+        if path is None:
+            return None
+
+        def decode() -> np.ndarray:
+            mask = read_mask(path)
+            self._check_size(mask, camera, f"mask {path}")
+            return entry.camera.undistort(mask)
+
+        return self._cache.get(("mask", str(path)), decode).copy()
+
+    def _check_size(self, image: np.ndarray, camera: str, what: str) -> None:
+        height, width = image.shape[:2]
+        wanted = self._camera(camera).camera
+        if (width, height) != (wanted.width, wanted.height):
+            raise SequenceError(
+                f"{what} is {width} x {height} pixels, but camera {camera!r} is {wanted.width} x {wanted.height} "
+                f"({self.path}). Correct `size` and K there, or export the file in the camera's size."
+            )
+
+    def _domain(self, domain: str | None) -> str:
+        if domain is None:
+            return self.domains[0]
+        if domain not in self.domains:
+            raise SequenceError(
+                f"{self.path} has no domain {domain!r}.{closest(domain, self.domains)} "
+                f"Its domains are: {', '.join(self.domains)}."
+            )
+        return domain
+
+    def _camera(self, camera: str) -> CameraInput:
+        if camera not in self._cameras:
+            raise SequenceError(
+                f"{self.path} has no camera {camera!r}.{closest(camera, self._cameras)} "
+                f"Its cameras are: {', '.join(self._cameras)}."
+            )
+        return self._cameras[camera]
+
+
+class _ByteBudget:
+    """Least recently used arrays, as many as fit into a number of bytes."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._used = 0
+        self._arrays: OrderedDict[tuple, np.ndarray] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array under `key`, made when it is not there. Two threads may make it at once; that does no harm."""
+        with self._lock:
+            if key in self._arrays:
+                self._arrays.move_to_end(key)
+                return self._arrays[key]
+        array = make()
+        with self._lock:
+            if key not in self._arrays:
+                self._arrays[key] = array
+                self._used += array.nbytes
+            while self._used > self._limit and len(self._arrays) > 1:
+                self._used -= self._arrays.popitem(last=False)[1].nbytes
+        return array

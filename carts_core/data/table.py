@@ -1,0 +1,96 @@
+"""Kinematics tables: CSV files with a header, a row per frame and columns called by name."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import SequenceError
+from .toml_table import closest
+
+
+@dataclass(frozen=True)
+class Table:
+    """A CSV file as text; cells become numbers when a column is asked for."""
+
+    path: Path
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]
+    """Line of the file in which each row ends, counted from 1."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def text(self, column: str, asked_by: str) -> list[str]:
+        """The cells of a column.
+
+        Args:
+            column: its name in the header.
+            asked_by: the key that names the column, for errors.
+
+        Raises:
+            SequenceError: there is no such column.
+        """
+        if column not in self.header:
+            raise SequenceError(
+                f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
+                f"Its columns are: {', '.join(self.header)}."
+            )
+        index = self.header.index(column)
+        return [row[index] for row in self.rows]
+
+    def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
+        """The values of a column.
+
+        Raises:
+            SequenceError: there is no such column, or a cell is not a finite number.
+        """
+        values = np.empty(len(self.rows))
+        for row, cell in enumerate(self.text(column, asked_by)):
+            try:
+                values[row] = float(cell)
+            except ValueError:
+                values[row] = math.nan
+            if not math.isfinite(values[row]):
+                raise SequenceError(
+                    f"{self.path}, line {self.lines[row]}, column {column!r}: {cell!r} is not a finite number. "
+                    "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
+                )
+        return values
+
+
+def read_table(path: Path, delimiter: str = ",") -> Table:
+    """Read a CSV file; blank lines are skipped.
+
+    Raises:
+        SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as handle:
+            reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
+            filled = [(reader.line_num, tuple(cell.strip() for cell in row)) for row in reader if any(row)]
+    except (FileNotFoundError, IsADirectoryError) as error:
+        raise SequenceError(f"kinematics table {path} is missing. Correct the path in the sequence file.") from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SequenceError(f"kinematics table {path} is not a readable CSV file: {error}.") from error
+    if len(filled) < 2:
+        raise SequenceError(f"kinematics table {path} has no rows. It needs a header and one row per frame.")
+    header = filled[0][1]
+    if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
+        raise SequenceError(
+            f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
+            f"Set `delimiter = {found!r}` in [kinematics] (decimal points are points)."
+        )
+    repeated = sorted({name for name in header if name and header.count(name) > 1})
+    if repeated:
+        raise SequenceError(f"{path} has several columns called {', '.join(map(repr, repeated))}. Rename all but one.")
+    for line, row in filled[1:]:
+        if len(row) != len(header):
+            raise SequenceError(
+                f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
+            )
+    return Table(path, header, tuple(row for _, row in filled[1:]), tuple(line for line, _ in filled[1:]))

@@ -1,0 +1,149 @@
+"""A TOML table that is read key by key, and says so when a key is wrong, missing or left over."""
+
+import difflib
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..errors import SequenceError
+
+_REQUIRED: Any = object()
+_KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """' Did you mean ...?' when one of `known` resembles `name`, else nothing."""
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" Did you mean {matches[0]!r}?" if matches else ""
+
+
+def read_toml(path: Path) -> "TomlTable":
+    """The root table of a TOML file.
+
+    Raises:
+        SequenceError: the file is missing or not TOML.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError as error:
+        raise SequenceError(f"sequence file {path} is missing. Give the path of a .toml file.") from error
+    except IsADirectoryError as error:
+        raise SequenceError(f"{path} is a folder. Give the .toml file inside it.") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SequenceError(
+            f"sequence file {path} is not readable TOML: {error}. Compare it with docs/sequence_format.md."
+        ) from error
+    return TomlTable(values, path, "")
+
+
+class TomlTable:
+    """One table of a file. Keys are taken one by one; `finish` complains about those that nobody took."""
+
+    def __init__(self, values: dict[str, Any], file: Path, where: str) -> None:
+        self.file = file
+        self.where = where
+        self._values = values
+        self._known: list[str] = []
+
+    def name(self, key: str) -> str:
+        """How errors call a key, say `sequence.toml: [cameras] 'left': size`."""
+        return f"{self.file}: {self.where + ': ' if self.where else ''}{key}"
+
+    def error(self, key: str, text: str) -> SequenceError:
+        """An error about one key."""
+        return SequenceError(f"{self.name(key)} {text}")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def take(self, key: str, kind: Any = object, default: Any = _REQUIRED) -> Any:
+        """The value of `key`.
+
+        Args:
+            key: its name.
+            kind: type it must have (or a tuple of them); `float` takes whole numbers too, `object` takes anything.
+            default: value when the key is absent; without one the key is required.
+
+        Raises:
+            SequenceError: the key is absent and required, or of another type.
+        """
+        self._known.append(key)
+        if key not in self._values:
+            if default is _REQUIRED:
+                given = [name for name in self._values if name not in self._known]
+                raise self.error(key, f"is missing. Add it (docs/sequence_format.md).{_typo(key, given)}")
+            return default
+        value = self._values[key]
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        accepted = tuple(extra for one in kinds for extra in ((int, float) if one is float else (one,)))
+        if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
+            wanted = " or ".join(_KINDS[one] for one in kinds)
+            raise self.error(key, f"is {value!r}, but must be {wanted}.")
+        return value
+
+    def take_choice(self, key: str, choices: tuple[str, ...], default: str) -> str:
+        """The text of `key`, one of `choices`.
+
+        Raises:
+            SequenceError: it is another one.
+        """
+        value = self.take(key, str, default)
+        if value not in choices:
+            raise self.error(key, f"is {value!r}, but must be one of: {', '.join(choices)}.{closest(value, choices)}")
+        return value
+
+    def take_table(self, key: str) -> "TomlTable":
+        """The table `[key]`, an empty one when it is absent."""
+        prefix = f"{self.where}: " if self.where else ""
+        return TomlTable(self.take(key, dict, {}), self.file, f"{prefix}[{key}]")
+
+    def take_tables(self, key: str) -> list["TomlTable"]:
+        """The array of tables `[[key]]`: at least one, each with a `name` of its own.
+
+        Raises:
+            SequenceError: there is none, or names repeat.
+        """
+        values = self.take(key, list, [])
+        if not values or not all(isinstance(value, dict) for value in values):
+            raise self.error(f"[[{key}]]", f"is missing. Describe at least one, under a line [[{key}]].")
+        tables: list[TomlTable] = []
+        names: list[str] = []
+        for number, value in enumerate(values, start=1):
+            name = TomlTable(value, self.file, f"[[{key}]] number {number}").take("name", str)
+            if name in names:
+                raise self.error(f"[[{key}]]", f"has the name {name!r} twice. Every one needs a name of its own.")
+            names.append(name)
+            table = TomlTable(value, self.file, f"[[{key}]] {name!r}")
+            table.take("name", str)
+            tables.append(table)
+        return tables
+
+    def items(self) -> dict[str, Any]:
+        """Everything in the table; for tables whose keys are names that the user chose."""
+        self._known.extend(self._values)
+        return dict(self._values)
+
+    def path(self, value: str) -> Path:
+        """A path in the file, which is relative to the file's folder."""
+        return self.file.parent / value
+
+    def finish(self) -> None:
+        """Check that every key was one that the format knows.
+
+        Raises:
+            SequenceError: one was not.
+        """
+        for key in self._values:
+            if key not in self._known:
+                known = list(dict.fromkeys(self._known))
+                raise self.error(key, f"is not a key of the format.{closest(key, known)} Known here: {_list(known)}.")
+
+
+def _typo(key: str, given: list[str]) -> str:
+    matches = difflib.get_close_matches(key, given, n=1, cutoff=0.5)
+    return f" Is {matches[0]!r} a misspelling of it?" if matches else ""
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
