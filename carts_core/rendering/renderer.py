@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms
-from .shading import VisiblePoints, intersect, phong, pixel_rays, rotate
-from .silhouette import boundary_pairs, boundary_term
+from .motion import carry_motion
+from .shading import phong, rotate, visible_points
 from .visibility_numba import visibility_numba
 from .visibility_torch import visibility_torch
 
@@ -71,18 +71,20 @@ class Renderer:
         batch = Ts.shape[:-4]
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
         face_ids, depth = self._visibility(views_T.detach(), views_K.detach())
-        points = VisiblePoints.of(face_ids)
-        Ts_camera_link = views_T[points.view, self.geometry.face_links[points.face]]
-        rays = pixel_rays(points, views_K)
-        points_link = intersect(self.geometry, points, Ts_camera_link, rays)
-        color = phong(self.geometry, points, Ts_camera_link, points_link, self.scene.light)
-        pixel = (points.view * self.height + points.y) * self.width + points.x
+        points = visible_points(self.geometry, face_ids, views_T.detach(), views_K.detach())
+        T = views_T[points.view, self.geometry.face_links[points.face]]
+        point = rotate(T[:, :3, :3], points.point_link) + T[:, :3, 3]
+        normal = rotate(T[:, :3, :3], points.normal_link)
+        color = phong(self.geometry.face_colors[points.face], point, normal, self.scene.light)
         values = torch.cat([color, torch.ones_like(color[:, :1])], -1)
-        flat = values.new_zeros(face_ids.numel(), 4).index_copy(0, pixel, values)
-        if torch.is_grad_enabled() and (views_T.requires_grad or views_K.requires_grad):
-            flat = self._with_boundary(flat, face_ids, depth, points, pixel, Ts_camera_link, points_link, views_K)
+        dense = values.new_zeros(face_ids.numel(), 4).index_copy(0, points.pixel, values).view(*face_ids.shape, 4)
+        if torch.is_grad_enabled() and (T.requires_grad or views_K.requires_grad):
+            K = views_K[points.view]
+            position = K[:, :2] * point[:, :2] / point[:, 2:] + K[:, 2:]
+            inverse_depth = torch.where(face_ids >= 0, 1.0 / depth, 0.0)
+            dense = carry_motion(dense, position, points.pixel, inverse_depth)
         shape = (*batch, len(self._indices), self.height, self.width)
-        image = flat.view(*shape, 4).movedim(-1, -3)
+        image = dense.view(*shape, 4).movedim(-1, -3)
         arm_ids = torch.where(face_ids >= 0, self.geometry.face_arms[face_ids.long()], -1)
         return Rendering(image[..., :3, :, :], image[..., 3, :, :], arm_ids.view(shape), depth.view(shape))
 
@@ -124,44 +126,3 @@ class Renderer:
             ids.append(face_ids)
             depths.append(depth)
         return torch.stack(ids), torch.stack(depths)
-
-    def _with_boundary(
-        self,
-        flat: Tensor,
-        face_ids: Tensor,
-        depth: Tensor,
-        points: VisiblePoints,
-        pixel: Tensor,
-        Ts_camera_link: Tensor,
-        points_link: Tensor,
-        views_K: Tensor,
-    ) -> Tensor:
-        """The flattened image with the gradient of its occlusion boundaries added."""
-        with torch.no_grad():
-            slope = self._slope(depth, points, pixel, Ts_camera_link, views_K)
-            pairs = boundary_pairs(face_ids, depth, slope, views_K[:, :2])
-            row = torch.zeros(face_ids.numel(), dtype=torch.int64, device=flat.device)
-            row[pixel] = torch.arange(len(pixel), device=flat.device)
-            near = row[pairs.near]
-        # The surface point stays where it is on its link, and moves in the image with the link and the camera.
-        T = Ts_camera_link[near]
-        point = rotate(T[:, :3, :3], points_link[near].detach()) + T[:, :3, 3]
-        intrinsics = views_K[points.view[near]]
-        position = intrinsics[:, :2] * point[:, :2] / point[:, 2:] + intrinsics[:, 2:]
-        term = boundary_term(pairs, flat, position)
-        return flat.index_add(0, pairs.near, term).index_add(0, pairs.far, term)
-
-    def _slope(
-        self, depth: Tensor, points: VisiblePoints, pixel: Tensor, Ts_camera_link: Tensor, views_K: Tensor
-    ) -> Tensor:
-        """Change of depth per pixel [views, height, width, 2] of the visible triangle's plane.
-
-        On a plane n . p = d the depth is z = d / (n . ray), so dz/dx = -z (n_x / fx) / (n . ray).
-        """
-        normal = rotate(Ts_camera_link[:, :3, :3], self.geometry.face_planes[points.face, :3])
-        towards = (normal * pixel_rays(points, views_K)).sum(-1, keepdim=True)
-        towards = torch.where(towards.abs() < 1e-6, 1e-6, towards)
-        z = depth.flatten()[pixel][:, None]
-        slope = -z * normal[:, :2] / views_K[points.view, :2] / towards
-        dense = slope.new_zeros(depth.numel(), 2).index_copy(0, pixel, slope)
-        return dense.view(*depth.shape, 2)
