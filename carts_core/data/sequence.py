@@ -13,7 +13,8 @@ from ..errors import SequenceError
 from ..rendering import Renderer
 from ..scene import Scene
 from .background import estimate_background, spread, widen
-from .description import CameraInput, Description, read_description
+from .camera_input import CameraInput
+from .description import Description, read_description
 from .images import read_image, read_mask
 from .toml_table import closest
 

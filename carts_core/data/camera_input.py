@@ -1,0 +1,119 @@
+"""A camera of a sequence with its images, masks and background, as a `[[cameras]]` table describes them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..camera import Camera
+from ..errors import SequenceError
+from .calibration import take_camera
+from .images import ImageFiles, ImageSource
+from .patterns import expand, frame_files, is_glob, is_per_frame
+from .rows import Rows
+from .toml_table import TomlTable, closest
+from .video import SUFFIXES, Video
+
+_SHOWN_MISSING = 3
+
+
+@dataclass(frozen=True)
+class CameraInput:
+    """A camera and the files that belong to it, by domain."""
+
+    camera: Camera
+    images: Mapping[str, ImageSource]
+    masks: Mapping[str, tuple[Path | None, ...]]
+    """Mask file of every frame, None for a frame that has none; empty when the sequence has no masks."""
+    background: Mapping[str, Path]
+
+
+def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
+    """The camera that one `[[cameras]]` table describes, every file of it present.
+
+    Raises:
+        SequenceError: a value is missing or wrong, or a file is missing.
+    """
+    camera = take_camera(table)
+    images = {
+        domain: _images(table, pattern, rows, domain, camera.name)
+        for domain, pattern in _by_domain(table, "images", domains, required=True).items()
+    }
+    sparse = table.take("sparse_masks", bool, False)
+    masks = {
+        domain: _masks(table, pattern, rows, domain=domain, camera=camera.name, sparse=sparse)
+        for domain, pattern in _by_domain(table, "masks", domains).items()
+    }
+    background: dict[str, Path] = {}
+    for domain, pattern in _by_domain(table, "background", domains).items():
+        path = table.path(expand(pattern, table.name("background"), domain=domain, camera=camera.name))
+        if not path.is_file():
+            raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
+        background[domain] = path
+    table.finish()
+    return CameraInput(camera, images, masks, background)
+
+
+def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
+    """Pattern of every domain: text is for all domains, a table names them one by one."""
+    value = table.take(key, (str, dict)) if required else table.take(key, (str, dict), {})
+    if isinstance(value, str):
+        if required and len(domains) > 1 and "{domain" not in value:
+            raise table.error(
+                key,
+                f"is {value!r} for all {len(domains)} domains. Put {{domain}} into it, "
+                "or give a table with one pattern per domain.",
+            )
+        return dict.fromkeys(domains, value)
+    for domain, pattern in value.items():
+        if domain not in domains:
+            raise table.error(
+                f"{key}.{domain}",
+                f"is for an unknown domain.{closest(domain, domains)} "
+                f"`domains` at the top of the file lists: {', '.join(domains)}.",
+            )
+        if not isinstance(pattern, str):
+            raise table.error(f"{key}.{domain}", f"is {pattern!r}, but must be text.")
+    if required and (missing := [domain for domain in domains if domain not in value]):
+        raise table.error(key, f"is missing for: {', '.join(missing)}. Give every domain a pattern.")
+    return dict(value)
+
+
+def _images(table: TomlTable, pattern: str, rows: Rows, domain: str, camera: str) -> ImageSource:
+    key = table.name("images")
+    if not is_per_frame(pattern) and not is_glob(pattern):
+        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        if path.suffix.lower() not in SUFFIXES:
+            raise table.error(
+                "images",
+                f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
+                f"or name a video ({', '.join(SUFFIXES)}).",
+            )
+        return Video(path, rows.video_frames)
+    files = frame_files(table.file.parent, pattern, key, frame_ids=rows.frame_ids, domain=domain, camera=camera)
+    _check_present(key, files, rows.frame_ids)
+    return ImageFiles(files)
+
+
+def _masks(
+    table: TomlTable, pattern: str, rows: Rows, *, domain: str, camera: str, sparse: bool
+) -> tuple[Path | None, ...]:
+    key = table.name("masks")
+    if not is_per_frame(pattern) and not is_glob(pattern):
+        raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it.")
+    files = frame_files(table.file.parent, pattern, key, frame_ids=rows.frame_ids, domain=domain, camera=camera)
+    if sparse and any(file.is_file() for file in files):
+        return tuple(file if file.is_file() else None for file in files)
+    _check_present(key, files, rows.frame_ids, " If only some frames have masks, set sparse_masks = true.")
+    return files
+
+
+def _check_present(key: str, files: tuple[Path, ...], frame_ids: tuple[str, ...], hint: str = "") -> None:
+    missing = [(file, frame_id) for file, frame_id in zip(files, frame_ids, strict=True) if not file.is_file()]
+    if missing:
+        shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
+        rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
+        raise SequenceError(
+            f"{key}: {len(missing)} of {len(files)} files are missing: {shown}{rest}. The kinematics table has "
+            f"{len(files)} rows and every row needs its file: put them back, correct the pattern, or remove the rows."
+            f"{hint}"
+        )
