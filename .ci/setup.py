@@ -23,6 +23,7 @@ VENV = ROOT / ".venv"
 VENV_PYTHON = VENV / "bin" / "python"
 OLDEST = (3, 11)
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+TORCH_INDEX = os.environ.get("TORCH_INDEX", "")
 WARMUP = "carts_core.rendering.warmup"
 
 
@@ -77,19 +78,22 @@ def create_venv():
 def stamp(extras):
     """The file whose presence says that exactly this was installed, by this interpreter, from this folder."""
     digest = hashlib.sha256()
-    for name in ("pyproject.toml", "constraints.txt", ".ci/setup.py"):
+    for name in ("pyproject.toml", "constraints.txt"):
         digest.update((ROOT / name).read_bytes())
     digest.update(str(output(VENV_PYTHON, "-VV")).encode())
     digest.update(str(ROOT).encode())
-    digest.update(os.environ.get("TORCH_INDEX", "").encode())
     return VENV / ".installed-{}-{}".format(extras or "base", digest.hexdigest()[:16])
+
+
+def is_installed(stamp_file):
+    """Whether the stamp is there, and from the index that is asked for, if one is."""
+    return stamp_file.exists() and TORCH_INDEX in ("", stamp_file.read_text())
 
 
 def torch_index():
     """The index to take torch from, or None for pip's own default."""
-    chosen = os.environ.get("TORCH_INDEX", "")
-    if chosen:
-        return None if chosen == "pypi" else chosen
+    if TORCH_INDEX:
+        return None if TORCH_INDEX == "pypi" else TORCH_INDEX
     has_nvidia = Path("/proc/driver/nvidia").exists() or shutil.which("nvidia-smi")
     if sys.platform != "linux" or has_nvidia:
         return None
@@ -105,9 +109,11 @@ def torch_index():
 def install(extras):
     pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "-c", "constraints.txt")
     index = torch_index()
-    if index is not None:
-        say("torch comes from {}".format(index))
-        run(*pip, "--no-deps", "--index-url", index, "torch")
+    if index is not None or TORCH_INDEX:
+        # Builds differ in what follows the + of their version only, so pip would be content with the one that is there.
+        anew = ("--force-reinstall",) if TORCH_INDEX else ()
+        say("torch comes from {}".format(index or "pip's default index"))
+        run(*pip, "--no-deps", *anew, *(("--index-url", index) if index else ()), "torch")
     run(*pip, "-e", ".[{}]".format(extras) if extras else ".")
     if (ROOT / (WARMUP.replace(".", "/") + ".py")).is_file():
         say("compiling the kernels, so that the first page does not wait for them")
@@ -120,13 +126,12 @@ def main():
     extras = "dev" if "--dev" in sys.argv else ""
     require_a_recent_python()
     create_venv()
-    done = stamp(extras)
     # Whoever has the development tools has everything else as well.
-    if done.exists() or stamp("dev").exists():
+    if is_installed(stamp("dev")) or is_installed(stamp(extras)):
         return
     say("installing CaRTS into {} (some minutes and about 2 GB, only this once)".format(VENV))
     install(extras)
-    done.touch()
+    stamp(extras).write_text(TORCH_INDEX)
     say("installed")
 
 
