@@ -99,6 +99,13 @@ def test_the_sdist_builds_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Pat
     assert set(zipfile.ZipFile(rebuilt).namelist()) == set(zipfile.ZipFile(wheel).namelist())
 
 
+def test_what_is_shipped_stays_small() -> None:
+    megabyte = 1_000_000
+    sizes = {path: (ROOT / path).stat().st_size for path in _shipped_files()}
+    assert sum(size for path, size in sizes.items() if path.parts[0] == "sample_data") <= 15 * megabyte
+    assert sum(size for path, size in sizes.items() if path.suffix == ".safetensors") <= 10 * megabyte
+
+
 def test_the_installed_command_describes_itself(environment: Path, tmp_path: Path) -> None:
     printed = _run(environment / "bin" / "carts", "--help", cwd=tmp_path)
     for command in ("view", "optimize", "evaluate", "render", "synthesize", "train"):
