@@ -1,0 +1,182 @@
+"""Smooth motion of two instruments that stay in view, apart from each other and above the tissue."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from ..camera import Camera
+from ..errors import SettingsError
+from ..robot import Robot
+from ..scene import Arm
+from .config import SynthesisConfig
+from .layout import WORK_POINTS
+from .tissue import Tissue
+
+_ATTEMPTS = 400
+_LIMIT_MARGIN = 0.05
+"""Part of each joint's range kept free at both ends."""
+_BORDER = 0.08
+"""The tips keep away from the picture's border by this part of its size."""
+_INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
+"""Where the jaws point in the middle of their range, in the world: to the other arm and down."""
+
+
+def plan_motion(
+    arms: Sequence[Arm], tissues: Sequence[Tissue], camera: Camera, config: SynthesisConfig
+) -> tuple[Float[np.ndarray, "frames 7"], ...]:
+    """True joint positions of each arm [rad, m].
+
+    Random splines are drawn until one keeps inside the joint limits, in view, and free of collisions.
+
+    Raises:
+        SettingsError: no motion within the settings was found.
+    """
+    bodies = tuple(_surface_points(arm.robot, config.rng("surface points")) for arm in arms)
+    reasons: dict[str, int] = {}
+    for attempt in range(_ATTEMPTS):
+        rng = config.rng("motion", attempt)
+        joints = tuple(_draw(arm, number, config, rng) for number, arm in enumerate(arms))
+        reason = _objection(arms, joints, bodies, tissues, camera, config)
+        if reason is None:
+            return joints
+        reasons[reason] = reasons.get(reason, 0) + 1
+    why = ", ".join(f"{reason} ({count})" for reason, count in sorted(reasons.items(), key=lambda item: -item[1]))
+    raise SettingsError(
+        f"none of {_ATTEMPTS} random motions fits the settings: {why}. "
+        "Make motion.reach or motion.wrist_range smaller, or take another seed."
+    )
+
+
+def sample_times(config: SynthesisConfig) -> Float[np.ndarray, "frames"]:
+    """Time of each frame [s]."""
+    return np.arange(config.motion.frames) / config.motion.frame_rate
+
+
+def reach_tip(
+    arm: Arm, tip_link: str, targets_world: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "n 7"]
+) -> Float[np.ndarray, "n 7"]:
+    """Inverse kinematics: yaw, pitch and insertion that bring the tip to each target, the other joints as given.
+
+    Newton's method on the forward kinematics; the three joints are the shaft's spherical coordinates about the
+    remote centre, so it converges in a few steps from anywhere near.
+    """
+    solution = torch.from_numpy(joints.copy())
+    goals = torch.from_numpy((targets_world - arm.T_world_base[:3, 3]) @ arm.T_world_base[:3, :3])
+    for _ in range(12):
+        tips = _tips(arm.robot, tip_link, solution)
+        columns = []
+        for joint in range(3):
+            moved = solution.clone()
+            moved[:, joint] += 1e-6
+            columns.append((_tips(arm.robot, tip_link, moved) - tips) / 1e-6)
+        jacobian = torch.stack(columns, dim=-1)
+        step = torch.linalg.solve(jacobian, (goals - tips)[..., None])[..., 0]
+        solution[:, :3] += torch.clamp(step, -0.3, 0.3)
+    return solution.numpy()
+
+
+def _tips(robot: Robot, tip_link: str, joints: torch.Tensor) -> torch.Tensor:
+    return robot.link_transform(joints, tip_link)[..., :3, 3]
+
+
+def _draw(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames 7"]:
+    """One random motion of one arm."""
+    motion = config.motion
+    times = sample_times(config)
+    controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
+    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
+
+    def spline(spread: np.ndarray) -> np.ndarray:
+        return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
+
+    targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
+    joints = np.zeros((len(times), 7))
+    joints[:, 2] = 0.14
+    joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
+    low, high = motion.jaw_range
+    joints[:, 6] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)]))[:, 0], low, high)
+    return reach_tip(arm, config.tip_link, targets, joints)
+
+
+def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """Roll, wrist pitch and wrist yaw for which the jaws point inwards and down: the best of many random ones."""
+    joints = np.zeros((600, 7))
+    joints[:, 2] = 0.14
+    joints[:, 3] = rng.uniform(-1.8, 1.8, len(joints))
+    joints[:, 4:6] = rng.uniform(-0.75, 0.75, (len(joints), 2))
+    samples = torch.from_numpy(joints)
+    closer = samples.clone()
+    # The direction of the jaws, without knowing the URDF's frames: it is what insertion has to undo when the last
+    # two joints turn the tip away, so it is read off as the tip's distance to the wrist's centre of rotation.
+    tips = _tips(arm.robot, config.tip_link, samples).numpy()
+    closer[:, 4:6] = 0.0
+    wrist = _tips(arm.robot, config.tip_link, closer).numpy()
+    shaft = wrist / np.linalg.norm(wrist, axis=-1, keepdims=True)
+    direction = (tips - (wrist - 0.0193 * shaft)) @ arm.T_world_base[:3, :3].T
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    wanted = _INWARDS[number] + rng.normal(0.0, 0.25, 3)
+    return joints[np.argmax(direction @ wanted), 3:6]
+
+
+def _objection(
+    arms: Sequence[Arm],
+    joints: Sequence[np.ndarray],
+    bodies: Sequence[list[np.ndarray]],
+    tissues: Sequence[Tissue],
+    camera: Camera,
+    config: SynthesisConfig,
+) -> str | None:
+    """Why a motion cannot be used, or None."""
+    for arm, positions in zip(arms, joints, strict=True):
+        low, high = arm.robot.joint_limits.numpy()[:6].T
+        margin = _LIMIT_MARGIN * (high - low)
+        if (positions[:, :6] < low + margin).any() or (positions[:, :6] > high - margin).any():
+            return "a joint comes too near to its limit"
+        tips = _tips(arm.robot, config.tip_link, torch.from_numpy(positions)).numpy()
+        if not _in_view(tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3], camera):
+            return "a tip leaves the picture"
+    clouds = [_clouds(arm, positions, body) for arm, positions, body in zip(arms, joints, bodies, strict=True)]
+    T = camera.T_camera_world
+    for frame in range(len(joints[0])):
+        inside = []
+        for cloud in clouds:
+            points = cloud[frame]
+            points = points[points @ T[2, :3] + T[2, 3] > 0.01]
+            inside.append(points)
+            for tissue in tissues:
+                if (points[:, 2] - tissue.height(points[:, 0], points[:, 1])).min() < config.motion.clearance:
+                    return "an instrument touches the tissue"
+        if cKDTree(inside[0]).query(inside[1])[0].min() < config.motion.clearance:
+            return "the instruments touch"
+    return None
+
+
+def _in_view(tips_world: np.ndarray, camera: Camera) -> bool:
+    T, (fx, fy, cx, cy) = camera.T_camera_world, camera.intrinsics
+    x, y, z = (tips_world @ T[:3, :3].T + T[:3, 3]).T
+    u, v = (fx * x / z + cx) / camera.width, (fy * y / z + cy) / camera.height
+    inside = (u > _BORDER) & (u < 1 - _BORDER) & (v > _BORDER) & (v < 1 - _BORDER)
+    return bool((inside & (z > 0.055) & (z < 0.135)).all())
+
+
+def _surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0018) -> list[np.ndarray]:
+    """Points spread over the surface of each link, in its frame [m]."""
+    points: list[list[np.ndarray]] = [[] for _ in robot.link_names]
+    for mesh in robot.meshes:
+        corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1) / 2
+        count = int(np.ceil(area.sum() / spacing**2)) + 20
+        chosen = corners[rng.choice(len(corners), count, p=area / area.sum())]
+        weights = rng.dirichlet((1.0, 1.0, 1.0), count)
+        points[mesh.link].append(np.einsum("nk,nkd->nd", weights, chosen))
+    return [np.concatenate(part) if part else np.zeros((0, 3)) for part in points]
+
+
+def _clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.ndarray]:
+    """Surface points of an arm in the world, per frame."""
+    Ts = arm.T_world_base @ arm.robot.forward_kinematics(torch.from_numpy(positions)).numpy()
+    return [np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p, T in zip(body, frame, strict=True)]) for frame in Ts]

@@ -1,0 +1,170 @@
+"""Made-up tissue: a height field with folds, fat lobules and vessels, and the colour that belongs to it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import map_coordinates
+
+from .noise import smooth_noise, smoothstep
+
+EXTENT = 0.26
+"""Side of the square of tissue, centred on the world's origin [m]."""
+TEXTURE = 1536
+"""Texels along each side."""
+_TEXELS_PER_METRE = TEXTURE / EXTENT
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What makes one organ look unlike another; colours are linear RGB."""
+
+    base: tuple[float, float, float]
+    dark: tuple[float, float, float]
+    patch: tuple[float, float, float]
+    patch_share: float
+    folds: float
+    lobules: float
+    vessels: int
+    roughness: float
+
+
+_KINDS = {
+    "muscle": _Kind((0.47, 0.150, 0.120), (0.27, 0.055, 0.045), (0.52, 0.30, 0.135), 0.26, 0.0026, 0.0009, 7, 0.36),
+    "bowel": _Kind((0.55, 0.28, 0.22), (0.40, 0.13, 0.105), (0.55, 0.38, 0.18), 0.30, 0.0048, 0.0010, 12, 0.33),
+    "liver": _Kind((0.215, 0.055, 0.040), (0.110, 0.022, 0.020), (0.34, 0.15, 0.10), 0.12, 0.0012, 0.0004, 3, 0.30),
+    "fat": _Kind((0.56, 0.36, 0.145), (0.46, 0.20, 0.085), (0.45, 0.15, 0.11), 0.26, 0.0022, 0.0016, 9, 0.38),
+}
+KINDS = tuple(_KINDS)
+"""Names of the kinds of tissue that `grow_tissue` knows."""
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """A patch of tissue around the world's origin, z up. Row r, column c of a field lies at y, x from -EXTENT / 2."""
+
+    heights: Float[np.ndarray, "n n"]
+    """Height above z = 0 [m] at the grid's points."""
+    albedo: Float[np.ndarray, "m m 3"]
+    """Diffuse reflectance, linear RGB in [0, 1]."""
+    roughness: Float[np.ndarray, "m m"]
+    """Roughness of the wet surface in [0, 1]."""
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height [m] at points of the plane [m]; beyond the patch, that of its border."""
+        return sample(self.heights, x, y)
+
+    def mesh(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 2"]]:
+        """Vertices [m], faces and texture coordinates of the height field."""
+        n = len(self.heights)
+        unit = np.linspace(0.0, 1.0, n)
+        v, u = np.meshgrid(unit, unit, indexing="ij")
+        vertices = np.stack([(u - 0.5) * EXTENT, (v - 0.5) * EXTENT, self.heights], axis=-1)
+        index = np.arange(n * n).reshape(n, n)
+        a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+        faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in ((a, b, c), (a, c, d))])
+        return vertices.reshape(-1, 3), faces, np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def sample(field: Float[np.ndarray, "n n"], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A field of the tissue at points of the plane [m], bilinear."""
+    scale = len(field) - 1
+    rows, columns = (np.asarray(y) / EXTENT + 0.5) * scale, (np.asarray(x) / EXTENT + 0.5) * scale
+    return map_coordinates(field, np.stack([rows, columns]), order=1, mode="nearest")
+
+
+def grow_tissue(kind: str, resolution: int, rng: np.random.Generator) -> Tissue:
+    """Tissue of one kind.
+
+    Args:
+        kind: one of `KINDS`.
+        resolution: grid points of the height field along each side.
+        rng: source of randomness.
+    """
+    look = _KINDS[kind]
+    warp = _noise(0.035, rng, octaves=2), _noise(0.035, rng, octaves=2)
+
+    patches = _warped(_noise(0.060, rng, octaves=4, gain=0.42), warp, 0.003)
+    patch = smoothstep(patches, *np.quantile(patches, [1.0 - look.patch_share - 0.12, 1.0 - look.patch_share + 0.10]))
+    crests = np.exp(-((_warped(_noise(0.040, rng), warp, 0.005) / 0.5) ** 2))  # along the zero crossings
+    folds = crests * smoothstep(_noise(0.080, rng), -0.6, 1.0)
+    lobules = np.minimum(np.abs(_warped(_noise(0.011, rng), warp, 0.002)), 1.2)
+    vessels = _draw_vessels(look.vessels, rng)
+    glossy = smoothstep(_noise(0.030, rng), -0.8, 1.2)
+
+    relief = 0.0042 * _noise(0.090, rng, octaves=2, gain=0.3) + look.folds * folds
+    relief += look.lobules * patch * lobules + 0.0003 * vessels
+    relief += 0.00005 * _noise(0.0032, rng, octaves=2) * (0.35 + 0.65 * glossy)
+
+    hollows = smoothstep(cv2.GaussianBlur(relief, (0, 0), 0.004 * _TEXELS_PER_METRE) - relief, -0.0002, 0.0016)
+    blush = 0.5 + 0.5 * np.tanh(0.8 * _noise(0.030, rng, octaves=4, gain=0.5))
+    color = _mix(np.array(look.base) * _jitter(rng), np.array(look.dark), np.clip(0.65 * blush + 0.35 * hollows, 0, 1))
+    color = _mix(color, np.array(look.patch) * _jitter(rng), 0.85 * patch * (1.0 - 0.5 * hollows))
+    capillaries = np.exp(-((_warped(_noise(0.008, rng), warp, 0.004) / 0.07) ** 2))
+    capillaries *= smoothstep(_noise(0.020, rng), 0.0, 1.2)
+    color = _mix(color, np.array([0.42, 0.035, 0.035]), 0.45 * capillaries)
+    color = _mix(color, np.array([0.20, 0.018, 0.030]), 0.75 * vessels)
+    color *= 1.0 + 0.05 * _noise(0.0012, rng, octaves=2)[..., None]
+
+    roughness = look.roughness + 0.05 * _noise(0.012, rng, octaves=2) + 0.10 * patch
+    return Tissue(
+        heights=_cavity(resolution) + cv2.resize(relief, (resolution, resolution), interpolation=cv2.INTER_AREA),
+        albedo=np.clip(color, 0.01, 0.9).astype(np.float32),
+        roughness=np.clip(roughness, 0.18, 0.7).astype(np.float32),
+    )
+
+
+def _noise(wavelength: float, rng: np.random.Generator, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
+    return smooth_noise((TEXTURE, TEXTURE), wavelength * _TEXELS_PER_METRE, rng, octaves=octaves, gain=gain)
+
+
+def _jitter(rng: np.random.Generator) -> np.ndarray:
+    return np.exp(rng.normal(0.0, 0.08, 3))
+
+
+def _mix(color: np.ndarray, other: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return color + (other - color) * share[..., None]
+
+
+def _warped(field: np.ndarray, warp: tuple[np.ndarray, np.ndarray], amount: float) -> np.ndarray:
+    """The field looked up at displaced places, which turns round blobs into things that look grown."""
+    rows, columns = np.indices(field.shape, dtype=np.float32)
+    shift = np.float32(amount * _TEXELS_PER_METRE)
+    return cv2.remap(
+        field, columns + shift * warp[0], rows + shift * warp[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+    )
+
+
+def _cavity(resolution: int) -> np.ndarray:
+    """Walls that rise around the middle, so that no picture looks past the tissue's end."""
+    unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
+    radius = np.hypot(*np.meshgrid(unit, unit))
+    return (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
+
+
+def _draw_vessels(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Branching lines that get thinner, 1 in their middle and 0 away from them."""
+    canvas = np.zeros((TEXTURE, TEXTURE), np.float32)
+    stack = [
+        (rng.uniform(0.1, 0.9, 2) * TEXTURE, rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.5) * 1e-3)
+        for _ in range(count)
+    ]
+    step = 0.0012 * _TEXELS_PER_METRE
+    while stack:
+        point, heading, width = stack.pop()
+        bend = 0.0
+        for _ in range(rng.integers(25, 90)):
+            bend = 0.85 * bend + rng.normal(0.0, 0.06)
+            heading += bend
+            target = point + step * np.array([np.cos(heading), np.sin(heading)])
+            thickness = max(1, round(width * _TEXELS_PER_METRE))
+            cv2.line(canvas, _pixel(point), _pixel(target), 1.0, thickness, cv2.LINE_AA, shift=4)
+            point, width = target, width * 0.99
+            if width > 0.0003 and rng.random() < 0.05:
+                stack.append((point, heading + rng.choice([-1, 1]) * rng.uniform(0.4, 1.0), width * 0.65))
+    return cv2.GaussianBlur(canvas, (0, 0), 1.8)
+
+
+def _pixel(point: np.ndarray) -> tuple[int, int]:
+    return int(point[0] * 16), int(point[1] * 16)
