@@ -1,0 +1,170 @@
+"""One frame, optimized step by step. Command line, viewer, batch runs and tests all drive this object."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
+
+from ..data import Frame
+from ..features.extractor import FeatureExtractor
+from ..scene import Scene, SceneState
+from .objective import Evaluation, FrameObjective
+from .parameters import ParameterVector
+from .settings import FreeParameters, OptimizerSettings
+from .solvers import make_solver
+
+_WIDE_SHARE = 0.5
+"""Share of the iterations that descend in the wide attention."""
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A point of an optimization and what it looks like. A copy: nothing later changes it."""
+
+    index: int
+    """Number of steps before it; 0 is the start."""
+    state: SceneState
+    loss: float
+    """In the final attention, so comparable through all iterates."""
+    terms: dict[str, float]
+    """Parts of the objective that was descended."""
+    gradient_norms: dict[str, float]
+    """Per unknown, in radian-like units."""
+    seconds: float
+    """Duration of this iteration [s]."""
+    arm_names: tuple[str, ...]
+    silhouette: Float[np.ndarray, "cameras h w"]
+    """At the working resolution."""
+    image: UInt8[np.ndarray, "cameras h w 3"]
+    """Rendered arms at the working resolution, RGB."""
+    attention: Float[np.ndarray, "cameras h w"]
+    similarity: Float[np.ndarray, "cameras h w"]
+    """Cosine similarity of features, at most 1."""
+
+    def joint_positions(self) -> dict[str, np.ndarray]:
+        """Arm name -> joint positions [dofs], [rad, m]."""
+        values = (value.cpu().double().numpy() for value in self.state.joint_positions)
+        return dict(zip(self.arm_names, values, strict=True))
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is kept of every iterate, in a few bytes."""
+
+    index: int
+    loss: float
+    seconds: float
+
+
+class FrameOptimizer:
+    """ACS optimization of one frame (paper, section 3), one iterate at a time.
+
+    Args:
+        scene: arms and cameras.
+        frame: observed images and measured joint positions.
+        backgrounds: camera name -> mean background BG_m.
+        extractor: the feature network.
+        start: arm name -> joint positions to start from, the measured ones by default.
+        settings: solver, loss, steps.
+        free: what is unknown.
+        cameras: names of the cameras that take part, all by default.
+
+    Raises:
+        SettingsError: an image or background is missing or of the wrong size, or nothing is free.
+        RobotError: `start` lacks an arm or has the wrong number of joint positions.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        frame: Frame,
+        backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        extractor: FeatureExtractor,
+        *,
+        start: Mapping[str, ArrayLike] | None = None,
+        settings: OptimizerSettings | None = None,
+        free: FreeParameters | None = None,
+        cameras: Sequence[str] | None = None,
+    ) -> None:
+        self.settings = settings or OptimizerSettings()
+        scene = scene.with_cameras(cameras)
+        self._arm_names = tuple(arm.name for arm in scene.arms)
+        state = scene.state(frame.measured if start is None else start, extractor.device)
+        self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
+        self._objective = FrameObjective(scene, frame.images, backgrounds, extractor, self._parameters, self.settings)
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to the start; the history is emptied."""
+        self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
+        self._solver = make_solver(self.settings)
+        self.history: list[Progress] = []
+        self.best: Iterate | None = None
+        self.stop_reason: str | None = None
+
+    def cancel(self) -> None:
+        """Stop; what was reached stays in `best` and `history`."""
+        self.stop_reason = self.stop_reason or "cancelled"
+
+    def step(self) -> Iterate | None:
+        """Evaluate the present point and move on; None once the optimization has stopped.
+
+        The first call gives iterate 0, the start.
+        """
+        if self.stop_reason is not None:
+            return None
+        began = time.perf_counter()
+        index = len(self.history)
+        last = self.settings.solver == "none" or index >= self.settings.iterations
+        wide = index < _WIDE_SHARE * self.settings.iterations
+        offsets = self._offsets.clone().requires_grad_(not last)
+        evaluation = self._objective(offsets, wide=wide)
+        gradient = torch.zeros_like(self._offsets)
+        if not last:
+            (gradient,) = torch.autograd.grad(evaluation.objective, offsets)
+            gradient = torch.nan_to_num(gradient)
+            self._offsets = self._parameters.clamp(self._offsets + self._solver(gradient, index))
+        iterate = self._iterate(index, offsets.detach(), evaluation, gradient, time.perf_counter() - began)
+        self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
+        if self.best is None or iterate.loss < self.best.loss:
+            self.best = iterate
+        self.stop_reason = self._reason_to_stop(last)
+        return iterate
+
+    def __iter__(self) -> Iterator[Iterate]:
+        """Step until the optimization stops."""
+        while (iterate := self.step()) is not None:
+            yield iterate
+
+    def _reason_to_stop(self, last: bool) -> str | None:
+        if last:
+            return "not optimized" if self.settings.solver == "none" else "iterations"
+        losses = [entry.loss for entry in self.history]
+        patience = self.settings.patience
+        if self.settings.tolerance > 0 and len(losses) > patience:
+            if min(losses[:-patience]) - min(losses) < self.settings.tolerance:
+                return "converged"
+        return None
+
+    def _iterate(
+        self, index: int, offsets: torch.Tensor, evaluation: Evaluation, gradient: torch.Tensor, seconds: float
+    ) -> Iterate:
+        rendering = evaluation.rendering
+        image = (rendering.image.detach().movedim(-3, -1) * 255.0).to(torch.uint8)
+        return Iterate(
+            index=index,
+            state=self._parameters.state(offsets).detached(),
+            loss=evaluation.loss,
+            terms={"similarity": float(evaluation.objective.detach()) - evaluation.prior, "prior": evaluation.prior},
+            gradient_norms=dict(zip(self._parameters.names, gradient.abs().tolist(), strict=True)),
+            seconds=seconds,
+            arm_names=self._arm_names,
+            silhouette=rendering.silhouette.detach().cpu().numpy().copy(),
+            image=image.cpu().numpy().copy(),
+            attention=evaluation.attention.cpu().numpy(),
+            similarity=evaluation.similarity.cpu().numpy(),
+        )

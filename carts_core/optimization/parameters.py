@@ -1,0 +1,156 @@
+"""Between a scene's state and the vector of unknowns that a solver sees."""
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import SettingsError
+from ..scene import Scene, SceneState
+from .settings import FreeParameters
+
+_FOCAL_SCALE = 1.0
+"""One unit of a focal unknown is a factor of e; a principal point moves by the focal length."""
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A stretch of the vector of unknowns."""
+
+    kind: str
+    index: int
+    """Of the arm or the camera."""
+    columns: tuple[int, ...]
+    """Free joints of the arm; empty for other kinds."""
+    start: int
+    size: int
+
+
+class ParameterVector:
+    """Unknowns as one vector of offsets from a start, in radian-like units.
+
+    A prismatic joint or a translation counts `lever` metres as one radian, so that one step size suits all.
+
+    Args:
+        scene: arms and cameras.
+        start: where all offsets are 0.
+        free: what is unknown.
+        lever: [m/rad].
+
+    Raises:
+        SettingsError: nothing is free, or `free` names an arm or a joint that does not exist.
+    """
+
+    def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, lever: float) -> None:
+        self.start = start
+        self._lever = lever
+        self.names: list[str] = []
+        self._blocks: list[_Block] = []
+        self._check_names(scene, free)
+        chosen = [i for i, arm in enumerate(scene.arms) if not free.arms or arm.name in free.arms]
+        lower, upper = [], []
+        for index in chosen if free.joints else ():
+            self._add_joints(scene, index, free, lower, upper)
+        for index in chosen if free.base_frames else ():
+            self._add("base_frame", index, f"{scene.arms[index].name}/base", ("rx", "ry", "rz", "x", "y", "z"))
+        for index, camera in enumerate(scene.cameras):
+            if free.extrinsics:
+                self._add("extrinsics", index, f"{camera.name}/camera", ("rx", "ry", "rz", "x", "y", "z"))
+            if free.intrinsics:
+                self._add("intrinsics", index, camera.name, ("fx", "fy", "cx", "cy"))
+        if not self.names:
+            raise SettingsError("nothing is free to be optimized. Free the joints, a base frame or a camera.")
+        count, bounded = len(self.names), len(lower)
+        device = start.T_world_base.device
+        infinite = [float("inf")] * (count - bounded)
+        self.lower = torch.tensor([*lower, *(-value for value in infinite)], device=device)
+        self.upper = torch.tensor([*upper, *infinite], device=device)
+
+    def _check_names(self, scene: Scene, free: FreeParameters) -> None:
+        for name in free.arms:
+            scene.arm(name)
+        known = {j for arm in scene.arms for j in arm.robot.joint_names}
+        known |= {f"{arm.name}/{j}" for arm in scene.arms for j in arm.robot.joint_names}
+        for joint in free.locked_joints:
+            if joint not in known:
+                raise SettingsError(f"locked joint {joint!r} does not exist. Known are: {', '.join(sorted(known))}.")
+
+    def _add(self, kind: str, index: int, owner: str, names: tuple[str, ...], columns: tuple[int, ...] = ()) -> None:
+        self._blocks.append(_Block(kind, index, columns, len(self.names), len(names)))
+        self.names += [f"{owner}/{name}" for name in names]
+
+    def _add_joints(
+        self, scene: Scene, index: int, free: FreeParameters, lower: list[float], upper: list[float]
+    ) -> None:
+        arm = scene.arms[index]
+        locked = set(free.locked_joints)
+        columns = tuple(
+            column
+            for column, joint in enumerate(arm.robot.joint_names)
+            if joint not in locked and f"{arm.name}/{joint}" not in locked
+        )
+        if not columns:
+            return
+        for column in columns:
+            scale = self._joint_scale(scene, index, column)
+            low, high = arm.robot.joint_limits[column].tolist()
+            value = self.start.joint_positions[index][..., column]
+            # A start outside the limits (a wrong calibration of the encoder, say) may stay, but not go further out.
+            lower.append((min(low, float(value.min())) - float(value.min())) / scale)
+            upper.append((max(high, float(value.max())) - float(value.max())) / scale)
+        self._add("joints", index, arm.name, tuple(arm.robot.joint_names[c] for c in columns), columns)
+        block = self._blocks[-1]
+        scales = torch.tensor([self._joint_scale(scene, index, c) for c in columns])
+        self._joint_scales = {**getattr(self, "_joint_scales", {}), block.start: scales}
+
+    def _joint_scale(self, scene: Scene, index: int, column: int) -> float:
+        return self._lever if scene.arms[index].robot.joint_types[column] == "prismatic" else 1.0
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+        """Offsets that respect the joint limits."""
+        return torch.minimum(torch.maximum(offsets, self.lower), self.upper)
+
+    def state(self, offsets: Float[Tensor, "*batch n"]) -> SceneState:
+        """The scene's state at the given offsets, differentiable."""
+        joints = list(self.start.joint_positions)
+        T_world_base, T_camera_world = self.start.T_world_base, self.start.T_camera_world
+        intrinsics = self.start.intrinsics
+        for block in self._blocks:
+            part = offsets[..., block.start : block.start + block.size]
+            if block.kind == "joints":
+                columns = torch.tensor(block.columns, device=part.device)
+                step = part * self._joint_scales[block.start].to(part)
+                joints[block.index] = joints[block.index].index_add(-1, columns, step)
+            elif block.kind == "base_frame":
+                # The base frame turns about its own origin, the remote centre, and not about the world's.
+                T_world_base = _update(T_world_base, block.index, lambda T, s=part: T @ self._rigid(s))
+            elif block.kind == "extrinsics":
+                T_camera_world = _update(T_camera_world, block.index, lambda T, s=part: self._rigid(s) @ T)
+            else:
+                intrinsics = _update(intrinsics, block.index, lambda K, s=part: _scaled_intrinsics(K, s), matrix=False)
+        return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics)
+
+    def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+        rotation = roma.rotvec_to_rotmat(step[..., :3])
+        translation = step[..., 3:] * self._lever
+        top = torch.cat([rotation, translation[..., None]], -1)
+        bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], device=step.device).expand(*step.shape[:-1], 1, 4)
+        return torch.cat([top, bottom], -2)
+
+
+def _scaled_intrinsics(K: Tensor, step: Tensor) -> Tensor:
+    focal = K[..., :2] * torch.exp(_FOCAL_SCALE * step[..., :2])
+    return torch.cat([focal, K[..., 2:] + K[..., :2] * step[..., 2:]], -1)
+
+
+def _update(stack: Tensor, index: int, change, *, matrix: bool = True) -> Tensor:
+    """`stack` with entry `index` of its arms or cameras replaced by `change(entry)`."""
+    dim = -3 if matrix else -2
+    parts = list(stack.unbind(dim))
+    parts[index] = change(parts[index])
+    return torch.stack(parts, dim)
