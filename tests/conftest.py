@@ -1,7 +1,7 @@
 """What several tests need: reference data where it is present, and small sequences made on the spot."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+
 from carts_core.camera import Camera
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
@@ -18,11 +19,11 @@ from carts_core.scene import Arm, Scene
 ROOT = Path(__file__).resolve().parents[1]
 FOCAL_PER_WIDTH = 1.2
 BIAS = 0.01
-"""What the tiny sequence's measured revolute joints are off by [rad]; a tenth of the number, in metres, for prismatic ones."""
+"""What the measured revolute joints are off by [rad]; prismatic ones are off by a tenth of the number [m]."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> object:
+def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> Iterator[None]:
     """Decimated meshes are cached between test runs, but not in the home folder."""
     assert pytestconfig.cache is not None
     with pytest.MonkeyPatch.context() as patch:

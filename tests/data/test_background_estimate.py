@@ -1,0 +1,63 @@
+"""The estimated background: what is behind a thing that moves, and a guess where it never moves away."""
+
+import numpy as np
+import pytest
+
+from carts_core.data.background import estimate_background, fill, spread, widen
+from carts_core.errors import SequenceError
+
+RNG = np.random.default_rng(5)
+SCENE = RNG.integers(30, 220, (60, 80, 3)).astype(np.uint8)
+
+
+def views(columns: list[int], width: int = 10):
+    """The scene with a black bar at each of these columns, and the bar as cover."""
+    for column in columns:
+        image, cover = SCENE.copy(), np.zeros((60, 80), bool)
+        image[:, column : column + width] = 0
+        cover[:, column : column + width] = True
+        yield image, cover
+
+
+def test_what_is_uncovered_in_some_view_is_found_exactly():
+    assert np.array_equal(estimate_background(views([0, 5, 70])), SCENE)
+
+
+def test_the_median_leaves_out_an_uncovered_outlier():
+    given = [(SCENE, np.zeros((60, 80), bool))] * 4 + [(255 - SCENE, np.zeros((60, 80), bool))]
+    assert np.array_equal(estimate_background(given), SCENE)
+
+
+def test_an_even_number_of_views_gives_the_mean_of_the_middle_two():
+    values = [10, 20, 31, 200]
+    given = [(np.full((4, 4, 3), value, np.uint8), np.zeros((4, 4), bool)) for value in values]
+    assert (estimate_background(given) == 26).all()
+
+
+def test_what_is_never_uncovered_is_filled_in_smoothly():
+    x = np.linspace(40, 200, 80)
+    ramp = np.tile(np.rint(x).astype(np.uint8)[None, :, None], (60, 1, 3))
+    hole = np.zeros((60, 80), bool)
+    hole[20:40, 30:50] = True
+    filled = fill(np.where(hole[..., None], 0, ramp).astype(np.uint8), hole)
+    assert np.array_equal(filled[~hole], ramp[~hole])
+    assert np.abs(filled[hole].astype(int) - ramp[hole]).max() < 25
+
+
+def test_a_scene_that_is_always_covered_is_refused():
+    with pytest.raises(SequenceError, match="cover every pixel of every frame. Check T_camera_world"):
+        estimate_background([(SCENE, np.ones((60, 80), bool))])
+
+
+def test_a_silhouette_is_widened_by_a_share_of_the_width():
+    dot = np.zeros((480, 640), bool)
+    dot[240, 320] = True
+    rows, columns = np.nonzero(widen(dot))
+    assert (np.ptp(rows), np.ptp(columns)) == (30, 30)
+
+
+def test_frames_are_spread_from_the_first_to_the_last():
+    assert spread(5) == [0, 1, 2, 3, 4]
+    assert spread(1) == [0]
+    chosen = spread(1000)
+    assert (len(chosen), chosen[0], chosen[-1]) == (30, 0, 999)

@@ -1,0 +1,279 @@
+"""Sequence: what is wrong with a file is said with the file, the place in it, what is allowed and the remedy."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.errors import RobotError, SequenceError
+from carts_core.resources import shipped_robot
+
+Edit = Callable[[str], str]
+MIRRORED = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
+
+
+def line(key: str, new: str) -> Edit:
+    """An edit that replaces the line `key = ...` by `new`."""
+
+    def edit(text: str) -> str:
+        edited, count = re.subn(rf"^{re.escape(key)} = .*$", lambda _: new, text, flags=re.MULTILINE)
+        assert count >= 1
+        return edited
+
+    return edit
+
+
+def error_of(path: Path, kind: type[Exception] = SequenceError) -> str:
+    with pytest.raises(kind) as caught:
+        Sequence.open(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("edit", "parts"),
+    [
+        (line("format", 'format = "carts-sequence/9"'), ["format is 'carts-sequence/9'", "carts-sequence/1"]),
+        (line("format", ""), ["format is '(none)'", "carts-sequence/1"]),
+        (line("domains", 'domain = ["regular"]'), ["domain is not a key", "Did you mean 'domains'"]),
+        (line("domains", "domains = []"), ["domains is []", 'domains = ["regular", "smoke"]']),
+        (line("domains", 'domains = ["a", "a"]'), ["domains names one twice: a, a"]),
+        (line("table", 'tabel = "kinematics.csv"'), ["[kinematics]: table is missing", "Is 'tabel' a misspelling"]),
+        (line("table", 'table = "other.csv"'), ["kinematics table", "other.csv is missing", "Correct the path"]),
+        (line("timestamp", 'timestamp = "tome"'), ["no column 'tome'", "timestamp names", "Did you mean 'time'"]),
+        (line("timestamp", "timestamp = 3"), ["timestamp is 3, but must be text"]),
+        (line("frame_id", 'frame_id = "001"'), ["frame_id is '001'", "{frame:03d}"]),
+        (line("frame_id", 'frame_id = "{frame:q}"'), ["'{frame:q}' cannot be filled in"]),
+        (line("robot", 'robot = "builtin:psm"'), ["robot is 'builtin:psm'", "builtin:psm_lnd"]),
+        (line("yaw", 'yaww = "yaw"'), ["[arms.joints]", "yaww is not a joint", "Did you mean 'yaw'", "insertion"]),
+        (line("yaw", ""), ["[arms.joints]: yaw is missing", "yaw = 0.0", "[rad]"]),
+        (line("insertion", ""), ["insertion is missing", "[m]"]),
+        (line("yaw", 'yaw = "yow"'), ["kinematics.csv has no column 'yow'", "joints: yaw", "Did you mean 'yaw'"]),
+        (line("yaw", 'yaw = { column = "yaw", unit = "mm" }'), ["unit is 'mm', but must be one of: rad, deg"]),
+        (line("yaw", 'yaw = { column = "yaw", units = "deg" }'), ["units is not a key", "Did you mean 'unit'"]),
+        (line("yaw", "yaw = 3"), ["yaw is 3, but must be text or a table"]),
+        (line("jaw", 'jaw = "jaw"\n[arms.defaults]\njaw = 0.1'), ["jaw is given, but the joint has a column"]),
+        (line("size", "size = [96]"), ["'left': size is [96]", "[640, 480]"]),
+        (line("K", "K = [[0, 0, 1], [0, 5, 1], [0, 0, 1]]"), ["'left'", "fx = 0", "must be positive"]),
+        (line("K", "K = [[5, 0, 1], [0, -5, 1], [0, 0, 1]]"), ["'left'", "fy = -5", "must be positive"]),
+        (line("K", "K = [1, 2, 3]"), ["K is [1, 2, 3]", "3 rows of 3 numbers", "fx = ..."]),
+        (line("K", "K = [[5, 0, 0], [0, 5, 0], [1, 1, 1]]"), ["K is", "rows must not be swapped"]),
+        (line("K", 'K = "calibration.json"'), ["K is 'calibration.json'", "file.json#name"]),
+        (line("K", 'K = "none.json#K"'), ["K points at", "none.json, which is missing"]),
+        (line("size", "size = [96, 72]\npixel_center = 1.0"), ["pixel_center is 1.0", "0.5", "0.0"]),
+        (line("size", "size = [96, 72]\ndistortion = [0.1]"), ["'left'", "there are 1 distortion coefficients"]),
+        (line("size", 'size = [96, 72]\ndistortion = ["a"]'), ["distortion is ['a']", "k1 k2 p1 p2"]),
+        (line("T_camera_world", f"T_camera_world = {MIRRORED}"), ["'left': T_camera_world mirrors", "must be +1"]),
+        (line("T_camera_world", "T_camera_world = [[1, 2], [3, 4]]"), ["T_camera_world has shape (2, 2)"]),
+        (
+            line("T_camera_world", f"T_camera_world = {np.diag([1.01, 1, 1, 1]).tolist()}"),
+            ["T_camera_world is not rigid", "allowed is 0.001"],
+        ),
+        (line("robot", f'robot = "builtin:psm_lnd"\nT_world_base = {MIRRORED}'), ["'PSM1': T_world_base mirrors"]),
+        (line("images", 'image = "{frame}.png"'), ["'left': images is missing", "Is 'image' a misspelling"]),
+        (line("images", 'images = "left.png"'), ["images is 'left.png'", "Put {frame} into it"]),
+        (line("images", 'images = "{fram}.png"'), ["images is '{fram}.png'", "Put {frame} into it"]),
+        (line("images", 'images = "{camera}/{frame}/{x}.png"'), ["unknown placeholder 'x'", "{frame}, {index}"]),
+        (line("images", 'images = "regular/left/*.jpg"'), ["matches 0 files", "has 3 rows"]),
+        (line("images", 'images = { smoke = "{frame}.png" }'), ["images.smoke is for an unknown domain", "regular"]),
+        (line("images", "images = {}"), ["images is missing for: regular"]),
+        (line("images", 'images = "left.mp4"'), ["video", "left.mp4 is missing"]),
+        (line("masks", 'masks = "mask.png"'), ["masks is 'mask.png'", "Put {frame} into it"]),
+        (line("masks", 'background = "bg.png"'), ["background points at", "bg.png, which is missing"]),
+        (line("masks", 'mask = "{frame}.png"'), ["mask is not a key of the format", "Did you mean 'masks'"]),
+    ],
+)
+def test_a_wrong_key_is_named_with_the_file_and_the_remedy(tiny_sequence, edit, parts):
+    path = tiny_sequence(edit=edit)
+    message = error_of(path)
+    assert str(path.parent) in message
+    for part in parts:
+        assert part in message
+
+
+def test_one_pattern_for_several_domains_must_tell_them_apart(tiny_sequence):
+    path = tiny_sequence(domains=("regular", "dark"), edit=line("images", 'images = "regular/left/{frame}.png"'))
+    assert "for all 2 domains. Put {domain} into it" in error_of(path)
+
+
+def test_two_cameras_of_one_name_are_refused(tiny_sequence):
+    path = tiny_sequence(cameras=("left", "right"), edit=lambda text: text.replace('"right"', '"left"'))
+    assert "[[cameras]] has the name 'left' twice" in error_of(path)
+
+
+def test_a_sequence_without_arms_is_refused(tiny_sequence):
+    path = tiny_sequence(edit=lambda text: text[: text.index("[[arms]]")] + text[text.index("[[cameras]]") :])
+    assert "[[arms]] is missing. Describe at least one" in error_of(path)
+
+
+def test_a_missing_sequence_file_is_named(tmp_path):
+    assert f"sequence file {tmp_path / 'none.toml'} is missing" in error_of(tmp_path / "none.toml")
+
+
+def test_a_folder_is_not_a_sequence_file(tmp_path):
+    assert "is a folder. Give the .toml file inside it" in error_of(tmp_path)
+
+
+def test_broken_toml_is_named_with_its_line(tiny_sequence):
+    path = tiny_sequence(edit=lambda text: text.replace("[kinematics]", "[kinematics"))
+    message = error_of(path)
+    assert "not readable TOML" in message
+    assert "line 4" in message
+
+
+def edit_cell(path: Path, row: int, column: str, value: str) -> None:
+    rows = [text.split(",") for text in path.read_text().splitlines()]
+    rows[row][rows[0].index(column)] = value
+    path.write_text("\n".join(map(",".join, rows)) + "\n")
+
+
+@pytest.mark.parametrize("value", ["nan", "NaN", "inf", "", "0,1".replace(",", ";"), "unknown"])
+@pytest.mark.parametrize("table", ["kinematics.csv", "truth.csv"])
+def test_a_cell_that_is_not_a_finite_number_is_named_by_line_and_column(tiny_sequence, table, value):
+    path = tiny_sequence()
+    edit_cell(path.parent / table, 2, "wrist_yaw", value)
+    message = error_of(path)
+    assert f"{path.parent / table}, line 3, column 'wrist_yaw': {value!r} is not a finite number" in message
+    assert "Correct the cell" in message
+
+
+def test_degrees_without_a_unit_are_noticed(tiny_sequence):
+    path = tiny_sequence()
+    edit_cell(path.parent / "kinematics.csv", 1, "pitch", "-31.5")
+    message = error_of(path)
+    assert "line 2, column 'pitch': read as rad" in message
+    assert 'pitch = { column = "pitch", unit = "deg" }' in message
+
+
+def test_millimetres_without_a_unit_are_noticed(tiny_sequence):
+    path = tiny_sequence()
+    edit_cell(path.parent / "kinematics.csv", 1, "insertion", "151")
+    assert 'insertion = { column = "insertion", unit = "mm" }' in error_of(path)
+
+
+def test_a_frame_that_comes_twice_is_named_with_both_lines(tiny_sequence):
+    path = tiny_sequence()
+    edit_cell(path.parent / "kinematics.csv", 3, "frame", "1")
+    assert "frame '001' is in line 2 and again in line 4" in error_of(path)
+
+
+def test_truth_with_another_number_of_rows_is_refused(tiny_sequence):
+    path = tiny_sequence()
+    text = (path.parent / "truth.csv").read_text().splitlines()
+    (path.parent / "truth.csv").write_text("\n".join(text[:-1]))
+    message = error_of(path)
+    assert f"{path.parent / 'truth.csv'} has 2 rows, but the kinematics table has 3" in message
+
+
+def test_truth_of_other_frames_is_refused(tiny_sequence):
+    path = tiny_sequence()
+    edit_cell(path.parent / "truth.csv", 3, "frame", "7")
+    assert "truth.csv, line 4 is frame '007', but the kinematics table has frame '003' there" in error_of(path)
+
+
+def test_more_rows_than_images_name_the_missing_images(tiny_sequence):
+    path = tiny_sequence(frames=6)
+    for row in range(2, 7):
+        (path.parent / f"regular/left/{row:03d}.png").unlink()
+    message = error_of(path)
+    assert f"5 of 6 files are missing: {path.parent / 'regular/left/002.png'} (frame 002)" in message
+    assert "and 2 more" in message
+    assert "remove the rows" in message
+
+
+def test_a_missing_mask_names_the_key_for_sparse_masks(tiny_sequence):
+    path = tiny_sequence()
+    (path.parent / "masks/left/002.png").unlink()
+    message = error_of(path)
+    assert "1 of 3 files are missing" in message
+    assert "sparse_masks = true" in message
+
+
+def test_a_glob_with_another_number_of_files_than_rows_is_refused(tiny_sequence):
+    path = tiny_sequence(edit=line("images", 'images = "regular/left/*.png"'))
+    shutil.copy(path.parent / "regular/left/001.png", path.parent / "regular/left/extra.png")
+    message = error_of(path)
+    assert "'regular/left/*.png' matches 4 files" in message
+    assert "has 3 rows" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["has no rows", "a header and one row per frame"]),
+        ("frame,yaw\n", ["has no rows"]),
+        ("frame;yaw\n1;2\n", ["not separated by ','", "delimiter = ';'"]),
+        ("frame,yaw,yaw\n1,2,3\n", ["several columns called 'yaw'"]),
+        ("frame,yaw\n1,2\n2\n", ["line 3 has 1 cells, but the header has 2"]),
+        ("row,yaw\n1,2\n", ["has no column 'frame'", "`frame` in [kinematics]", "row, yaw"]),
+        ("frame,yaw\na,2\n", ["'{frame:03d}' cannot be filled in", "'a'"]),
+    ],
+)
+def test_a_table_of_the_wrong_form_is_refused(tiny_sequence, text, parts):
+    path = tiny_sequence()
+    (path.parent / "kinematics.csv").write_text(text)
+    message = error_of(path)
+    for part in ["kinematics.csv", *parts]:
+        assert part in message
+
+
+def test_a_missing_mesh_names_the_file_and_the_remedy(tiny_sequence, tmp_path):
+    folder = tmp_path / "robot"
+    shutil.copytree(shipped_robot().parent, folder)
+    mesh = next((folder / "meshes").iterdir())
+    mesh.unlink()
+    path = tiny_sequence(edit=line("robot", f'robot = "robot/{shipped_robot().name}"'))
+    assert mesh.name in error_of(path, RobotError)
+
+
+def test_a_missing_robot_and_a_wrong_base_link_are_named(tiny_sequence):
+    message = error_of(tiny_sequence(edit=line("robot", 'robot = "none.urdf"')), RobotError)
+    assert "none.urdf is missing" in message
+    message = error_of(tiny_sequence(edit=line("robot", 'robot = "builtin:psm_lnd"\nbase_link = "none"')), RobotError)
+    assert "no link is called 'none'" in message
+
+
+def test_an_image_that_vanishes_after_opening_is_named(tiny_sequence):
+    path = tiny_sequence()
+    sequence = Sequence.open(path)
+    image = path.parent / "regular/left/002.png"
+    image.unlink()
+    with pytest.raises(SequenceError, match=f"image {image} is missing. Put it back"):
+        sequence.frame(1)
+    assert sequence.frame(0).images
+
+
+@pytest.mark.parametrize("name", ["regular/left/002.png", "masks/left/002.png"])
+def test_an_image_or_mask_of_another_size_is_named_with_both_sizes(tiny_sequence, name):
+    path = tiny_sequence()
+    cv2.imwrite(str(path.parent / name), np.full((48, 64), 255, np.uint8))
+    sequence = Sequence.open(path)
+    with pytest.raises(
+        SequenceError, match=r"002.png is 64 x 48 pixels, but camera 'left' is 96 x 72 .*Correct `size`"
+    ):
+        sequence.frame(1)
+
+
+def test_a_background_of_another_size_is_refused(tiny_sequence):
+    path = tiny_sequence(edit=lambda text: text.replace('images = "', 'background = "bg.png"\nimages = "'), masks=False)
+    cv2.imwrite(str(path.parent / "bg.png"), np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(SequenceError, match=r"background .*bg.png is 10 x 10 pixels, but camera 'left' is 96 x 72"):
+        Sequence.open(path).background("left")
+
+
+def test_unknown_frames_domains_and_cameras_are_named_with_those_that_exist(tiny_sequence):
+    sequence = Sequence.open(tiny_sequence())
+    with pytest.raises(SequenceError, match="no frame number 3; its frames are 0 to 2"):
+        sequence.frame(3)
+    with pytest.raises(SequenceError, match="no frame number -1"):
+        sequence.frame(-1)
+    with pytest.raises(SequenceError, match="no domain 'regulr'. Did you mean 'regular'"):
+        sequence.frame(0, "regulr")
+    with pytest.raises(SequenceError, match="no camera 'lift'. Did you mean 'left'"):
+        sequence.frame(0, cameras=["lift"])
+    with pytest.raises(SequenceError, match="no camera 'right'"):
+        sequence.background("right")

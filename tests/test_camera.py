@@ -1,0 +1,100 @@
+"""Camera: what is refused, and where pixels go when distortion is removed or the size changes."""
+
+import cv2
+import numpy as np
+import pytest
+
+from carts_core.camera import Camera, rigid_transform
+from carts_core.errors import SettingsError
+
+INTRINSICS = (110.0, 115.0, 63.0, 46.0)
+BARREL = (-0.3, 0.08, 0.002, -0.001)
+
+
+def camera(**changes: object) -> Camera:
+    values: dict = {"name": "left", "width": 128, "height": 96, "intrinsics": INTRINSICS, "T_camera_world": np.eye(4)}
+    return Camera(**{**values, **changes})
+
+
+def spot_image(u: float, v: float) -> np.ndarray:
+    """A bright spot whose centre is at (u, v) [px], pixel centres at +0.5."""
+    x, y = np.meshgrid(np.arange(128) + 0.5, np.arange(96) + 0.5)
+    return (255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 3.0**2))).astype(np.float32)
+
+
+def spot_centre(image: np.ndarray) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(128) + 0.5, np.arange(96) + 0.5)
+    return np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
+
+
+def distorted_projection(point: np.ndarray) -> np.ndarray:
+    """Where a point lands in the recorded image, by OpenCV's model with its own pixel centres, shifted to ours."""
+    K_opencv = camera().K
+    K_opencv[:2, 2] -= 0.5
+    projected, _ = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), K_opencv, np.array(BARREL))
+    return projected.ravel() + 0.5
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, 1.0), (0.3, -0.2, 1.0), (-0.35, 0.25, 1.0)])
+def test_an_undistorted_point_is_where_the_pinhole_projects_it(point):
+    distorted = camera(distortion=BARREL)
+    image = distorted.undistort(spot_image(*distorted_projection(np.array(point))))
+    u, v, w = distorted.K @ point
+    assert spot_centre(image) == pytest.approx([u / w, v / w], abs=0.15)
+
+
+def test_undistorting_moves_the_spot_by_more_than_the_tolerance_of_the_test_above():
+    point = np.array([-0.35, 0.25, 1.0])
+    u, v, w = camera().K @ point
+    assert np.linalg.norm(distorted_projection(point) - [u / w, v / w]) > 1.0
+
+
+def test_without_distortion_an_image_stays_as_it_is():
+    image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+    assert camera().undistort(image) is image
+    assert camera(distortion=(0.0,) * 5).undistort(image) is image
+
+
+def test_an_undistorted_mask_is_still_a_mask():
+    mask = spot_image(100, 75) > 100
+    undistorted = camera(distortion=BARREL).undistort(mask)
+    assert undistorted.dtype == bool
+    assert 0 < undistorted.sum() < mask.size
+    assert (undistorted != mask).any()
+
+
+def test_an_image_of_another_size_is_not_undistorted():
+    with pytest.raises(SettingsError, match=r"'left' is 128 x 96 but the image is 64 x 48"):
+        camera(distortion=BARREL).undistort(np.zeros((48, 64, 3), np.uint8))
+
+
+def test_a_resized_camera_projects_to_the_same_place_in_the_view():
+    small = camera(distortion=BARREL).resized(64, 24)
+    point = np.array([0.2, -0.1, 1.0])
+    u, v, w = camera().K @ point
+    assert (small.K @ point)[:2] == pytest.approx([u / w * 64 / 128, v / w * 24 / 96])
+    assert (small.width, small.height, small.distortion) == (64, 24, ())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 0}, "the image size is 0 x 96"),
+        ({"intrinsics": (0.0, 1.0, 2.0, 3.0)}, "focal lengths .* must be positive"),
+        ({"intrinsics": (1.0, -1.0, 2.0, 3.0)}, "focal lengths .* must be positive"),
+        ({"intrinsics": (1.0, 1.0, float("nan"), 3.0)}, "four finite numbers"),
+        ({"distortion": (0.1, 0.2, 0.3)}, "there are 3 distortion coefficients. Give 0, 4, 5, 8, 12 or 14"),
+        ({"T_camera_world": np.diag([2.0, 2.0, 2.0, 1.0])}, "T_camera_world is not rigid: .* off the identity by 3"),
+        ({"T_camera_world": np.diag([1.0, 1.0, -1.0, 1.0])}, "T_camera_world mirrors"),
+        ({"T_camera_world": np.eye(3)}, r"T_camera_world has shape \(3, 3\)"),
+        ({"T_camera_world": np.eye(4).T + np.eye(4, k=-3)}, "the last row of T_camera_world"),
+    ],
+)
+def test_an_impossible_camera_is_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
+        camera(**changes)
+
+
+def test_a_transform_that_is_not_made_of_numbers_is_refused():
+    with pytest.raises(SettingsError, match="T_world_base is not a matrix of numbers"):
+        rigid_transform([["a", "b"], ["c"]], "T_world_base")
