@@ -1,7 +1,7 @@
 """Forward kinematics of a URDF tree, differentiable and batched (pytorch-kinematics)."""
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytorch_kinematics
@@ -77,7 +77,7 @@ class Kinematics:
         probes = torch.stack([torch.zeros(len(self.joint_names)), torch.full((len(self.joint_names),), 0.1)]).double()
         Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
         if not torch.allclose(Ts_root_base[0], Ts_root_base[1]):
-            raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint. Name a link before the first.")
+            raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint; name one that does not.")
         return torch.linalg.inv(Ts_root_base[0])
 
     def _Ts_root(self, joint_positions: Float[Tensor, "n dofs"]) -> Float[Tensor, "links n 4 4"]:

@@ -82,7 +82,8 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[trimesh.Trimesh
         loaded = trimesh.load_scene(path)
         meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     except Exception as error:  # trimesh raises whatever its format readers raise
-        raise RobotError(f"mesh {path} cannot be read ({error}). Allowed are OBJ, STL, PLY, GLB and DAE files.") from error
+        allowed = "OBJ, STL, PLY, GLB and DAE files"
+        raise RobotError(f"mesh {path} cannot be read ({error}). Allowed are {allowed}.") from error
     if not meshes:
         raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
     if geometry.mesh.scale is not None:

@@ -1,12 +1,12 @@
 """The gradient that a hard visibility image lacks: how everything that is seen moves in the image.
 
-The visible triangle of a pixel is constant almost everywhere, so a rasterized image only changes where surfaces change
-their shading; that boundaries (and the shading itself) *move* has to be put in. For two adjacent pixels a and b let x be
-the projected surface point of the nearer of them, moving with its triangle. When x moves along the axis from a to b, the
-image moves with it: both pixels change by ``(I_a - I_b) / 2`` per pixel of motion. Horizontal pairs carry motion in x,
-vertical pairs motion in y; background stands still. Summed over the image this is a summation by parts of
-``integral of grad(w) . x' I``, the exact derivative of a weighted image that is transported by x', whatever happens at
-the occlusion boundaries, where the tangent plane contains the viewing ray and so the contour moves with the surface.
+The visible triangle of a pixel is constant almost everywhere, so a rasterized image only changes where surfaces
+change their shading; that boundaries (and the shading itself) *move* has to be put in. For two adjacent pixels a and b
+let x be the projected surface point of the nearer of them, moving with its triangle. When x moves along the axis from
+a to b, the image moves with it: both pixels change by ``(I_a - I_b) / 2`` per pixel of motion. Horizontal pairs carry
+motion in x, vertical pairs motion in y; background stands still. Summed over the image this is a summation by parts of
+``integral of grad(w) . x' I``, the exact derivative of a weighted image that is transported by x', whatever happens
+at occlusion boundaries, where the tangent plane contains the viewing ray and so the contour moves with the surface.
 """
 
 import torch

@@ -1,0 +1,49 @@
+"""The `carts` command. Each subcommand is a dataclass whose fields are its options and whose `run` does the work."""
+
+import sys
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from .commands.evaluate import Evaluate
+from .commands.optimize import Optimize
+from .commands.render import Render
+from .commands.synthesize import Synthesize
+from .commands.train import Train
+from .commands.view import View
+from .errors import CartsError
+
+BAD_INPUT = 2
+"""Exit status when a file or an option is not usable."""
+
+Command = (
+    Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Optimize, tyro.conf.subcommand("optimize")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; errors that are meant for people end it with one message and status 2."""
+    try:
+        command = tyro.cli(
+            Command,
+            prog="carts",
+            description="Correct a surgical robot's kinematics from its endoscope image.",
+            args=arguments,
+        )  # pyright: ignore
+        command.run()
+    except CartsError as error:
+        Console(stderr=True).print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted; what was finished is kept")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

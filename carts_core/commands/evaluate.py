@@ -1,0 +1,104 @@
+"""`carts evaluate`: optimize frames and compare them with the truth."""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from ..data import Sequence
+from ..evaluation import FrameScore, evaluate, mean_score, to_json
+from ..features.extractor import FeatureExtractor
+from ..optimization import FreeParameters, OptimizerSettings
+from .selection import Network, Selection, SequencePath
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Optimize frames, each alone, and compare masks and joints with the truth."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    json: Path | None = None
+    """Write the scores of all frames and their means to this file."""
+    perturb_deg: float = 0.0
+    """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
+    seed: int = 0
+    """Seed of the perturbation's signs."""
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
+
+    def run(self) -> None:
+        """Print a table of means, and write the JSON file if one is named."""
+        console = Console()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        frames = self.select.frame_indices(sequence)
+        cameras = self.select.camera_names(sequence.scene)
+        domains = self.select.domain_names(sequence)
+        scores = list(
+            track(
+                evaluate(
+                    sequence,
+                    FeatureExtractor.load(self.network.weights, self.network.device),
+                    frames=frames,
+                    cameras=cameras,
+                    domains=domains,
+                    settings=self.optimizer,
+                    free=self.free,
+                    perturb_deg=self.perturb_deg,
+                    seed=self.seed,
+                ),
+                "optimizing",
+                total=len(frames) * len(cameras) * len(domains),
+                console=console,
+            )
+        )
+        console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
+        if self.json is not None:
+            write_text(self.json, json.dumps(to_json(scores), indent=1))
+            console.print(f"wrote {self.json}")
+
+
+def _table(scores: list[FrameScore], title: str) -> Table:
+    table = Table(title=title)
+    for column in ("domain", "camera", "Dice before", "after", "worst change", "joint MAE before [deg]", "after"):
+        table.add_column(column, justify="left" if column in ("domain", "camera") else "right")
+    table.add_column("iterations", justify="right")
+    table.add_column("s per frame", justify="right")
+    groups: dict[tuple[str, str], list[FrameScore]] = {}
+    for score in scores:
+        groups.setdefault((score.domain, score.camera), []).append(score)
+    for (domain, camera), group in groups.items():
+        mean = mean_score(group)
+        change = [s.dice_after - s.dice_before for s in group if s.dice_after is not None and s.dice_before is not None]
+        table.add_row(
+            domain,
+            camera,
+            _number(mean["dice_before"], 4),
+            _number(mean["dice_after"], 4),
+            _number(min(change, default=None), 4),
+            _number(mean["joint_mae_deg_before"], 2),
+            _number(mean["joint_mae_deg_after"], 2),
+            _number(mean["iterations"], 1),
+            _number(mean["seconds"], 2),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)

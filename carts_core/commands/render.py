@@ -1,0 +1,73 @@
+"""`carts render`: the arms as the kinematics say, as pictures."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from ..data import Frame, Sequence
+from ..evaluation import start_positions
+from ..export import image_png, mask_png, write_bytes
+from ..rendering import Renderer
+from ..scene import SceneState
+from .selection import Selection, SequencePath
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render the arms at the measured joint positions, over the frames or alone."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/render`."""
+    style: Literal["overlay", "image", "mask"] = "overlay"
+    """The rendering blended over the frame, alone, or its mask."""
+    opacity: float = 0.6
+    """Of the rendering in an overlay, 0 to 1."""
+    perturb_deg: float = 0.0
+    """Move every joint by that many degrees (and millimetres) off the truth first."""
+    seed: int = 0
+    """Seed of the perturbation's signs."""
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+
+    def run(self) -> None:
+        """Write one PNG per frame, camera and domain."""
+        console = Console()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        folder = self.output or Path("runs") / sequence.name / "render"
+        frames = self.select.frame_indices(sequence)
+        for domain in self.select.domain_names(sequence):
+            for camera in self.select.camera_names(sequence.scene):
+                renderer = Renderer(sequence.scene, cameras=[camera])
+                for index in track(frames, f"{domain}, {camera}", console=console):
+                    frame = sequence.frame(index, domain, [camera])
+                    state = sequence.scene.state(start_positions(sequence, frame, self.perturb_deg, self.seed))
+                    png = self._png(renderer, state, frame, camera)
+                    write_bytes(folder / domain / camera / f"{frame.frame_id}.png", png)
+        console.print(f"wrote {folder}")
+
+    def _png(self, renderer: Renderer, state: SceneState, frame: Frame, camera: str) -> bytes:
+        if self.style == "mask":
+            return mask_png(renderer.segment(state)[0] >= 0)
+        image, mask = image_and_mask(renderer, state)
+        return image_png(image if self.style == "image" else overlay(frame.images[camera], image, mask, self.opacity))
+
+
+def image_and_mask(renderer: Renderer, state: SceneState) -> tuple[np.ndarray, np.ndarray]:
+    """The first camera's rendering as RGB uint8, and its mask."""
+    with torch.no_grad():
+        rendering = renderer(state)
+    image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
+    return image, rendering.silhouette[0].numpy() > 0.5
+
+
+def overlay(frame: np.ndarray, image: np.ndarray, mask: np.ndarray, opacity: float) -> np.ndarray:
+    """The rendering blended over the frame where the mask is, RGB uint8."""
+    return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)

@@ -1,0 +1,118 @@
+"""Which frames, cameras, domains and arms a command works on. Shared by all commands, declared once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..data import Sequence
+from ..errors import SettingsError
+from ..scene import Scene
+
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of a sequence is worked on."""
+
+    frames: str = ALL
+    """Positions of frames, counted from 0: `all`, numbers and ranges such as `0-9,15`, or `::3` for every third."""
+    camera: tuple[str, ...] = (ALL,)
+    """Cameras, by name; each one is worked on alone."""
+    domain: tuple[str, ...] = ()
+    """Domains, by name, or `all`; the sequence's first one if none is named."""
+
+    def frame_indices(self, sequence: Sequence) -> list[int]:
+        """Positions of the chosen frames.
+
+        Raises:
+            SettingsError: `frames` is not readable or leaves the sequence.
+        """
+        return parse_frames(self.frames, len(sequence))
+
+    def camera_names(self, scene: Scene) -> list[str]:
+        """Names of the chosen cameras.
+
+        Raises:
+            RobotError: there is no such camera.
+        """
+        if ALL in self.camera:
+            return [camera.name for camera in scene.cameras]
+        return [scene.camera(name).name for name in self.camera]
+
+    def domain_names(self, sequence: Sequence) -> list[str]:
+        """Names of the chosen domains.
+
+        Raises:
+            SettingsError: there is no such domain.
+        """
+        if not self.domain:
+            return [sequence.domains[0]]
+        if ALL in self.domain:
+            return list(sequence.domains)
+        for name in self.domain:
+            if name not in sequence.domains:
+                known = ", ".join(sequence.domains)
+                raise SettingsError(f"domain {name!r} is not in {sequence.path}. Its domains are: {known}.")
+        return list(self.domain)
+
+
+def parse_frames(text: str, count: int) -> list[int]:
+    """Positions that a `--frames` text means in a sequence of `count` frames.
+
+    Raises:
+        SettingsError: the text is not readable, names no frame or leaves the sequence.
+    """
+    hint = "Give `all`, numbers and ranges such as `0-9,15`, or a slice such as `::3`."
+    if text == ALL:
+        return list(range(count))
+    chosen: list[int] = []
+    try:
+        for part in text.split(","):
+            if ":" in part:
+                chosen += range(count)[slice(*(int(bound) if bound else None for bound in part.split(":")))]
+            else:
+                first, _, last = part.partition("-")
+                chosen += range(int(first), int(last or first) + 1)
+    except (ValueError, TypeError) as error:
+        raise SettingsError(f"--frames {text!r} is not readable. {hint}") from error
+    outside = [index for index in chosen if not 0 <= index < count]
+    if outside or not chosen:
+        wrong = f"frame {outside[0]} is outside" if outside else f"{text!r} names no frame"
+        raise SettingsError(f"--frames: {wrong}; the sequence has positions 0 to {count - 1}. {hint}")
+    return sorted(set(chosen))
+
+
+@dataclass(frozen=True)
+class Network:
+    """The feature network and where it runs."""
+
+    weights: Path | None = None
+    """Weights file; the shipped one by default."""
+    device: str = "cpu"
+    """`cpu`, or a CUDA device such as `cuda` or `cuda:1`."""
+
+    def __post_init__(self) -> None:
+        check_device(self.device)
+
+
+def check_device(device: str) -> None:
+    """See that a device exists.
+
+    Raises:
+        SettingsError: it does not.
+    """
+    import torch  # noqa: PLC0415, torch takes a second to import, which `--help` need not wait for
+
+    kind, _, number = device.partition(":")
+    cards = torch.cuda.device_count()
+    if device == "cpu" or (kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards))):
+        return
+    known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
+    raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")
+
+
+SequencePath = Annotated[Path, tyro.conf.Positional]
+"""A sequence file as the first argument."""

@@ -1,0 +1,38 @@
+"""`carts view`: open a sequence in the browser."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..resources import sample_sequence
+from .selection import Network
+
+
+@dataclass(frozen=True)
+class View:
+    """Open a sequence in the browser; the shipped sample if none is named."""
+
+    sequence: Annotated[Path | None, tyro.conf.Positional] = None
+    """Sequence file."""
+    host: str = "127.0.0.1"
+    """Address to listen on; only this machine by default."""
+    port: int = 8080
+    """Port to listen on; the next free one if it is taken."""
+    open_browser: bool = False
+    """Open the page in the default browser."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        from carts_viewer.app import serve  # noqa: PLC0415, the core works without the viewer
+
+        serve(
+            self.sequence or sample_sequence(),
+            host=self.host,
+            port=self.port,
+            device=self.network.device,
+            weights=self.network.weights,
+            open_browser=self.open_browser,
+        )
