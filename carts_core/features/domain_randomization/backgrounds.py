@@ -1,0 +1,136 @@
+"""Procedural backgrounds: tissue, cloth, boards, anything smooth or patterned, in display colours."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+Image = Float[np.ndarray, "h w 3"]
+
+_TISSUE = np.array(
+    [
+        [0.75, 0.35, 0.30], [0.85, 0.55, 0.45], [0.60, 0.22, 0.20], [0.88, 0.70, 0.55],
+        [0.80, 0.66, 0.36], [0.92, 0.80, 0.66], [0.66, 0.42, 0.36], [0.80, 0.45, 0.48],
+    ],
+    np.float32,
+)  # fmt: skip
+_BOARD = np.array(
+    [
+        [0.58, 0.55, 0.36], [0.72, 0.68, 0.55], [0.62, 0.52, 0.40], [0.55, 0.58, 0.52],
+        [0.80, 0.78, 0.74], [0.45, 0.52, 0.60], [0.42, 0.58, 0.44], [0.66, 0.60, 0.46],
+    ],
+    np.float32,
+)  # fmt: skip
+
+
+def random_background(rng: np.random.Generator, width: int, height: int) -> Image:
+    """A background without shadows, clutter or camera effects, RGB in [0, 1].
+
+    Its mean brightness stays above about 0.25: low light is no part of the training data.
+    """
+    kind = rng.choice(["tissue", "board", "free", "pattern"], p=[0.38, 0.4, 0.14, 0.08])
+    if kind == "tissue":
+        image = _tissue(rng, width, height)
+    elif kind == "board":
+        image = _board(rng, width, height)
+    elif kind == "free":
+        image = _blend(rng, rng.uniform(0.1, 0.95, (3, 3)).astype(np.float32), width, height)
+        image *= 1 + rng.uniform(0, 0.12) * _grain(rng, width, height)
+    else:
+        image = _pattern(rng, width, height)
+    image = np.clip(image, 0, 1)
+    mean = image.mean()
+    if mean < 0.25:
+        image = np.clip(image + (0.25 - mean), 0, 1)
+    return image * _illumination(rng, width, height)
+
+
+def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
+    """Multi-octave noise, zero mean, about unit deviation [height, width]; `cells` are the coarsest cells per width."""
+    noise = np.zeros((height, width), np.float32)
+    amplitude = 1.0
+    for _ in range(octaves):
+        columns = max(int(cells), 2)
+        rows = max(int(cells * height / width), 2)
+        grid = rng.standard_normal((rows, columns), np.float32)
+        noise += amplitude * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
+        cells *= 2.1
+        amplitude *= 0.55
+    return (noise - noise.mean()) / (noise.std() + 1e-6)
+
+
+def _grain(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """Fine texture of about unit deviation, some pixels wide [height, width, 1]."""
+    grain = rng.standard_normal((height, width), np.float32)
+    grain = cv2.GaussianBlur(grain, (0, 0), rng.uniform(0.5, 2.0))
+    return (grain / (grain.std() + 1e-6))[..., None]
+
+
+def _blend(rng: np.random.Generator, colors: np.ndarray, width: int, height: int) -> Image:
+    cells, octaves = np.exp(rng.uniform(np.log(2), np.log(12))), int(rng.integers(1, 5))
+    image = np.broadcast_to(colors[0], (height, width, 3)).astype(np.float32)
+    for color in colors[1:]:
+        sharpness = rng.uniform(0.8, 3.0)
+        field = sharpness * (smooth_noise(rng, width, height, cells, octaves) + rng.normal(0, 0.5))
+        share = 1 / (1 + np.exp(-field))
+        image = image + share[..., None] * (color - image)
+    return image
+
+
+def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
+    colors = _TISSUE[rng.choice(len(_TISSUE), 3, replace=False)] * np.clip(rng.normal(1, 0.12, (3, 3)), 0.6, 1.4)
+    image = _blend(rng, colors.astype(np.float32), width, height)
+    relief = smooth_noise(rng, width, height, rng.uniform(4, 20), 3)
+    image = image * (1 + rng.uniform(0, 0.15) * relief[..., None])
+    image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
+    for _ in range(rng.integers(0, 8)):
+        image = _vessel(rng, image)
+    if rng.random() < 0.6:  # wet spots mirror the light
+        wet = smooth_noise(rng, width, height, rng.uniform(15, 45), 2) + 0.5 * relief
+        spots = np.clip((wet - rng.uniform(2.0, 3.0)) * 2, 0, 1)[..., None]
+        image = image + spots * (rng.uniform(0.7, 1.0) - image)
+    return image
+
+
+def _vessel(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    steps = 24
+    heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.25, steps))
+    stride = rng.uniform(0.02, 0.06) * width
+    start = rng.uniform(0, 1, 2) * (width, height)
+    points = start + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * stride, axis=0)
+    layer = np.zeros((height, width), np.float32)
+    cv2.polylines(layer, [(points * 8).astype(np.int32)], False, 1.0, int(rng.integers(1, 5)), cv2.LINE_AA, 3)
+    layer = cv2.GaussianBlur(layer, (0, 0), rng.uniform(0.6, 2.0))[..., None] * rng.uniform(0.2, 0.7)
+    color = image.mean((0, 1)) * rng.uniform(0.5, 1.0) * np.array([1.0, 0.75, 0.75], np.float32)
+    return image + layer * (color - image)
+
+
+def _board(rng: np.random.Generator, width: int, height: int) -> Image:
+    color = _BOARD[rng.integers(len(_BOARD))] * np.clip(rng.normal(1, 0.12, 3), 0.6, 1.4)
+    stain = smooth_noise(rng, width, height, rng.uniform(2, 8), 4)[..., None]
+    image = color * (1 + rng.uniform(0, 0.08) * stain)
+    image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
+    return image.astype(np.float32)
+
+
+def _pattern(rng: np.random.Generator, width: int, height: int) -> Image:
+    """Weave, stripes or checks between two colours."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(4), np.log(60)))
+    u = (x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / period
+    v = (y * np.cos(angle) - x * np.sin(angle)) * 2 * np.pi / period
+    wave = np.sin(u) * (np.sin(v) if rng.random() < 0.6 else 1)
+    share = 1 / (1 + np.exp(-wave * rng.uniform(1, 8)))[..., None]
+    first = rng.uniform(0.25, 0.9, 3)
+    second = np.clip(first + rng.normal(0, 0.2, 3), 0.15, 0.95)
+    return (first + share * (second - first)).astype(np.float32) * (1 + 0.05 * _grain(rng, width, height))
+
+
+def _illumination(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """Uneven light: a broad spot and a slope, never darker than about two thirds."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    x, y = x / width - rng.uniform(0.1, 0.9), y / height - rng.uniform(0.1, 0.9)
+    spot = np.exp(-(x * x + y * y) / (2 * rng.uniform(0.3, 0.9) ** 2))
+    slope = x * rng.normal(0, 0.2) + y * rng.normal(0, 0.2)
+    light = 1 - rng.uniform(0, 0.4) * (1 - spot) + slope
+    return np.clip(light, 0.6, 1.25)[..., None].astype(np.float32)

@@ -1,0 +1,153 @@
+"""The feature network: a small U-Net whose last layer before the 1x1 head is what ACS compares."""
+
+import json
+from dataclasses import asdict, dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from ..errors import SettingsError
+
+CONTRAST_FLOOR = 0.02
+"""Standard deviation [1] below which an image counts as empty and is not amplified any further."""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What distinguishes one feature network from another; it travels in the weights file."""
+
+    widths: tuple[int, ...] = (12, 24, 48, 64, 96)
+    """Channels per level, from full resolution down; each level halves the resolution."""
+    encoder_convolutions: tuple[int, ...] = (1, 2, 2, 2, 2)
+    """3x3 convolutions per level on the way down. Full resolution costs most, so it has one."""
+    decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
+    """3x3 convolutions per level on the way up, from full resolution down."""
+
+    def __post_init__(self) -> None:
+        levels = len(self.widths)
+        if levels < 2 or any(width < 1 for width in self.widths):
+            raise SettingsError(f"widths are {self.widths}; give at least two positive channel counts.")
+        if len(self.encoder_convolutions) != levels or any(n < 1 for n in self.encoder_convolutions):
+            raise SettingsError(
+                f"encoder_convolutions are {self.encoder_convolutions}; give {levels} counts of 1 or more."
+            )
+        if len(self.decoder_convolutions) != levels - 1 or any(n < 1 for n in self.decoder_convolutions):
+            raise SettingsError(
+                f"decoder_convolutions are {self.decoder_convolutions}; give {levels - 1} counts of 1 or more."
+            )
+
+    @property
+    def stride(self) -> int:
+        """Width and height of an input must be multiples of this [px]."""
+        return 2 ** (len(self.widths) - 1)
+
+    def to_json(self) -> str:
+        """One line of JSON; the inverse of `from_json`."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> "Architecture":
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError, TypeError: the text is not an architecture.
+            SettingsError: it is one that cannot exist.
+        """
+        return Architecture(**{name: tuple(int(n) for n in counts) for name, counts in json.loads(text).items()})
+
+
+class FeatureNetwork(nn.Module):
+    """U-Net of convolution, batch norm and ReLU; skips are added, not concatenated, which halves the last level's cost.
+
+    Images are standardised first (per channel the mean, over all channels the deviation), so that exposure and a
+    uniform haze change nothing before the first convolution.
+    """
+
+    def __init__(self, architecture: Architecture | None = None) -> None:
+        super().__init__()
+        self.architecture = architecture or Architecture()
+        widths = self.architecture.widths
+        inputs = (3, *widths[:-1])
+        counts = self.architecture.encoder_convolutions
+        self.encoder = nn.ModuleList(_block(i, o, n) for i, o, n in zip(inputs, widths, counts, strict=True))
+        counts = self.architecture.decoder_convolutions
+        self.reduce = nn.ModuleList(nn.Conv2d(i, o, 1) for o, i in zip(widths[:-1], widths[1:], strict=True))
+        self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
+        self.head = nn.Conv2d(widths[0], 1, 1)
+
+    def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
+        """The last layer before the head, F_I of the paper.
+
+        Args:
+            images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
+
+        Raises:
+            SettingsError: another number of channels, or a size that is no such multiple.
+        """
+        self._check(images)
+        x = standardize(images)
+        skips: list[Tensor] = []
+        for level, encode in enumerate(self.encoder):
+            x = encode(functional.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        skips.pop()
+        for reduce, decode in zip(reversed(self.reduce), reversed(self.decoder), strict=True):
+            x = functional.interpolate(reduce(x), scale_factor=2, mode="bilinear", align_corners=False)
+            x = decode(x + skips.pop())
+        return x
+
+    def logits(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
+        """Log odds that a pixel shows an instrument. Arguments and errors as `features`."""
+        return self.head(self.features(images))
+
+    def forward(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
+        """The same as `logits`."""
+        return self.logits(images)
+
+    def folded(self) -> "FeatureNetwork":
+        """A frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
+        copy = FeatureNetwork(self.architecture)
+        copy.load_state_dict(self.state_dict())
+        copy.eval()
+        for block in (*copy.encoder, *copy.decoder):
+            _fold(block)
+        return copy.to(next(self.parameters()).device, memory_format=torch.channels_last).requires_grad_(False)
+
+    def _check(self, images: Tensor) -> None:
+        stride = self.architecture.stride
+        if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] % stride or images.shape[3] % stride:
+            raise SettingsError(
+                f"the feature network got a tensor of shape {tuple(images.shape)}. Give [batch, 3, height, width] "
+                f"with height and width multiples of {stride}; pad or crop the image."
+            )
+
+
+def standardize(images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
+    """Each image with zero mean per channel and unit deviation over all channels."""
+    centred = images - images.mean(dim=(2, 3), keepdim=True)
+    variance = centred.square().mean(dim=(1, 2, 3), keepdim=True)
+    return centred * torch.rsqrt(variance + CONTRAST_FLOOR**2)
+
+
+def _block(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for index in range(convolutions):
+        layers += [
+            nn.Conv2d(outputs if index else inputs, outputs, 3, padding=1, bias=False),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+        ]
+    return nn.Sequential(*layers)
+
+
+def _fold(block: nn.Module) -> None:
+    assert isinstance(block, nn.Sequential)
+    layers = list(block)
+    for index in range(0, len(layers), 3):
+        convolution, norm = layers[index], layers[index + 1]
+        assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
+        block[index] = fuse_conv_bn_eval(convolution, norm)
+        block[index + 1] = nn.Identity()

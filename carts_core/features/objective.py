@@ -1,0 +1,107 @@
+"""What training minimises: the paper's cross-entropy, and terms that make features comparable across images."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..errors import SettingsError
+from .network import FeatureNetwork
+
+CLASSES = 3
+"""Background, shaft, head."""
+
+_NEIGHBOURHOOD = 21
+_OTHER_PART = 0.6
+
+
+@dataclass(frozen=True)
+class ObjectiveWeights:
+    """Weights of the terms of the training loss; zero leaves a term out."""
+
+    cross_entropy: float = 1.0
+    """Binary cross-entropy of the instrument's probability, as in the paper."""
+    dice: float = 0.5
+    """One minus soft Dice per image, so that small instruments count as much as large ones."""
+    consistency: float = 0.5
+    """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
+    parts: float = 0.2
+    """Cross-entropy of a second head that tells shaft, wrist and jaws apart; it is dropped after training."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not getattr(self, name) >= 0:
+                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
+
+
+class Objective(nn.Module):
+    """The training loss of a batch of pairs; owns the second head."""
+
+    def __init__(self, channels: int, weights: ObjectiveWeights) -> None:
+        super().__init__()
+        self.weights = weights
+        self.parts = nn.Conv2d(channels, CLASSES, 1)
+
+    def forward(
+        self,
+        network: FeatureNetwork,
+        images: Float[Tensor, "batch pair 3 h w"],
+        classes: Int[Tensor, "batch pair h w"],
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss, and each term before weighting.
+
+        Args:
+            network: the network that is trained.
+            images: observed image and hybrid image of each pair, RGB in [0, 1].
+            classes: 0 background, 1 shaft, 2 head.
+        """
+        features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+        logits = network.head(features)[:, 0]
+        target = (classes > 0).flatten(0, 1).to(logits.dtype)
+        features_of_pair = features.unflatten(0, images.shape[:2])
+        terms = {
+            "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
+            "dice": soft_dice_loss(logits.sigmoid(), target),
+            "consistency": consistency_loss(
+                features_of_pair[:, 0], features_of_pair[:, 1], classes[:, 0], classes[:, 1]
+            ),
+            "parts": functional.cross_entropy(self.parts(features), classes.flatten(0, 1).long()),
+        }
+        total = sum((getattr(self.weights, name) * term for name, term in terms.items()), logits.new_zeros(()))
+        return total, terms
+
+
+def soft_dice_loss(probability: Float[Tensor, "batch h w"], target: Float[Tensor, "batch h w"]) -> Float[Tensor, ""]:
+    """One minus the Dice score of probabilities, averaged over images."""
+    overlap = (probability * target).sum((1, 2))
+    return 1 - ((2 * overlap + 1) / (probability.sum((1, 2)) + target.sum((1, 2)) + 1)).mean()
+
+
+def consistency_loss(
+    features_a: Float[Tensor, "batch channels h w"],
+    features_b: Float[Tensor, "batch channels h w"],
+    classes_a: Int[Tensor, "batch h w"],
+    classes_b: Int[Tensor, "batch h w"],
+) -> Float[Tensor, ""]:
+    """How far cosine similarities are from what alignment needs, near the instruments (where ACS attends).
+
+    Where both images show the same class the cosine should be 1; where one shows background and the other an
+    instrument, not above 0; where one shows the shaft and the other the head, not above 0.6.
+    """
+    similarity = functional.cosine_similarity(features_a, features_b, dim=1, eps=1e-4)
+    instrument = ((classes_a > 0) | (classes_b > 0)).to(similarity.dtype)
+    near = functional.max_pool2d(instrument[:, None], _NEIGHBOURHOOD, 1, _NEIGHBOURHOOD // 2)[:, 0]
+    same = near * (classes_a == classes_b)
+    moved = ((classes_a > 0) != (classes_b > 0)).to(similarity.dtype)
+    other_part = instrument * (classes_a != classes_b) * (1 - moved)
+    return (
+        _weighted_mean(1 - similarity, same)
+        + _weighted_mean(similarity.clamp(min=0), moved)
+        + _weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
+    )
+
+
+def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    return (values * weights).sum() / (weights.sum() + 1)

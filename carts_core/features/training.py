@@ -1,0 +1,185 @@
+"""Training of the feature network: `train` runs, resumes and reports."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from ..errors import SettingsError
+from .checkpoint import History, load_checkpoint, save_checkpoint
+from .loader import training_batches, validation_set
+from .network import FeatureNetwork
+from .objective import Objective
+from .report import write_report
+from .training_config import TrainingConfig
+from .validation import Validation, validate
+from .weights import save_weights
+
+WEIGHTS_FILE = "features.safetensors"
+_LOG_EVERY = 10
+_MAY_CHANGE = ("steps", "workers", "threads", "device", "validation_every", "checkpoint_every")
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Where a run stands; one per logged step."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps in all."""
+    loss: float
+    """Loss, averaged over the last steps."""
+    seconds_per_step: float
+    """Wall time per step [s]."""
+    validation: Validation | None
+    """The newest validation."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a finished run leaves behind."""
+
+    weights: Path
+    """Weights file, ready for `FeatureExtractor.load`."""
+    report: Path
+    """The training report."""
+    validation: Validation
+    """Figures of the saved weights."""
+    seconds: float
+    """Wall time spent in training steps, over all resumed parts [s]."""
+
+
+def train(
+    config: TrainingConfig, output: Path, progress: Callable[[TrainingProgress], None] | None = None
+) -> TrainingResult:
+    """Train a feature network, or go on with the run that `output` holds.
+
+    The run writes `checkpoint.safetensors` now and then, `features.safetensors` after every validation, and
+    `report/` at the end. After a kill the same call goes on from the last checkpoint.
+
+    Raises:
+        SettingsError: `output` holds a run with other settings.
+        WeightsError: its checkpoint cannot be read.
+        RobotError: a robot cannot be loaded.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(config.threads)
+    run = _Run(config, output)
+    return run.finish(progress or (lambda event: None))
+
+
+class _Run:
+    """The state of one training run."""
+
+    def __init__(self, config: TrainingConfig, output: Path) -> None:
+        self.config, self.output = config, output
+        torch.manual_seed(config.seed)
+        self.network = FeatureNetwork(config.architecture).to(config.device, memory_format=torch.channels_last)
+        self.objective = Objective(config.architecture.widths[0], config.objective).to(config.device)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
+        parameters = [*self.network.parameters(), *self.objective.parameters()]
+        self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
+        self.modules = {"network": self.network, "objective": self.objective, "average": self.average}
+        self.step, self.history = 0, History()
+        self._resume()
+
+    def _resume(self) -> None:
+        checkpoint = load_checkpoint(self.output)
+        if checkpoint is None:
+            return
+        before, now = json.loads(checkpoint.config_json), json.loads(config_json(self.config))
+        changed = [name for name in now if name not in _MAY_CHANGE and before.get(name) != now[name]]
+        if changed:
+            details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
+            raise SettingsError(
+                f"{self.output} holds a run with other settings: {details}. Give the same settings to go on with it, or "
+                "another output folder to start anew."
+            )
+        checkpoint.restore(self.modules, self.optimizer)
+        self.step, self.history = checkpoint.step, checkpoint.history
+
+    def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
+        images, classes = validation_set(self.config)
+        validation = None
+        if self.step < self.config.steps:
+            batches = training_batches(self.config, self.step)
+            sums: dict[str, float] = {}
+            count, started = 0, time.perf_counter()
+            while self.step < self.config.steps:
+                for name, value in self._train_step(*next(batches)).items():
+                    sums[name] = sums.get(name, 0.0) + value
+                count += 1
+                last = self.step == self.config.steps
+                if last or self.step % self.config.validation_every == 0:
+                    validation = self._validate(images, classes)
+                if last or count == _LOG_EVERY:
+                    means = {name: value / count for name, value in sums.items()}
+                    self.history.losses.append({"step": self.step, **means})
+                    elapsed = time.perf_counter() - started
+                    self.history.seconds += elapsed
+                    progress(TrainingProgress(self.step, self.config.steps, means["loss"], elapsed / count, validation))
+                    sums, count, started = {}, 0, time.perf_counter()
+                if last or self.step % self.config.checkpoint_every == 0:
+                    self._checkpoint()
+        if validation is None:
+            validation = validate(self._averaged(), images, classes)
+            self._save(validation)
+        report = write_report(
+            self.output / "report", config_json(self.config), self.history, self._averaged(), images, classes
+        )
+        return TrainingResult(self.output / WEIGHTS_FILE, report, validation, self.history.seconds)
+
+    def _train_step(self, images: torch.Tensor, classes: torch.Tensor) -> dict[str, float]:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self.config.steps)
+        self.network.train()
+        device = self.config.device
+        loss, terms = self.objective(self.network, images.to(device).float() / 255, classes.to(device))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimizer.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+
+    def _averaged(self) -> FeatureNetwork:
+        network = self.average.module
+        assert isinstance(network, FeatureNetwork)
+        return network
+
+    def _validate(self, images: torch.Tensor, classes: torch.Tensor) -> Validation:
+        validation = validate(self._averaged(), images, classes)
+        self.history.validations.append({"step": self.step, **asdict(validation)})
+        self._save(validation)
+        return validation
+
+    def _save(self, validation: Validation) -> None:
+        training = {"step": self.step, "validation": asdict(validation), "config": json.loads(config_json(self.config))}
+        field = self.config.images.field_width
+        # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
+        working_size = (field, field * 3 // 4)
+        save_weights(self._averaged(), self.output / WEIGHTS_FILE, training, working_size)
+
+    def _checkpoint(self) -> None:
+        save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
+
+
+def schedule(step: int, warmup: int, steps: int) -> float:
+    """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
+    rise = min(1.0, (step + 1) / max(warmup, 1))
+    done = min(1.0, max(0.0, (step - warmup) / max(steps - warmup, 1)))
+    return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+def config_json(config: TrainingConfig) -> str:
+    """The settings as JSON; robots by file name, so that a run can move with its folder."""
+    settings = asdict(config)
+    settings["robots"] = [path.name for path in config.robots]
+    return json.dumps(settings)

@@ -1,0 +1,83 @@
+"""Settings of a training run."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..errors import SettingsError
+from ..resources import shipped_robot
+from .domain_randomization import PairSettings
+from .network import Architecture
+from .objective import ObjectiveWeights
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything that a training run depends on."""
+
+    robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
+    """URDF files of the robots whose images are made."""
+    steps: int = 4000
+    """Optimizer steps."""
+    batch_pairs: int = 8
+    """Pairs of an observed and a hybrid image per step."""
+    reuse: int = 2
+    """How often a pair is used, mirrored by chance after the first time; making one costs as much as learning from it."""
+    learning_rate: float = 3e-3
+    """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
+    weight_decay: float = 1e-4
+    """Weight decay of AdamW."""
+    warmup: int = 100
+    """Steps until the learning rate is at its peak."""
+    average: float = 0.995
+    """Decay per step of the running average of the weights, which is what is saved."""
+    validation_every: int = 250
+    """Steps between validations."""
+    validation_pairs: int = 32
+    """Pairs of the fixed validation set."""
+    checkpoint_every: int = 100
+    """Steps between checkpoints."""
+    workers: int = 2
+    """Processes that make images."""
+    threads: int = 2
+    """Threads of the training process itself."""
+    seed: int = 0
+    """Seed of everything random."""
+    device: str = "cpu"
+    """Where the network is trained."""
+    images: PairSettings = field(default_factory=PairSettings)
+    """What training images look like."""
+    objective: ObjectiveWeights = field(default_factory=ObjectiveWeights)
+    """Weights of the loss terms."""
+    architecture: Architecture = field(default_factory=Architecture)
+    """The network."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "steps",
+            "batch_pairs",
+            "reuse",
+            "validation_every",
+            "validation_pairs",
+            "checkpoint_every",
+            "threads",
+        ):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} is {getattr(self, name)}; give 1 or more.")
+        for name in ("warmup", "workers", "seed"):
+            if getattr(self, name) < 0:
+                raise SettingsError(f"{name} is {getattr(self, name)}; give 0 or more.")
+        if not self.learning_rate > 0 or not self.weight_decay >= 0:
+            raise SettingsError(
+                f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and a "
+                "decay of 0 or more."
+            )
+        if not 0 <= self.average < 1:
+            raise SettingsError(f"average is {self.average}; give a decay from 0 (no average) to below 1.")
+        if not self.robots:
+            raise SettingsError("no robot to train on; give at least one URDF file.")
+        stride = self.architecture.stride
+        if self.images.width % stride or self.images.height % stride:
+            raise SettingsError(
+                f"training images of {self.images.width}x{self.images.height} px do not fit the network; give multiples "
+                f"of {stride}."
+            )

@@ -1,0 +1,105 @@
+"""Weights files: safetensors, with the architecture and the training settings as metadata."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from ..errors import SettingsError, WeightsError
+from .network import Architecture, FeatureNetwork
+
+FORMAT = "carts-feature-network"
+VERSION = "1"
+WORKING_SIZE = (320, 240)
+"""Width and height [px] that a 640x480 image is reduced to before the network sees it."""
+
+_REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipped ones back."
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What a weights file holds."""
+
+    network: FeatureNetwork
+    """The trained network, in evaluation mode, not folded."""
+    working_size: tuple[int, int]
+    """Width and height [px] of the images that it was trained for."""
+    training: dict
+    """Settings and figures of the training run, as written by `carts train`."""
+    sha256: str
+    """Fingerprint of the file."""
+
+
+def save_weights(network: FeatureNetwork, path: Path, training: dict, working_size: tuple[int, int]) -> None:
+    """Write a weights file; a reader never sees half of it.
+
+    Args:
+        network: the network whose state is written (batch norms included, so that training can go on from it).
+        path: the file, by convention `*.safetensors`; its folder is made.
+        training: settings and figures that JSON can hold.
+        working_size: width and height [px] of the images that the network is meant for.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "architecture": network.architecture.to_json(),
+        "working_size": json.dumps(working_size),
+        "training": json.dumps(training),
+    }
+    partial = path.with_name(path.name + ".part")
+    save_file({name: value.contiguous() for name, value in network.state_dict().items()}, partial, metadata)
+    partial.replace(path)
+
+
+def read_weights(path: Path) -> Weights:
+    """Read and check a weights file.
+
+    Raises:
+        WeightsError: the file is missing, is not safetensors, was not written by `carts train`, or its tensors do not
+            fit the architecture it names.
+    """
+    if not path.is_file():
+        raise WeightsError(f"weights file {path} is missing. {_REMEDY}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(
+            f"weights file {path} is not a readable safetensors file ({error}). Allowed is what `carts train` writes. "
+            f"{_REMEDY}"
+        ) from error
+    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
+        raise WeightsError(
+            f"weights file {path} says format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed "
+            f"is {FORMAT!r}, version {VERSION!r}. {_REMEDY}"
+        )
+    try:
+        architecture = Architecture.from_json(metadata["architecture"])
+        working_size = tuple(int(n) for n in json.loads(metadata["working_size"]))
+        training = json.loads(metadata["training"])
+    except (KeyError, ValueError, TypeError, AttributeError, SettingsError) as error:
+        raise WeightsError(
+            f"weights file {path} has unreadable metadata ({error}). Allowed are an architecture with widths, "
+            f"encoder_convolutions and decoder_convolutions, a working size and the training settings. {_REMEDY}"
+        ) from error
+    network = FeatureNetwork(architecture)
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        reason = "; ".join(line.strip() for line in str(error).splitlines()[1:4])
+        raise WeightsError(
+            f"weights file {path} does not fit its architecture of widths {architecture.widths}: {reason}. {_REMEDY}"
+        ) from error
+    if not all(bool(value.isfinite().all()) for value in state.values()):
+        raise WeightsError(f"weights file {path} holds values that are not finite. {_REMEDY}")
+    if len(working_size) != 2 or any(n <= 0 or n % architecture.stride for n in working_size):
+        raise WeightsError(
+            f"weights file {path} gives the working size {working_size}; allowed are two positive multiples of "
+            f"{architecture.stride}. {_REMEDY}"
+        )
+    return Weights(network.eval(), working_size, training, hashlib.sha256(path.read_bytes()).hexdigest())
