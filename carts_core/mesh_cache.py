@@ -3,6 +3,7 @@
 import hashlib
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def read(key: str) -> tuple[LinkMesh, ...] | None:
                 )
                 for i in range(int(stored["count"]))
             )
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         return None
 
 

@@ -1,0 +1,169 @@
+"""Robots from URDF files: forward kinematics, mimic joints, meshes, errors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from carts_core.errors import RobotError
+from carts_core.meshes import face_budget
+from carts_core.resources import shipped_robot
+from carts_core.robot import Robot
+
+LENGTH_RCC, LENGTH_TOOL, PITCH_TO_YAW, YAW_TO_TIP = 0.4318, 0.4162, 0.0091, 0.0102
+HALF = np.pi / 2
+
+PSM_SURROL_JOINTS = (
+    "psm_yaw_joint",
+    "psm_pitch_back_joint",
+    "psm_main_insertion_joint",
+    "psm_tool_roll_joint",
+    "psm_tool_pitch_joint",
+    "psm_tool_yaw_joint",
+)
+
+
+def dh_row(alpha: float, a: float, d: float, theta: float) -> np.ndarray:
+    """A row of a modified Denavit-Hartenberg table as a transform."""
+    ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
+    return np.array(
+        [[ct, -st, 0, a], [st * ca, ct * ca, -sa, -d * sa], [st * sa, ct * sa, ca, d * ca], [0, 0, 0, 1]], dtype=float
+    )
+
+
+def psm_tip(q: np.ndarray) -> np.ndarray:
+    """T_base_tip of the classic PSM by its published table."""
+    rows = [
+        (HALF, 0, 0, q[0] + HALF),
+        (-HALF, 0, 0, q[1] - HALF),
+        (HALF, 0, q[2] - LENGTH_RCC, 0),
+        (0, 0, LENGTH_TOOL, q[3]),
+        (-HALF, 0, 0, q[4] - HALF),
+        (-HALF, PITCH_TO_YAW, 0, q[5] - HALF),
+        (-HALF, 0, YAW_TO_TIP, HALF),
+    ]
+    return np.linalg.multi_dot([dh_row(*row) for row in rows])
+
+
+def random_positions(count: int) -> np.ndarray:
+    """Six joint positions of a PSM each [rad, m]."""
+    rng = np.random.default_rng(0)
+    low, high = [-1.5, -0.75, 0.05, -2.5, -1.3, -1.3], [1.5, 0.75, 0.24, 2.5, 1.3, 1.3]
+    return rng.uniform(low, high, (count, 6))
+
+
+def largest_error(robot: Robot, joints: tuple[str, ...], tip_link: str, dtype: torch.dtype) -> float:
+    six = random_positions(1000)
+    q = np.zeros((len(six), len(robot.joint_names)))
+    for column, name in enumerate(joints):
+        q[:, robot.joint_index(name)] = six[:, column]
+    T_base_tip = robot.link_transform(torch.tensor(q, dtype=dtype), tip_link).numpy()
+    truth = np.stack([psm_tip(row) for row in six])
+    return float(np.abs(T_base_tip[:, :3, 3] - truth[:, :3, 3]).max())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_forward_kinematics_of_the_shipped_psm_is_the_dh_formula(shipped_psm: Robot, dtype: torch.dtype) -> None:
+    joints = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+    assert largest_error(shipped_psm, joints, "tool_tip_link", dtype) < 1e-6
+
+
+def test_forward_kinematics_of_the_classic_psm_is_the_dh_formula(shared_dir: Path) -> None:
+    robot = Robot.load(shared_dir / "robots/psm_classic_lnd/psm.urdf", base_link="PSM1_base_link")
+    joints = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+    assert largest_error(robot, joints, "PSM1_tool_tip_link", torch.float32) < 1e-6
+
+
+def test_forward_kinematics_of_the_surrol_psm_is_the_dh_formula(shared_dir: Path) -> None:
+    robot = Robot.load(shared_dir / "robots/psm_surrol/psm.urdf", base_link="psm_remote_center_link")
+    assert largest_error(robot, PSM_SURROL_JOINTS, "psm_tool_tip_link", torch.float32) < 1e-6
+
+
+def test_mimic_joints_are_folded_into_the_joint_that_they_follow(shipped_psm: Robot) -> None:
+    assert shipped_psm.joint_names == ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
+    open_jaw = torch.zeros(7)
+    open_jaw[-1] = 0.6
+    first = shipped_psm.link_transform(open_jaw, "jaw_1_link")
+    second = shipped_psm.link_transform(open_jaw, "jaw_2_link")
+    between = first[:3, :3].T @ second[:3, :3]
+    angle = torch.arccos((between.trace() - 1) / 2)
+    assert float(angle) == pytest.approx(0.6, abs=1e-5)
+
+
+def test_batches_of_any_shape_agree_with_single_configurations(shipped_psm: Robot) -> None:
+    q = torch.rand(2, 3, 7) * 0.2
+    batch = shipped_psm.forward_kinematics(q)
+    assert batch.shape == (2, 3, len(shipped_psm.link_names), 4, 4)
+    assert torch.allclose(batch[1, 2], shipped_psm.forward_kinematics(q[1, 2]))
+
+
+def test_wrong_number_of_joint_positions_names_the_degrees_of_freedom(shipped_psm: Robot) -> None:
+    with pytest.raises(RobotError, match="got 5 joint positions for a robot with 7 degrees of freedom: yaw, pitch"):
+        shipped_psm.forward_kinematics(torch.zeros(5))
+
+
+def test_an_unknown_joint_lists_the_joints(shipped_psm: Robot) -> None:
+    with pytest.raises(RobotError, match=r"has no joint 'elbow'.*yaw, pitch, insertion"):
+        shipped_psm.joint_index("elbow")
+
+
+def test_a_missing_mesh_names_the_file_and_the_remedy(tmp_path: Path) -> None:
+    text = shipped_robot().read_text()
+    first = text.split('filename="')[1].split('"')[0]
+    urdf = tmp_path / "psm.urdf"
+    urdf.write_text(text)
+    with pytest.raises(RobotError, match=f"(?s)mesh .*{Path(first).name} is missing.*Put the file there"):
+        Robot.load(urdf)
+
+
+def test_a_file_that_is_no_urdf_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text("not XML")
+    with pytest.raises(RobotError, match=r"robot\.urdf is not a readable URDF"):
+        Robot.load(path)
+
+
+def test_a_missing_urdf_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"nowhere\.urdf is missing"):
+        Robot.load(tmp_path / "nowhere.urdf")
+
+
+def test_an_unknown_base_link_lists_the_links() -> None:
+    with pytest.raises(RobotError, match=r"no link is called 'foot'. The links are: base_link"):
+        Robot.load(shipped_robot(), base_link="foot")
+
+
+def test_a_base_link_that_moves_is_refused() -> None:
+    with pytest.raises(RobotError, match="moves with a joint"):
+        Robot.load(shipped_robot(), base_link="roll_link")
+
+
+def test_meshes_come_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
+    lines: list[str] = []
+    first = Robot.load(shipped_robot(), progress=lines.append)
+    assert lines and list(tmp_path.glob("*.npz"))
+    lines.clear()
+    second = Robot.load(shipped_robot(), progress=lines.append)
+    assert not lines
+    for a, b in zip(first.meshes, second.meshes, strict=True):
+        assert np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces)
+
+
+def test_a_damaged_cache_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
+    Robot.load(shipped_robot())
+    (cached,) = tmp_path.glob("*.npz")
+    cached.write_bytes(cached.read_bytes()[:100])
+    assert len(Robot.load(shipped_robot()).meshes) > 0
+
+
+def test_decimation_keeps_to_the_budget() -> None:
+    robot = Robot.load(shipped_robot(), max_faces=3000)
+    assert sum(len(mesh.faces) for mesh in robot.meshes) < 3600
+
+
+def test_small_meshes_keep_every_face() -> None:
+    assert face_budget([10, 5000, 5000], 4010) == [10, 2000, 2000]
+    assert face_budget([10, 20], 100) == [10, 20]
