@@ -1,0 +1,256 @@
+"""The app: opens a sequence, builds page, panels and worker, and ties them together."""
+
+import logging
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import viser
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_viewer import intents as ask
+from carts_viewer.controller import Controller
+from carts_viewer.display import PageDisplay
+from carts_viewer.guard import check_loopback
+from carts_viewer.intents import Mailbox
+from carts_viewer.layers import Layer
+from carts_viewer.page import Page
+from carts_viewer.panels.browse import BrowsePanel
+from carts_viewer.panels.curves import CurvesPanel
+from carts_viewer.panels.export import ExportPanel
+from carts_viewer.panels.help import HelpPanel
+from carts_viewer.panels.inputs import Panel
+from carts_viewer.panels.joints import JointsPanel
+from carts_viewer.panels.message import MessagePanel
+from carts_viewer.panels.optimize import OptimizePanel
+from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.settings import FreePanel, SettingsPanel
+from carts_viewer.picture import Painter
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.session import Session
+from carts_viewer.stage import Stage
+from carts_viewer.state import ViewState
+from carts_viewer.worker import Worker
+
+_PANEL_WIDTH = 312.0
+
+Report = Callable[[str], None]
+"""Told, line by line, what takes long."""
+
+
+class ViewerApp:
+    """The viewer of one sequence, serving until it is closed.
+
+    Attributes:
+        url: Where the page is.
+        page: The page, for tests and scripts.
+        mailbox: Where intents go.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        device: str = "cpu",
+        weights: Path | None = None,
+        report: Report = lambda line: None,
+    ) -> None:
+        """Start serving an open sequence; arguments as in `open`."""
+        self._report = report
+        self._session = Session(sequence)
+        self._painter = Painter(sequence, device)
+        state = self._first_state()
+        self.mailbox = Mailbox()
+        self._optimizers = OptimizerFactory(sequence, weights=weights, device=device, report=self._say)
+        self._controller = Controller(state, self._session, self._painter, self._optimizers, self._deliver)
+        # The first rendering compiles the visibility kernel, which takes seconds the very first time.
+        report("Preparing the renderer (the first time takes a few seconds)")
+        self._painter.arm_ids(state.pose.scene, state.camera)
+        self.page = Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
+        self.url = self.page.url
+        self.joints: JointsPanel
+        panels = self._build(state)
+        stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
+        self._display = PageDisplay(self.page, self._session, self._painter, stage, panels)
+        self.page.on_drawn(self._on_drawn)
+        self._worker = Worker(self.mailbox, self._controller, self._display)
+        self._worker.start(self._prepare)
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        device: str = "cpu",
+        weights: Path | None = None,
+        report: Report = lambda line: None,
+    ) -> "ViewerApp":
+        """Open a sequence file and serve its viewer.
+
+        Args:
+            path: The sequence file.
+            host: A loopback address or `localhost`.
+            port: 0 picks a free port; a busy one moves up to the next free one.
+            device: Where to render and optimize, say `cpu` or `cuda`.
+            weights: Of the feature network; None for the shipped ones.
+            report: Told what takes long.
+
+        Raises:
+            CartsError: the sequence, its robot or an option is not usable.
+        """
+        check_loopback(host)
+        report(f"Opening {path}")
+        sequence = Sequence.open(path, progress=report)
+        return cls(sequence, host=host, port=port, device=device, weights=weights, report=report)
+
+    def __enter__(self) -> "ViewerApp":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def state(self) -> ViewState:
+        """The newest state; a snapshot that does not change."""
+        return self._controller.state
+
+    def close(self) -> None:
+        """Stop the worker and the server."""
+        self._worker.stop()
+        self.page.close()
+
+    def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
+        """Wait until everything asked for so far has been done and sent to the page.
+
+        Args:
+            timeout: [s]
+
+        Raises:
+            TimeoutError: it has not, in that time.
+        """
+        if not self._worker.settled(timeout):
+            raise TimeoutError(f"The viewer was still busy after {timeout} s.")
+        return self.state
+
+    def _first_state(self) -> ViewState:
+        sequence = self._session.sequence
+        domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
+        frame = self._session.frame(0, domain, camera)
+        pose = self._session.measured(frame)
+        return ViewState(
+            index=0,
+            frame=frame,
+            domain=domain,
+            camera=camera,
+            pose=pose,
+            layer=Layer.SHADED,
+            opacity=0.6,
+            settings=OptimizerSettings(),
+            free=FreeParameters(),
+            scores=self._painter.scores(pose.scene, frame, camera),
+        )
+
+    def _build(self, state: ViewState) -> list[Panel]:
+        """Lay out the page: browsing, overlay and joints on the left, optimizing, export and help on the right."""
+        page, session, emit = self.page, self._session, self.mailbox.put
+        gui = page.server.gui
+        gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
+        gui.set_panel_label("CaRTS")
+        gui.main_panel.dock_left()
+        gui.main_panel.set_width(_PANEL_WIDTH)
+        panels: list[Panel] = [
+            MessagePanel(page, emit),
+            BrowsePanel(page, session, emit),
+            OverlayPanel(page, session, state, emit),
+        ]
+        with gui.add_folder("Joints"):
+            self.joints = JointsPanel(page, session, state, emit, self.mailbox.waits)
+        right = gui.add_panel()
+        with right.add_tab("Optimize", viser.Icon.TARGET_ARROW):
+            panels += [
+                OptimizePanel(page, session, state, emit),
+                CurvesPanel(gui),
+                SettingsPanel(page, state, emit),
+                FreePanel(page, session, state, emit),
+            ]
+        with right.add_tab("Export", viser.Icon.DOWNLOAD):
+            panels.append(ExportPanel(page, session, emit))
+        with right.add_tab("Help", viser.Icon.HELP):
+            HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
+        right.dock_right()
+        right.set_width(_PANEL_WIDTH)
+        return [*panels, self.joints]
+
+    def _prepare(self) -> None:
+        """Load on the worker, with the page already up, what the first run will need."""
+        try:
+            self._optimizers.prepare()
+        finally:
+            self._worker.report(None)
+
+    def _say(self, text: str) -> None:
+        self._report(text)
+        self._worker.report(text)
+
+    def _on_drawn(self, tab: int) -> None:
+        self._display.drawn(tab)
+        self.mailbox.put(ask.Drawn())
+
+    def _deliver(self, client_id: int, name: str, content: bytes) -> None:
+        client = self.page.server.get_clients().get(client_id)
+        if client is not None:
+            client.send_file_download(name, content, save_immediately=True)
+
+
+def serve(
+    sequence_path: Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    device: str = "cpu",
+    weights: Path | None = None,
+    open_browser: bool = False,
+) -> None:
+    """Serve the viewer of a sequence until Ctrl-C; prints where it is.
+
+    Args:
+        sequence_path: The sequence file.
+        host: A loopback address or `localhost`.
+        port: 0 picks a free port; a busy one moves up to the next free one.
+        device: Where to render and optimize, say `cpu` or `cuda`.
+        weights: Of the feature network; None for the shipped ones.
+        open_browser: Open the page in the default browser.
+
+    Raises:
+        SystemExit: with code 2, after a message on stderr, when the sequence or an option is not usable.
+    """
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    began = time.monotonic()
+    try:
+        app = ViewerApp.open(
+            sequence_path, host=host, port=port, device=device, weights=weights, report=_print_progress
+        )
+    except CartsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    with app:
+        print(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.", flush=True)
+        if open_browser:
+            webbrowser.open(app.url)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            print("\nClosing.", flush=True)
+
+
+def _print_progress(line: str) -> None:
+    print(f"  {line} …", flush=True)

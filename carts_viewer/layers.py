@@ -1,0 +1,109 @@
+"""What can be drawn over the frame: pure functions from arm ids, masks and maps to RGBA pictures."""
+
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+
+class Layer(StrEnum):
+    """A way to show the arm over the frame; the value is what people read."""
+
+    SHADED = "Shaded arm"
+    MASK = "Mask"
+    CONTOUR = "Contour"
+    TRUTH = "Against truth"
+    ATTENTION = "Attention map"
+    SIMILARITY = "Feature similarity"
+    NONE = "None"
+
+
+ARM_COLORS = ((45, 212, 167), (96, 165, 250), (250, 204, 21), (232, 121, 249))
+"""Colours of the arms in mask and contour, in the scene's order and then again from the start."""
+
+TRUTH_COLORS = {
+    "true positive": (255, 255, 255),
+    "false positive": (255, 140, 0),
+    "false negative": (220, 20, 30),
+    "true negative": (0, 0, 0),
+}
+"""The paper's colours for the comparison with a true mask."""
+
+Rgba = UInt8[np.ndarray, "height width 4"]
+ArmIds = Int[np.ndarray, "height width"]
+
+
+def nothing(height: int, width: int) -> Rgba:
+    """A picture that hides nothing."""
+    return np.zeros((height, width, 4), np.uint8)
+
+
+def shaded(image: Float[np.ndarray, "height width 3"], arm_ids: ArmIds, opacity: float) -> Rgba:
+    """The rendered arm itself; `image` is RGB in [0, 1]."""
+    picture = nothing(*arm_ids.shape)
+    picture[..., :3] = np.clip(image * 255.0 + 0.5, 0, 255)
+    picture[..., 3] = np.where(arm_ids >= 0, _byte(opacity), 0)
+    return picture
+
+
+def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
+    """Each arm's pixels in its colour."""
+    colors, _ = _palette(arm_ids)
+    return _faded(colors[arm_ids + 1], opacity)
+
+
+def contour(arm_ids: ArmIds, opacity: float) -> Rgba:
+    """The outline of each arm's visible part, along its outermost pixels, in its colour."""
+    colors, count = _palette(arm_ids)
+    picture = nothing(*arm_ids.shape)
+    thickness = max(1, round(max(arm_ids.shape) / 480))
+    for arm in range(count):
+        lines, _ = cv2.findContours((arm_ids == arm).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, lines, -1, tuple(int(value) for value in colors[arm + 1]), thickness)
+    return _faded(picture, opacity)
+
+
+def against_truth(
+    predicted: Bool[np.ndarray, "height width"], truth: Bool[np.ndarray, "height width"], opacity: float
+) -> Rgba:
+    """True and false positives and negatives in the paper's colours."""
+    table = np.array([(*color, 255) for color in TRUTH_COLORS.values()], np.uint8)
+    index = np.select([predicted & truth, predicted, truth], [0, 1, 2], 3)
+    return _faded(table[index], opacity)
+
+
+def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[int, int], opacity: float) -> Rgba:
+    """A map at any resolution in the colours of viridis, from `low` (dark) to `high` (bright).
+
+    Args:
+        values: The map.
+        low: The value of the darkest colour.
+        high: The value of the brightest colour.
+        size: Height and width of the picture [px].
+        opacity: Opacity, 0..1.
+    """
+    height, width = size
+    share = np.clip((np.nan_to_num(values.astype(np.float32)) - low) / (high - low), 0, 1)
+    share = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR)
+    colored = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    picture = nothing(height, width)
+    picture[..., :3] = colored[..., ::-1]
+    picture[..., 3] = _byte(opacity)
+    return picture
+
+
+def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:
+    """RGBA of background (index 0) and of each arm (its index + 1), and the number of arms seen."""
+    count = int(arm_ids.max(initial=-1)) + 1
+    rows = [(0, 0, 0, 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]
+    return np.array(rows, np.uint8), count
+
+
+def _faded(picture: Rgba, opacity: float) -> Rgba:
+    picture[..., 3] = (picture[..., 3] * np.float32(opacity) + 0.5).astype(np.uint8)
+    return picture
+
+
+def _byte(opacity: float) -> int:
+    return round(255 * opacity)

@@ -1,0 +1,191 @@
+"""Everything the viewer needs from viser that viser does not offer publicly, in one place.
+
+- The server is guarded against other sites and other host names, and serves `static/` and our script and style.
+- Messages to one client's page (`tell`), and the page's word that it has drawn an overlay (`on_drawn`).
+- Buttons side by side, which viser's panels do not know.
+
+viser is pinned to one minor version, and the browser tests drive all of this end to end.
+"""
+
+import contextlib
+import functools
+import http
+import io
+import json
+import mimetypes
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import viser
+import websockets.asyncio.server
+from viser._messages import RunJavascriptMessage
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from carts_core.errors import CartsError
+from carts_core.resources import static_dir
+from carts_viewer.guard import check_loopback, refusal
+
+_TITLE = "<title>Viser</title>"
+_SERVER_CONSTRUCTION = threading.Lock()
+
+
+class Page:
+    """A viser server that answers this computer's own page only, plus the script that runs in that page."""
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, title: str = "CaRTS") -> None:
+        """Start serving.
+
+        Args:
+            host: A loopback address or `localhost`.
+            port: The port to listen on; 0 picks a free one, a busy one moves up to the next free one.
+            title: The browser tab's title.
+
+        Raises:
+            SettingsError: `host` is reachable from other computers.
+        """
+        check_loopback(host)
+        self._title = title
+        self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
+        with _guarded_server(self._respond), contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.url = f"http://{host}:{self.server.get_port()}"
+        # The page writes into this invisible field when it has drawn a new overlay.
+        self._drawn = self.server.gui.add_text("drawn", "", visible=False)
+
+    def close(self) -> None:
+        """Stop serving and disconnect every tab."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def on_drawn(self, callback: Callable[[int], None]) -> None:
+        """Call `callback(client_id)` on the event loop whenever a tab has drawn a newer overlay."""
+
+        @self._drawn.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client_id is not None:
+                callback(event.client_id)
+
+    def tell(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
+        """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
+        call = ", ".join(json.dumps(argument) for argument in arguments)
+        source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({call});"
+        # Never broadcast: viser replays a broadcast script to every tab that joins later.
+        client._websock_connection.queue_message(RunJavascriptMessage(source=source))
+
+    def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
+        """Lay out consecutive buttons of the current container side by side.
+
+        Args:
+            handles: The buttons, in order.
+            weights: Relative widths; equal when left out.
+        """
+        shares = [1.0] * len(handles) if weights is None else list(weights)
+        self._side_by_side([handle._impl.uuid for handle in handles], shares, "div:has(> [id='{}'])")
+
+    def columns(self, handles: Sequence[viser.GuiCheckboxHandle], count: int = 2) -> None:
+        """Lay out consecutive checkboxes of the current container in columns, in reading order."""
+        for first in range(0, len(handles), count):
+            group = [handle._impl.uuid for handle in handles[first : first + count]]
+            # A short last line keeps the width of the others.
+            box = "div:has(> .mantine-Flex-root > div > .mantine-Checkbox-root [id='{}'])"
+            self._side_by_side(group, [1.0] * len(group), box, total=float(count))
+
+    def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
+        """Turn the boxes around these elements into parts of a line, by a style sheet that names their ids."""
+        total = sum(shares) if total is None else total
+        boxes = [box.format(name) for name in ids]
+        rules = [
+            f"{', '.join(boxes)} {{ display: inline-block; box-sizing: border-box; vertical-align: top; "
+            "margin-inline: 0 !important; padding-inline: 4px !important }"
+        ]
+        for one, share in zip(boxes, shares, strict=True):
+            # The line is as wide as single elements, which keep 10 px from either side of the panel.
+            rules.append(f"{one} {{ width: calc((100% - 12px) * {share / total:.4f}) }}")
+        rules.append(f"{boxes[0]} {{ margin-left: 6px !important }}")
+        self.server.gui.add_html(f"<style>{' '.join(rules)}</style>")
+
+    def element_id(self, handle: Any) -> str:
+        """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
+        return handle._impl.uuid
+
+    def _respond(self, request: Request) -> Response | None:
+        """Our own answer to a request, or None to let viser answer it."""
+        reason = refusal(request.headers)
+        if reason is not None:
+            return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
+        path = request.path.partition("?")[0]
+        if path.startswith("/static/"):
+            return self._static(path.removeprefix("/static/"))
+        if path in ("/", "/index.html") and request.headers.get("Upgrade") != "websocket":
+            return _response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index())
+        return None
+
+    def _static(self, name: str) -> Response:
+        # Only names that a listing of the folder gave are looked up, so no path can leave it.
+        file = self._files.get(name)
+        if file is None:
+            return _response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")
+        kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
+        return _response(http.HTTPStatus.OK, kind, file.read_bytes())
+
+    def _index(self) -> bytes:
+        configuration = json.dumps({"drawn": self._drawn._impl.uuid})
+        return (
+            _index_of_viser()
+            .replace(
+                _TITLE,
+                f"<title>{self._title}</title>"
+                '<link rel="icon" href="/static/icon.svg" />'
+                '<link rel="stylesheet" href="/static/page.css" />'
+                f"<script>window.cartsConfiguration = {configuration};</script>"
+                '<script src="/static/page.js" defer></script>',
+                1,
+            )
+            .encode()
+        )
+
+
+@functools.cache
+def _index_of_viser() -> str:
+    index = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    text = index.read_text(encoding="utf-8")
+    if _TITLE not in text:
+        raise CartsError(
+            f"{index} is not the page of viser 1.1. Install the pinned version: pip install 'viser~=1.1.1'"
+        )
+    return text
+
+
+def _response(status: http.HTTPStatus, kind: str, body: bytes) -> Response:
+    headers = Headers()
+    headers["Content-Type"] = kind
+    headers["Content-Length"] = str(len(body))
+    headers["Cache-Control"] = "no-cache"
+    headers["X-Content-Type-Options"] = "nosniff"
+    headers["X-Frame-Options"] = "DENY"
+    return Response(status.value, status.phrase, headers, body)
+
+
+@contextlib.contextmanager
+def _guarded_server(respond: Callable[[Request], Response | None]) -> Iterator[None]:
+    """While active, a websocket server that is started asks `respond` before it answers anything."""
+    original = websockets.asyncio.server.serve
+
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def guarded(connection: Any, request: Request) -> Any:
+            answer = respond(request)
+            if answer is not None or process_request is None:
+                return answer
+            return process_request(connection, request)
+
+        return original(*arguments, process_request=guarded, **options)
+
+    with _SERVER_CONSTRUCTION:
+        websockets.asyncio.server.serve = serve  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = original

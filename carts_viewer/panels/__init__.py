@@ -1,0 +1,1 @@
+"""The panels: each builds its widgets, turns what people do into intents, and shows a state."""

@@ -1,0 +1,57 @@
+"""Which frame, domain and camera are shown, and playing."""
+
+import viser
+
+from carts_viewer import intents as ask
+from carts_viewer.controller import SPEEDS
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
+from carts_viewer.session import Session
+from carts_viewer.state import Source, ViewState
+
+_SOURCES = {
+    Source.MEASURED: "joints as measured",
+    Source.EDITED: "joints moved by hand",
+    Source.OPTIMIZED: "joints optimized",
+}
+
+
+class BrowsePanel:
+    """Frame slider, transport buttons, domain and camera."""
+
+    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
+        gui = page.server.gui
+        sequence = session.sequence
+        self._count = len(sequence)
+        with gui.add_folder("Sequence"):
+            # A slider needs two ends even for a sequence of a single frame.
+            self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
+            back = gui.add_button("", icon=viser.Icon.PLAYER_TRACK_PREV)
+            self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+            forward = gui.add_button("", icon=viser.Icon.PLAYER_TRACK_NEXT)
+            page.row(back, self._play, forward, weights=(1, 2, 1))
+            self._speed = gui.add_number("Frames/s", 10.0, min=SPEEDS[0], max=SPEEDS[1], step=0.5)
+            self._domains = {humanized(name): name for name in sequence.domains}
+            self._domain = gui.add_dropdown("Domain", list(self._domains), visible=len(self._domains) > 1)
+            cameras = [camera.name for camera in sequence.scene.cameras]
+            self._camera = gui.add_dropdown("Camera", cameras, visible=len(cameras) > 1)
+            self._caption = gui.add_html("")
+        on_input(self._frame, lambda value: ask.ShowFrame(int(value) - 1), emit)
+        on_click(back, lambda _: ask.MoveFrame(-1), emit)
+        on_click(forward, lambda _: ask.MoveFrame(1), emit)
+        on_click(self._play, lambda _: ask.Play(), emit)
+        on_input(self._speed, ask.SetSpeed, emit)
+        on_input(self._domain, lambda label: ask.ShowDomain(self._domains[label]), emit)
+        on_input(self._camera, ask.ShowCamera, emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        write(self._frame, state.index + 1)
+        write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
+        write(self._camera, state.camera)
+        self._play.label = "Stop" if state.playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_STOP if state.playing else viser.Icon.PLAYER_PLAY
+        self._caption.content = (
+            f'<p class="carts-caption">Frame <b>{escaped(state.frame.frame_id)}</b> '
+            f"({state.index + 1} of {self._count}) · {_SOURCES[state.pose.source]}</p>"
+        )

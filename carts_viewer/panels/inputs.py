@@ -1,0 +1,72 @@
+"""The traffic between widgets and intents: what a browser sends is checked, what we write is not taken for input."""
+
+import html
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import viser
+
+from carts_viewer.intents import Intent
+from carts_viewer.state import ViewState
+
+Emit = Callable[[Intent], None]
+"""Hands an intent to the worker; never blocks."""
+
+
+class Panel(Protocol):
+    """A group of widgets."""
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+
+
+def on_input(handle: Any, intent: Callable[[Any], Intent | None], emit: Emit) -> None:
+    """When a person changes the widget, emit what `intent` makes of its value.
+
+    Our own writes (they have no client), numbers that are not finite and choices that do not exist are not input.
+    The callback is a coroutine: viser runs those in order on its event loop, plain functions in no order on a pool.
+    """
+
+    @handle.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        if event.client_id is not None and valid(handle):
+            asked = intent(handle.value)
+            if asked is not None:
+                emit(asked)
+
+
+def on_click(handle: viser.GuiButtonHandle, intent: Callable[[int], Intent], emit: Emit) -> None:
+    """When a person presses the button, emit what `intent` makes of the number of their tab."""
+
+    @handle.on_click
+    async def _(event: viser.GuiEvent) -> None:
+        # A tab can send a click on a button that is greyed out, so what a click may do is decided by the controller.
+        if event.client_id is not None:
+            emit(intent(event.client_id))
+
+
+def valid(handle: Any) -> bool:
+    """Whether the widget's value is one that its own rules allow, as far as they are not numbers to be clamped."""
+    value = handle.value
+    if isinstance(value, float) and not math.isfinite(value):
+        return False
+    options = getattr(handle, "options", None) if isinstance(handle, viser.GuiDropdownHandle) else None
+    return options is None or value in options
+
+
+def write(handle: Any, value: Any) -> None:
+    """Set a widget's value if it is another one; a number that was not finite counts as another one."""
+    if handle.value != value:
+        handle.value = value
+
+
+def escaped(text: str) -> str:
+    """Text for use inside HTML."""
+    return html.escape(text, quote=True)
+
+
+def humanized(name: str) -> str:
+    """A joint's or field's identifier as people write it: `outer_yaw_joint` -> `Outer yaw`."""
+    words = name.removesuffix("_joint").replace("_", " ").replace("-", " ").strip()
+    return words[:1].upper() + words[1:]

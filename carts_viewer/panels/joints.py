@@ -1,0 +1,137 @@
+"""Joint positions by hand: a slider with a number field per joint, in degrees and millimetres, and what undoes them."""
+
+import math
+from collections.abc import Callable, Hashable
+
+import viser
+
+from carts_viewer import intents as ask
+from carts_viewer.controller import LARGEST_PERTURBATION
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, humanized, on_click, on_input
+from carts_viewer.session import JointRange, Session
+from carts_viewer.state import ViewState
+
+_WINDOWS = {"± 5": 5.0, "± 20": 20.0, "Full range": math.inf}
+_STEP = 0.05
+"""Of the sliders [deg] and [mm]."""
+
+
+class JointsPanel:
+    """One tab per arm with its joints, and the buttons that concern all arms."""
+
+    def __init__(
+        self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Callable[[Hashable], bool]
+    ) -> None:
+        """
+        Args:
+            page: Where to build the widgets, in the current container.
+            session: The open sequence.
+            state: The state to begin with.
+            emit: Takes the intents.
+            waits: Whether an intent of this key waits for the worker, in which case its widget is ahead of the state.
+        """
+        gui = page.server.gui
+        self._session = session
+        self._waits = waits
+        self._server = page.server
+        self._window = 20.0
+        self._sliders: dict[tuple[str, int], tuple[JointRange, viser.GuiSliderHandle[float]]] = {}
+        self._centred_on: object = None
+        tabs = gui.add_tab_group()
+        for arm in session.scene.arms:
+            with tabs.add_tab(arm.name, viser.Icon.GRAIN):
+                self._add_arm(page, arm.name, state, emit)
+        window = gui.add_dropdown("Slider range", list(_WINDOWS), initial_value="± 20")
+        self._degrees = gui.add_number("Perturb by °/mm", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
+        self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
+        perturb = gui.add_button("Perturb all joints", icon=viser.Icon.ARROWS_SHUFFLE)
+        measured = gui.add_button("Back to measured", icon=viser.Icon.HISTORY)
+        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP)
+        page.row(measured, self._undo, weights=(3, 2))
+        on_click(perturb, lambda _: self.perturb(), emit)
+        on_click(measured, lambda _: ask.BackToMeasured(), emit)
+        on_click(self._undo, lambda _: ask.Undo(), emit)
+
+        @window.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client_id is not None and window.value in _WINDOWS:
+                self._window = _WINDOWS[window.value]
+                self._centred_on = None
+                emit(ask.Refresh())
+
+    def perturb(self) -> ask.Perturb:
+        """The perturbation that the fields describe."""
+        return ask.Perturb(float(self._degrees.value), int(self._seed.value))
+
+    def slider(self, arm: str, joint: int) -> viser.GuiSliderHandle[float]:
+        """The slider of one joint."""
+        return self._sliders[arm, joint][1]
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        joints = self._session.joints(state.pose.scene)
+        with self._server.atomic():
+            if self._centred_on != state.frame.index:
+                self._centred_on = state.frame.index
+                self._centre(state)
+            for (arm, joint), (limits, slider) in self._sliders.items():
+                shown = to_shown(limits, float(joints[arm][joint]))
+                # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
+                near = math.isfinite(slider.value) and abs(slider.value - shown) < _STEP / 2
+                if not near and not self._waits((ask.SetJoint, arm, joint)):
+                    self._widen(slider, shown)
+                    slider.value = round(shown, 2)
+        self._undo.disabled = state.undoable == 0
+
+    def _add_arm(self, page: Page, arm: str, state: ViewState, emit: Emit) -> None:
+        gui = page.server.gui
+        joints = self._session.joints(state.pose.scene)[arm]
+        for joint, limits in enumerate(limits for limits in self._session.ranges if limits.arm == arm):
+            low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
+            value = to_shown(limits, float(joints[joint]))
+            unit = "°" if limits.revolute else "mm"
+            label = f"{humanized(limits.joint)} [{unit}]"
+            slider = gui.add_slider(
+                label, math.floor(min(low, value)), math.ceil(max(high, value)), _STEP, round(value, 2)
+            )
+            self._sliders[arm, joint] = (limits, slider)
+            on_input(slider, self._intent(arm, joint, limits), emit)
+        reset = gui.add_button(f"{arm} back to measured", icon=viser.Icon.HISTORY)
+        page.row(reset)
+        on_click(reset, lambda _: ask.BackToMeasured(arm), emit)
+
+    def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], ask.Intent]:
+        return lambda shown: ask.SetJoint(arm, joint, from_shown(limits, shown))
+
+    def _centre(self, state: ViewState) -> None:
+        """Put the sliders' ends around the measured values, within the joints' limits."""
+        measured = state.frame.measured
+        for (arm, joint), (limits, slider) in self._sliders.items():
+            low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
+            middle = to_shown(limits, float(measured[arm][joint]))
+            slider.min = _tidy(max(low, min(middle - self._window, high)))
+            slider.max = _tidy(min(high, max(middle + self._window, low)))
+            self._widen(slider, slider.value if math.isfinite(slider.value) else middle)
+
+    @staticmethod
+    def _widen(slider: viser.GuiSliderHandle[float], value: float) -> None:
+        """Let the slider reach a value beyond its ends."""
+        if value < slider.min:
+            slider.min = math.floor(value)
+        if value > slider.max:
+            slider.max = math.ceil(value)
+
+
+def to_shown(limits: JointRange, value: float) -> float:
+    """A joint position [rad, m] as people read it [deg, mm]."""
+    return math.degrees(value) if limits.revolute else 1e3 * value
+
+
+def from_shown(limits: JointRange, shown: float) -> float:
+    """A joint position [rad, m] from what people type [deg, mm]."""
+    return math.radians(shown) if limits.revolute else shown / 1e3
+
+
+def _tidy(value: float) -> float:
+    return round(value) if math.isfinite(value) else value

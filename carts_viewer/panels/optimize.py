@@ -1,0 +1,81 @@
+"""Run, Pause, Step, Reset, how it is going, and which loss."""
+
+from typing import get_args
+
+import viser
+
+from carts_core.losses import Loss
+from carts_viewer import intents as ask
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.session import Session
+from carts_viewer.state import Phase, ViewState
+
+LOSS_LABELS = {
+    "acs": "ACS, per attended area",
+    "acs_paper": "ACS as in the paper",
+    "acs_reference": "ACS as in the paper's code",
+    "l1": "L1 on predictions",
+}
+"""What people read for the losses; one that is not listed goes by its own name."""
+
+
+class OptimizePanel:
+    """The buttons that drive a run, and its state in words."""
+
+    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
+        gui = page.server.gui
+        self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY, color="teal")
+        self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, disabled=True)
+        page.row(self._run, self._pause)
+        self._step = gui.add_button("Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, color="gray")
+        self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
+        page.row(self._step, self._reset)
+        self._status = gui.add_html("")
+        losses: tuple[str, ...] = get_args(Loss)
+        self._losses = {LOSS_LABELS.get(name, name): name for name in losses}
+        self._loss = gui.add_dropdown(
+            "Loss", list(self._losses), initial_value=_label(self._losses, state.settings.loss)
+        )
+        cameras = [camera.name for camera in session.scene.cameras]
+        self._cameras = gui.add_dropdown("Cameras", ["Shown camera", "All cameras"], visible=len(cameras) > 1)
+        on_click(self._run, lambda _: ask.Run(), emit)
+        on_click(self._pause, lambda _: ask.Pause(), emit)
+        on_click(self._step, lambda _: ask.Step(), emit)
+        on_click(self._reset, lambda _: ask.Reset(), emit)
+        on_input(self._loss, lambda label: ask.SetSetting("loss", self._losses[label]), emit)
+        on_input(self._cameras, lambda label: ask.SetCameras(label == "All cameras"), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        running = state.run.phase is Phase.RUNNING
+        self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
+        self._run.disabled = running
+        self._pause.disabled = not running
+        self._step.disabled = running
+        self._reset.disabled = not state.run.curves.loss
+        write(self._loss, _label(self._losses, state.settings.loss))
+        write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
+        self._status.content = f'<p class="carts-status">{status_line(state)}</p>'
+
+
+def status_line(state: ViewState) -> str:
+    """Iteration, time per iteration and why it stopped, as HTML."""
+    curves, phase = state.run.curves, state.run.phase
+    if state.busy is not None:
+        return f'<span class="carts-spinner"></span>{escaped(state.busy)} …'
+    parts = []
+    if curves.loss:
+        parts.append(f"Iteration <b>{len(curves.loss) - 1}</b> of {state.settings.iterations}")
+        parts.append(f"{1e3 * sum(curves.seconds) / len(curves.seconds):.0f} ms each")
+    if phase is Phase.RUNNING:
+        parts.append("running")
+    elif phase is Phase.PAUSED:
+        parts.append("paused")
+    elif state.run.reason:
+        parts.append(f"<b>{escaped(state.run.reason)}</b>")
+    return " · ".join(parts) or "Press Run to fit the arm to this frame."
+
+
+def _label(labels: dict[str, str], name: str) -> str:
+    return next(label for label, known in labels.items() if known == name)

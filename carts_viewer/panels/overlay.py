@@ -1,0 +1,56 @@
+"""What is drawn over the frame, and what its colours mean."""
+
+from carts_viewer import intents as ask
+from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, on_input, write
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+
+
+class OverlayPanel:
+    """Layer and opacity, with a legend and the fit to the truth."""
+
+    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
+        gui = page.server.gui
+        sequence = session.sequence
+        self._arms = [arm.name for arm in sequence.scene.arms]
+        options = offered_layers(session)
+        with gui.add_folder("Overlay"):
+            self._layer = gui.add_dropdown("Layer", [str(layer) for layer in options], initial_value=str(state.layer))
+            self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
+            self._legend = gui.add_html("")
+        on_input(self._layer, lambda value: ask.ShowLayer(Layer(value)), emit)
+        on_input(self._opacity, lambda value: ask.SetOpacity(value / 100), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        write(self._layer, str(state.layer))
+        self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
+
+    def _explain(self, state: ViewState) -> str:
+        if state.layer in (Layer.MASK, Layer.CONTOUR):
+            return " ".join(
+                _swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
+            )
+        if state.layer is Layer.TRUTH:
+            if state.frame.masks is None or state.camera not in state.frame.masks:
+                return "This frame has no true mask to compare with."
+            return " ".join(_swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
+        if state.layer is Layer.ATTENTION:
+            return '<span class="carts-ramp"></span> 0 (left out) to 1 (counts fully)'
+        if state.layer is Layer.SIMILARITY:
+            return '<span class="carts-ramp"></span> 0 (unlike) to 1 (alike)'
+        return ""
+
+
+def offered_layers(session: Session) -> list[Layer]:
+    """The layers that make sense for a sequence: without true masks there is nothing to compare with."""
+    sequence = session.sequence
+    cameras = [camera.name for camera in sequence.scene.cameras]
+    truth = any(sequence.has_masks(camera, domain) for camera in cameras for domain in sequence.domains)
+    return [layer for layer in Layer if truth or layer is not Layer.TRUTH]
+
+
+def _swatch(color: tuple[int, int, int], name: str) -> str:
+    return f'<span class="carts-swatch" style="background: rgb{color}"></span>{name}'

@@ -1,0 +1,77 @@
+"""The overlay of a pose over its frame at the frame's own size, and how well it fits the truth."""
+
+import torch
+
+from carts_core.data import Frame, Sequence
+from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.rendering import Renderer
+from carts_core.scene import SceneState
+from carts_viewer import layers
+from carts_viewer.layers import Layer
+from carts_viewer.state import Maps, Scores
+
+
+class Painter:
+    """Renders poses into the scene's cameras; keeps one renderer per camera."""
+
+    def __init__(self, sequence: Sequence, device: str | torch.device = "cpu") -> None:
+        self._scene = sequence.scene
+        self._measured_joints = sequence.measured_joints
+        self._device = device
+        self._renderers: dict[str, Renderer] = {}
+
+    def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
+        """Index of the visible arm per pixel of the camera's own image, -1 for background."""
+        return self._renderer(camera).segment(state.to(self._device))[0]
+
+    def overlay(
+        self, state: SceneState, frame: Frame, camera: str, layer: Layer, opacity: float, maps: Maps | None
+    ) -> layers.Rgba:
+        """The layer over one camera's image.
+
+        Args:
+            state: The pose of the whole scene.
+            frame: Its true masks are used by the comparison; without one there is nothing to compare.
+            camera: The camera's name.
+            layer: What to draw.
+            opacity: Opacity, 0..1.
+            maps: Where attention and similarity come from; without them these layers are empty.
+        """
+        size = self._scene.camera(camera).height, self._scene.camera(camera).width
+        if layer is Layer.SHADED:
+            return self._shaded(state, camera, opacity)
+        if layer is Layer.MASK:
+            return layers.mask(self.arm_ids(state, camera), opacity)
+        if layer is Layer.CONTOUR:
+            return layers.contour(self.arm_ids(state, camera), opacity)
+        if layer is Layer.TRUTH:
+            truth = None if frame.masks is None else frame.masks.get(camera)
+            predicted = self.arm_ids(state, camera) >= 0
+            return layers.nothing(*size) if truth is None else layers.against_truth(predicted, truth, opacity)
+        if layer in (Layer.ATTENTION, Layer.SIMILARITY) and maps is not None and camera in maps.cameras:
+            # Features are not negative, so their similarity is not either.
+            values = maps.iterate.attention if layer is Layer.ATTENTION else maps.iterate.similarity
+            return layers.heat(values[maps.cameras.index(camera)], 0.0, 1.0, size, opacity)
+        return layers.nothing(*size)
+
+    def scores(self, state: SceneState, frame: Frame, camera: str) -> Scores:
+        """How close the pose is to the frame's truth, as far as there is one."""
+        mask = None if frame.masks is None else frame.masks.get(camera)
+        overlap = None if mask is None else dice(self.arm_ids(state, camera) >= 0, mask)
+        values = (joints.double().numpy() for joints in state.joint_positions)
+        estimate = {arm.name: joints for arm, joints in zip(self._scene.arms, values, strict=True)}
+        return Scores(overlap, joint_mae_deg(self._scene, estimate, frame.truth or {}, self._measured_joints))
+
+    @torch.no_grad()
+    def _shaded(self, state: SceneState, camera: str, opacity: float) -> layers.Rgba:
+        rendering = self._renderer(camera)(state.to(self._device))
+        image = rendering.image[0].permute(1, 2, 0).cpu().numpy()
+        return layers.shaded(image, rendering.arm_ids[0].cpu().numpy(), opacity)
+
+    def _renderer(self, camera: str) -> Renderer:
+        if camera not in self._renderers:
+            own = self._scene.camera(camera)
+            self._renderers[camera] = Renderer(
+                self._scene, width=own.width, height=own.height, cameras=[camera], device=self._device
+            )
+        return self._renderers[camera]

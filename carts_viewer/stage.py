@@ -1,0 +1,152 @@
+"""The 3D scene of the page: the frame and its overlay in front of the lens, and behind them arms and cameras.
+
+viser's world is the shown camera's frame (OpenCV axes), so looking through the endoscope is looking from the origin
+along z, whatever camera is shown; the recording's own world is a node that moves when the camera is changed.
+"""
+
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+from viser import transforms
+
+from carts_core.camera import Camera
+from carts_core.scene import Scene, SceneState
+from carts_viewer.layers import ARM_COLORS, Rgba
+
+LENS = "/lens"
+"""Lines from the lens to the corners of the frame; hidden like `WORLD`."""
+FRAME = "/frame"
+OVERLAY = "/overlay"
+WORLD = "/world"
+"""Arms and other cameras; the page's script hides it in the endoscope view, where the frame covers it anyway."""
+_LENS_COLOR = (45, 212, 167)
+_OTHER_COLOR = (150, 160, 165)
+_JPEG_QUALITY = 88
+_DEPTH_SHARE = 0.25
+_OVERLAY_SHARE = 0.99
+
+
+class Stage:
+    """What all tabs see; every tab chooses for itself from where."""
+
+    def __init__(self, server: viser.ViserServer, scene: Scene, state: SceneState, camera: str) -> None:
+        """
+        Args:
+            server: The page's server.
+            scene: The recording's arms and cameras.
+            state: A pose of it, which decides how far from the lens the frame is put.
+            camera: The camera to begin with.
+        """
+        self._server = server
+        self._scene = scene
+        self._depth = _DEPTH_SHARE * _distance_of_arms(scene, state, camera)
+        self._links: list[list[viser.FrameHandle]] = []
+        self._outlines: dict[str, viser.LineSegmentsHandle] = {}
+        self._planes: dict[str, tuple[Camera, viser.ImageHandle]] = {}
+        server.scene.set_up_direction("-y")
+        initial = server.initial_camera
+        initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
+        self._world = server.scene.add_frame(WORLD, show_axes=False)
+        self._add_arms()
+        self._add_cameras()
+
+    def show_frame(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera) -> None:
+        """Put an image of this camera in front of the lens."""
+        self._put(FRAME, image, camera, self._depth, "jpeg")
+
+    def show_overlay(self, picture: Rgba, camera: Camera) -> None:
+        """Put an overlay for this camera's image between the image and the lens."""
+        self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
+
+    def show_pose(self, state: SceneState, camera: str) -> None:
+        """Move arms and cameras to where they are, seen from this camera."""
+        extrinsics = {
+            own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_camera_world, strict=True)
+        }
+        _place(self._world, extrinsics[camera])
+        for name, outline in self._outlines.items():
+            _place(outline, np.linalg.inv(extrinsics[name]))
+            outline.visible = name != camera
+        bases = state.T_world_base.numpy().astype(float)
+        arms = zip(self._scene.arms, self._links, bases, state.joint_positions, strict=True)
+        for arm, nodes, T_world_base, joints in arms:
+            Ts_base_link = arm.robot.forward_kinematics(joints).detach().numpy().astype(float)
+            for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
+                _place(node, T_world_base @ T_base_link)
+
+    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
+        """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
+        if name in self._planes and self._planes[name][0] is camera:
+            self._planes[name][1].image = image
+            return
+        fx, fy, cx, cy = camera.intrinsics
+        handle = self._server.scene.add_image(
+            name,
+            image,
+            camera.width / fx * z,
+            camera.height / fy * z,
+            format="jpeg" if kind == "jpeg" else "png",
+            jpeg_quality=_JPEG_QUALITY,
+            position=((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._planes[name] = (camera, handle)
+        if name == FRAME:
+            self._outline(LENS, camera, _LENS_COLOR)
+
+    def _outline(self, name: str, camera: Camera, color: tuple[int, int, int]) -> viser.LineSegmentsHandle:
+        """Lines from a lens to the corners of its image at the frame's depth, and around the image."""
+        fx, fy, cx, cy = camera.intrinsics
+        z = self._depth
+        corners = [
+            ((u - cx) / fx * z, (v - cy) / fy * z, z)
+            for u, v in ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))
+        ]
+        edges = [(corner, corners[(number + 1) % 4]) for number, corner in enumerate(corners)]
+        rays = [((0.0, 0.0, 0.0), corner) for corner in corners]
+        return self._server.scene.add_line_segments(
+            name, np.array([*edges, *rays], np.float32), color, thickness=2.0, thickness_units="screen"
+        )
+
+    def _add_arms(self) -> None:
+        scene = self._server.scene
+        for number, arm in enumerate(self._scene.arms):
+            root = f"{WORLD}/{number}"
+            links = [scene.add_frame(f"{root}/{name}", show_axes=False) for name in arm.robot.link_names]
+            for part, mesh in enumerate(arm.robot.meshes):
+                scene.add_mesh_simple(
+                    f"{root}/{arm.robot.link_names[mesh.link]}/{part}",
+                    np.asarray(mesh.vertices, np.float32),
+                    np.asarray(mesh.faces, np.uint32),
+                    color=_mixed(mesh.color, ARM_COLORS[number % len(ARM_COLORS)]),
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+            self._links.append(links)
+
+    def _add_cameras(self) -> None:
+        for camera in self._scene.cameras:
+            self._outlines[camera.name] = self._outline(f"{WORLD}/camera {camera.name}", camera, _OTHER_COLOR)
+
+
+def _place(node: viser.SceneNodeHandle, T_parent_node: Float[np.ndarray, "4 4"]) -> None:
+    node.wxyz = transforms.SO3.from_matrix(T_parent_node[:3, :3]).wxyz
+    node.position = T_parent_node[:3, 3]
+
+
+def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
+    """Depth of the nearest link in front of the camera [m], or a plausible one."""
+    row = [own.name for own in scene.cameras].index(camera)
+    depths = []
+    for arm, T_world_base, joints in zip(scene.arms, state.T_world_base, state.joint_positions, strict=True):
+        Ts = state.T_camera_world[row] @ T_world_base @ arm.robot.forward_kinematics(joints)
+        depths += [float(z) for z in Ts[..., 2, 3] if z > 0.0]
+    return min(depths, default=0.1)
+
+
+def _mixed(color, accent: tuple[int, int, int]) -> tuple[int, int, int]:
+    """A link's own colour with a touch of the arm's, so that arms can be told apart."""
+    own = np.asarray(color, float)[:3] * 255
+    return tuple(int(value) for value in np.clip(0.75 * own + 0.25 * np.array(accent), 0, 255))  # type: ignore[return-value]

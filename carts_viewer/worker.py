@@ -1,0 +1,119 @@
+"""The one thread that computes: takes intents, changes the state, and shows what came out."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from carts_core.errors import CartsError
+from carts_viewer.controller import Controller
+from carts_viewer.intents import Mailbox
+from carts_viewer.state import ViewState
+
+_log = logging.getLogger(__name__)
+
+
+class Display(Protocol):
+    """Where states are shown."""
+
+    def ready_in(self) -> float:
+        """How long until the page can take another picture [s]; 0 when it can now."""
+        ...
+
+    def show_picture(self, state: ViewState) -> None:
+        """Send frame, overlay and 3D scene, as far as they changed."""
+
+    def show_panels(self, state: ViewState) -> None:
+        """Bring every widget up to date."""
+
+
+class Worker:
+    """Drains the mailbox, newest wins; pictures go out as fast as the page draws them and the last one always does."""
+
+    def __init__(self, mailbox: Mailbox, controller: Controller, display: Display) -> None:
+        self._mailbox = mailbox
+        self._controller = controller
+        self._display = display
+        self._stop = threading.Event()
+        self._shown: ViewState | None = None
+        self._pictured: ViewState | None = None
+        self._startup: Callable[[], None] | None = None
+        self._rest = threading.Condition()
+        self._resting = False
+        self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
+
+    def start(self, startup: Callable[[], None] | None = None) -> None:
+        """Begin; `startup` runs on the worker's thread once the first picture is out."""
+        self._startup = startup
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Finish what is being done and end the thread."""
+        self._stop.set()
+        self._mailbox.wake()
+        self._thread.join(timeout=30.0)
+
+    def settled(self, timeout: float) -> bool:
+        """Wait until nothing is left to do or to show; False when that took longer than `timeout` [s]."""
+        end = time.monotonic() + timeout
+        with self._rest:
+            while not (self._resting and self._mailbox.empty()):
+                if not self._rest.wait(min(0.05, max(0.0, end - time.monotonic()))) and time.monotonic() > end:
+                    return False
+        return True
+
+    def report(self, text: str | None) -> None:
+        """Show what is being prepared, at once; called on the worker's thread from within the work."""
+        self._controller.say(text)
+        self._display.show_panels(self._controller.state)
+
+    def _work(self) -> None:
+        self._attempt(self._publish)
+        if self._startup is not None:
+            self._attempt(self._startup)
+        while not self._stop.is_set():
+            self._attempt(self._round)
+
+    def _round(self) -> None:
+        patience = self._patience()
+        self._set_resting(patience is None and self._mailbox.empty())
+        intents = self._mailbox.take(patience)
+        self._set_resting(False)
+        for intent in intents:
+            self._attempt(lambda intent=intent: self._controller.handle(intent))
+        self._attempt(self._controller.advance)
+        self._publish()
+
+    def _set_resting(self, resting: bool) -> None:
+        with self._rest:
+            self._resting = resting
+            self._rest.notify_all()
+
+    def _patience(self) -> float | None:
+        """How long to wait for an intent: not while there is work, and no longer than a picture waits for the page."""
+        patience = self._controller.patience()
+        if self._pictured is not self._controller.state:
+            ready = self._display.ready_in()
+            return ready if patience is None else min(ready, patience)
+        return patience
+
+    def _publish(self) -> None:
+        if self._pictured is not self._controller.state and self._display.ready_in() <= 0.0:
+            self._controller.complete()
+            self._display.show_picture(self._controller.state)
+            self._pictured = self._controller.state
+        if self._shown is not self._controller.state:
+            self._display.show_panels(self._controller.state)
+            self._shown = self._controller.state
+
+    def _attempt(self, work: Callable[[], None]) -> None:
+        """Do something; an error is shown in the page and the worker goes on."""
+        try:
+            work()
+        except CartsError as error:
+            self._controller.fail(error)
+        except Exception as error:
+            # The traceback helps whoever reads the terminal; the page shows what happened.
+            _log.exception("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"))
+            self._controller.fail(error)
