@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -76,6 +77,7 @@ def _tip(robot: Robot, joint_positions: np.ndarray) -> np.ndarray:
     return T_base_link[:3, :3] @ robot.meshes[-1].vertices.mean(0) + T_base_link[:3, 3]
 
 
+@cache
 def tiny_scene(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> TinyScene:
     """One arm whose instrument's tip is in the middle of every camera's view."""
     prismatic = np.array([kind == "prismatic" for kind in robot.joint_types])
@@ -104,25 +106,45 @@ def _write_table(path: Path, robot: Robot, positions: np.ndarray) -> None:
             writer.writerow([row + 1, f"{row / 10:.3f}", *(f"{value:.9f}" for value in values)])
 
 
-def _write_images(folder: Path, tiny: TinyScene, domains: tuple[str, ...]) -> None:
-    """Images and masks of the arm at its true joint positions, before a smooth background."""
-    for camera in tiny.scene.cameras:
-        renderer = Renderer(tiny.scene, width=camera.width, height=camera.height, cameras=[camera.name])
-        x, y = np.meshgrid(np.linspace(0, 1, camera.width), np.linspace(0, 1, camera.height))
-        background = np.stack([0.55 + 0.1 * x, 0.3 + 0.1 * y, 0.25 + 0.05 * x * y], -1)
+@dataclass(frozen=True)
+class TinyImage:
+    """One image of a tiny sequence."""
+
+    camera: str
+    row: int
+    image: np.ndarray
+    """[height, width, 3] in [0, 1]: the arm at its true joint positions, before a smooth background."""
+    mask: np.ndarray
+
+
+# Many tests ask for the same small pictures, so each is rendered once.
+@cache
+def tiny_images(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> tuple[TinyImage, ...]:
+    """Every image of a tiny sequence."""
+    tiny = tiny_scene(robot, frames, cameras, width, height)
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    background = np.stack([0.55 + 0.1 * x, 0.3 + 0.1 * y, 0.25 + 0.05 * x * y], -1)
+    images = []
+    for camera in cameras:
+        renderer = Renderer(tiny.scene, width=width, height=height, cameras=[camera])
         for row, joint_positions in enumerate(tiny.truth):
             with torch.no_grad():
                 rendering = renderer(tiny.scene.state({"PSM1": joint_positions}))
             cover = rendering.silhouette[0].numpy()[..., None]
             image = cover * rendering.image[0].permute(1, 2, 0).numpy() + (1 - cover) * background
-            (folder / "masks" / camera.name).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(
-                str(folder / "masks" / camera.name / f"{row + 1:03d}.png"), (cover[..., 0] > 0.5).astype(np.uint8) * 255
-            )
-            for number, domain in enumerate(domains):
-                (folder / domain / camera.name).mkdir(parents=True, exist_ok=True)
-                pixels = np.rint(255 * np.clip(image / (1 + number), 0, 1)).astype(np.uint8)
-                cv2.imwrite(str(folder / domain / camera.name / f"{row + 1:03d}.png"), pixels[..., ::-1])
+            images.append(TinyImage(camera, row, image.clip(0, 1), cover[..., 0] > 0.5))
+    return tuple(images)
+
+
+def _write_images(folder: Path, images: tuple[TinyImage, ...], domains: tuple[str, ...]) -> None:
+    for entry in images:
+        name = f"{entry.camera}/{entry.row + 1:03d}.png"
+        for kind in ("masks", *domains):
+            (folder / kind / entry.camera).mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / "masks" / name), entry.mask.astype(np.uint8) * 255)
+        for number, domain in enumerate(domains):
+            pixels = np.rint(255 * entry.image / (1 + number)).astype(np.uint8)
+            cv2.imwrite(str(folder / domain / name), pixels[..., ::-1])
 
 
 def _sequence_toml(tiny: TinyScene, domains: tuple[str, ...], robot: str, masks: bool, truth: bool) -> str:
@@ -178,7 +200,7 @@ def tiny_sequence(tmp_path: Path, shipped_psm: Robot) -> Callable[..., Path]:
         tiny = tiny_scene(shipped_psm, frames, cameras, width, height)
         _write_table(tmp_path / "kinematics.csv", shipped_psm, tiny.measured)
         _write_table(tmp_path / "truth.csv", shipped_psm, tiny.truth)
-        _write_images(tmp_path, tiny, domains)
+        _write_images(tmp_path, tiny_images(shipped_psm, frames, cameras, width, height), domains)
         path = tmp_path / "sequence.toml"
         path.write_text(edit(_sequence_toml(tiny, domains, "builtin:psm_lnd", masks, truth)))
         return path

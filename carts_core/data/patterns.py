@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import SequenceError
+from .toml_table import closest
 
+_PLACEHOLDERS = ("frame", "index", "domain", "camera")
 _EXAMPLE = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jpg"'
 
 
@@ -30,9 +32,9 @@ def expand(pattern: str, key: str, **values: object) -> str:
     try:
         return pattern.format(**values)
     except (KeyError, IndexError) as error:
-        known = ", ".join(f"{{{name}}}" for name in values)
         raise SequenceError(
-            f"{key}: {pattern!r} has the unknown placeholder {error}. Known are: {known}; examples: {_EXAMPLE}."
+            f"{key}: {pattern!r} has the unknown placeholder {error}.{closest(str(error.args[0]), _PLACEHOLDERS)} "
+            f"Examples: {_EXAMPLE}."
         ) from error
     except (ValueError, AttributeError) as error:
         raise SequenceError(

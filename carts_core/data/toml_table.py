@@ -40,9 +40,10 @@ def read_toml(path: Path) -> "TomlTable":
 class TomlTable:
     """One table of a file. Keys are taken one by one; `finish` complains about those that nobody took."""
 
-    def __init__(self, values: dict[str, Any], file: Path, where: str) -> None:
+    def __init__(self, values: dict[str, Any], file: Path, where: str, prefix: str = "") -> None:
         self.file = file
         self.where = where
+        self._prefix = prefix
         self._values = values
         self._known: list[str] = []
 
@@ -95,8 +96,8 @@ class TomlTable:
 
     def take_table(self, key: str) -> "TomlTable":
         """The table `[key]`, an empty one when it is absent."""
-        prefix = f"{self.where}: " if self.where else ""
-        return TomlTable(self.take(key, dict, {}), self.file, f"{prefix}[{key}]")
+        place = f"{self.where}: " if self.where else ""
+        return TomlTable(self.take(key, dict, {}), self.file, f"{place}[{self._prefix}{key}]")
 
     def take_tables(self, key: str) -> list["TomlTable"]:
         """The array of tables `[[key]]`: at least one, each with a `name` of its own.
@@ -114,7 +115,7 @@ class TomlTable:
             if name in names:
                 raise self.error(f"[[{key}]]", f"has the name {name!r} twice. Every one needs a name of its own.")
             names.append(name)
-            table = TomlTable(value, self.file, f"[[{key}]] {name!r}")
+            table = TomlTable(value, self.file, f"[[{key}]] {name!r}", f"{key}.")
             table.take("name", str)
             tables.append(table)
         return tables

@@ -17,14 +17,14 @@ SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".
 _CACHED_FRAMES = 16
 _KEPT_BEFORE = 6
 _SKIP_AT_MOST = 48
-_PROBED_FRAMES = 40
 
 
 class Video:
     """Frames of one video file by number; safe to use from several threads.
 
-    Frames in order are decoded in order. A jump seeks, if seeking in this very file was found to give the same pixels
-    as decoding in order does; otherwise the file is decoded again from its start, which is slow and right.
+    Frames are decoded in order, and the checksum of each is kept. Only a frame whose checksum is known is jumped to,
+    and what arrives is compared with it: many files seek to a neighbour of the frame that was asked for. In such a
+    file every jump backwards decodes again from the start, which is slow and right.
 
     Args:
         path: the video file.
@@ -41,12 +41,12 @@ class Video:
         self._cache: OrderedDict[int, np.ndarray] = OrderedDict()
         self._capture: cv2.VideoCapture | None = None
         self._next = 0
-        self._seekable: bool | None = None
+        self._in_order = True
+        self._seekable = True
+        self._checksums: list[int] = []
         if not path.is_file():
             raise SequenceError(f"video {path} is missing. Put it back, or correct the path in the sequence file.")
-        count = int(self._open().get(cv2.CAP_PROP_FRAME_COUNT))
-        # Containers without an index report no count; such a video shows its length when it is read.
-        if 0 < count <= max(numbers):
+        if (count := self._count(max(numbers) + 1)) <= max(numbers):
             raise SequenceError(
                 f"video {path} has {count} frames, but the kinematics table asks for frame number {max(numbers)} "
                 "(counted from 0). Shorten the table, or give it a column with frame numbers (`video_frame`)."
@@ -69,6 +69,19 @@ class Video:
             self._cache.move_to_end(number)
             return self._cache[number]
 
+    def _count(self, wanted: int) -> int:
+        """How many frames there are, counted only as far as `wanted` and only if the file does not say enough."""
+        capture = self._open()
+        said = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if said >= wanted:
+            return said
+        # Files without an index guess their length from the bit rate, and may guess too little.
+        count = 0
+        while count < wanted and capture.grab():
+            count += 1
+        self._open()
+        return count
+
     def _remember(self, number: int, image: np.ndarray) -> None:
         self._cache[number] = image
         while len(self._cache) > _CACHED_FRAMES:
@@ -79,6 +92,7 @@ class Video:
             self._capture.release()
         self._capture = cv2.VideoCapture(str(self.path))
         self._next = 0
+        self._in_order = True
         if not self._capture.isOpened():
             raise SequenceError(
                 f"video {self.path} cannot be decoded. Convert it, say with `ffmpeg -i {self.path.name} -c:v libx264 "
@@ -87,58 +101,45 @@ class Video:
         return self._capture
 
     def _decode(self, number: int) -> None:
-        capture = self._move_to(number)
-        while self._next < number - _KEPT_BEFORE:
-            if not capture.grab():
-                raise self._ended(number)
-            self._next += 1
-        # The frames just before are kept as well, so that stepping backwards needs no new jump every time.
-        while True:
-            ok, image = capture.read()
-            if not ok or image is None:
-                raise self._ended(number)
-            self._remember(self._next, np.ascontiguousarray(image[..., ::-1]))
-            self._next += 1
-            if self._next > number:
-                return
+        """Bring frame `number`, and the few before it, into the cache."""
+        if self._seek(number) and self._read_until(number):
+            return
+        # Nothing is known about seeking in this file, or it lied: decoding in order is always right.
+        if not (self._in_order and self._next <= number):
+            self._open()
+        if not self._read_until(number):
+            raise SequenceError(
+                f"video {self.path} ends, or is damaged, before frame number {number} (counted from 0). "
+                "Copy it again, or shorten the kinematics table."
+            )
 
-    def _move_to(self, number: int) -> cv2.VideoCapture:
-        """Put the decoder somewhere before frame `number`, from where decoding in order reaches it."""
+    def _seek(self, number: int) -> bool:
+        """Jump back to shortly before a frame that was decoded before; False when it must be reached in order."""
         assert self._capture is not None
-        if self._next <= number <= self._next + _SKIP_AT_MOST:
-            return self._capture
-        if self._seekable is None:
-            self._seekable = self._seeks_exactly()
-        if self._seekable and self._seek(self._capture, max(number - _KEPT_BEFORE, 0)):
-            return self._capture
-        return self._open() if self._seekable or number < self._next else self._capture
+        if self._next <= number <= self._next + _SKIP_AT_MOST and (self._in_order or number < len(self._checksums)):
+            return True
+        if not self._seekable or number >= len(self._checksums):
+            return False
+        start = max(number - _KEPT_BEFORE, 0)
+        self._in_order = False
+        self._next = start
+        self._seekable = self._capture.set(cv2.CAP_PROP_POS_FRAMES, start)
+        return self._seekable
 
-    def _seek(self, capture: cv2.VideoCapture, number: int) -> bool:
-        capture.set(cv2.CAP_PROP_POS_FRAMES, number)
-        arrived = round(capture.get(cv2.CAP_PROP_POS_FRAMES)) == number
-        if arrived:
-            self._next = number
-        return arrived
-
-    def _seeks_exactly(self) -> bool:
-        """Whether seeking gives the frames that decoding in order gives, tried at the file's beginning."""
-        capture = self._open()
-        in_order: list[int] = []
-        while len(in_order) < _PROBED_FRAMES:
-            ok, image = capture.read()
+    def _read_until(self, number: int) -> bool:
+        """Decode up to and with frame `number`; False when the video ends, or seeking is found not to be exact."""
+        assert self._capture is not None
+        while self._next <= number:
+            ok, image = self._capture.read()
+            checksum = zlib.crc32(image.tobytes()) if ok else -1
+            if self._in_order and ok and self._next == len(self._checksums):
+                self._checksums.append(checksum)
+            elif not self._in_order and checksum != self._checksums[self._next]:
+                self._seekable = False
+                return False
             if not ok:
-                break
-            in_order.append(zlib.crc32(image.tobytes()))
-        last = len(in_order) - 1
-        exact = True
-        for number in (last * 3 // 4, last // 3, last, 0, last // 2):
-            ok, image = capture.read() if self._seek(capture, number) else (False, np.empty(0))
-            exact = exact and ok and zlib.crc32(image.tobytes()) == in_order[number]
-        self._open()
-        return exact
-
-    def _ended(self, number: int) -> SequenceError:
-        return SequenceError(
-            f"video {self.path} ends, or is damaged, before frame number {number} (counted from 0). "
-            "Copy it again, or shorten the kinematics table."
-        )
+                return False
+            if self._next >= number - _KEPT_BEFORE:
+                self._remember(self._next, np.ascontiguousarray(image[..., ::-1]))
+            self._next += 1
+        return True

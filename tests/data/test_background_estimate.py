@@ -45,7 +45,7 @@ def test_what_is_never_uncovered_is_filled_in_smoothly():
 
 
 def test_a_scene_that_is_always_covered_is_refused():
-    with pytest.raises(SequenceError, match="cover every pixel of every frame. Check T_camera_world"):
+    with pytest.raises(SequenceError, match=r"cover every pixel of every frame. Check T_camera_world"):
         estimate_background([(SCENE, np.ones((60, 80), bool))])
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from carts_core.camera import Camera
 from carts_core.data import Sequence
+from carts_core.data.images import read_image
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 
@@ -214,7 +215,7 @@ def test_files_may_be_named_by_a_glob_in_natural_order(tiny_sequence):
     for row in range(1, 12):
         (path.parent / f"regular/left/{row:03d}.png").rename(path.parent / f"regular/left/shot{row}.png")
     sequence = Sequence.open(path)
-    last = cv2.imread(str(path.parent / "regular/left/shot11.png"))[..., ::-1]
+    last = read_image(path.parent / "regular/left/shot11.png")
     assert np.array_equal(sequence.frame(10).images["left"], last)
     assert not np.array_equal(sequence.frame(1).images["left"], last)
 

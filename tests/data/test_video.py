@@ -1,7 +1,5 @@
 """Video: the frame that is asked for is the frame that comes, in any order."""
 
-import shutil
-import subprocess
 from pathlib import Path
 
 import cv2
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 
 from carts_core.data import Sequence
+from carts_core.data.images import read_image
 from carts_core.data.video import Video
 from carts_core.errors import SequenceError
 
@@ -36,7 +35,9 @@ def write_video(path: Path, codec: str, frames: int = FRAMES) -> Path:
     return path
 
 
-@pytest.fixture(params=[("mp4v", ".mp4"), ("MJPG", ".avi"), ("VP80", ".webm")], ids=lambda param: param[0])
+@pytest.fixture(
+    params=[("mp4v", ".mp4"), ("MJPG", ".avi"), ("VP80", ".webm"), ("PIM1", ".mpg")], ids=lambda param: param[0]
+)
 def video_file(request, tmp_path):
     codec, suffix = request.param
     return write_video(tmp_path / f"left{suffix}", codec)
@@ -66,7 +67,6 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
         """A capture whose seeking arrives one frame late and claims to be right, as some files make it."""
 
         def __init__(self, name: str) -> None:
-            self.capture = cv2.VideoCapture.__new__(cv2.VideoCapture)
             self.capture = real(name)
             self.shift = 0
 
@@ -84,17 +84,6 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
     monkeypatch.setattr("carts_core.data.video.cv2.VideoCapture", Inexact)
     video = Video(path, tuple(range(FRAMES)))
     order = [140, 3, 77, 76, 0, 149]
-    assert [number_of(video.read(index)) for index in order] == order
-
-
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
-def test_frames_of_a_video_with_b_frames_are_right(tmp_path):
-    source = write_video(tmp_path / "source.avi", "MJPG")
-    path = tmp_path / "left.mp4"
-    command = ["ffmpeg", "-loglevel", "error", "-i", str(source), "-c:v", "libx264", "-bf", "3", "-g", "30", str(path)]
-    subprocess.run(command, check=True)
-    video = Video(path, tuple(range(FRAMES)))
-    order = np.random.default_rng(1).integers(0, FRAMES, 40).tolist()
     assert [number_of(video.read(index)) for index in order] == order
 
 
@@ -137,7 +126,7 @@ def test_a_sequence_can_be_made_of_a_video(tiny_sequence):
     expected = Sequence.open(path).frame(2).images["left"]
     writer = cv2.VideoWriter(str(path.parent / "regular/left.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE)
     for row in (1, 2, 3):
-        writer.write(cv2.imread(str(path.parent / f"regular/left/{row:03d}.png")))
+        writer.write(np.ascontiguousarray(read_image(path.parent / f"regular/left/{row:03d}.png")[..., ::-1]))
     writer.release()
     path.write_text(as_video(path.read_text()))
     image = Sequence.open(path).frame(2).images["left"]
