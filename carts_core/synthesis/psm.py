@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -17,8 +16,15 @@ from jaxtyping import Float
 from ..errors import RobotError
 from ..resources import shipped_robot
 
-if TYPE_CHECKING:
+try:
     from manifold3d import Manifold
+
+    from . import psm_jaw, psm_shaft, psm_wrist
+    from .psm_shapes import cylinder
+except ImportError as error:
+    raise RobotError(
+        f"the PSM's meshes need manifold3d ({error}). Install the extra: pip install 'carts[synthesis]'."
+    ) from error
 
 ROBOT_NAME = "psm_lnd"
 METAL = (0.60, 0.60, 0.60)
@@ -74,25 +80,14 @@ class Part:
     name: str
     link: str
     color: tuple[float, float, float]
-    build: Callable[[], "Manifold"]
+    build: Callable[[], Manifold]
     """Makes the solid in the link's frame, in millimetres."""
     keep_rings: bool = False
     """Keep flat neighbouring triangles apart; otherwise they are merged."""
 
 
 def parts() -> tuple[Part, ...]:
-    """Every mesh of the instrument; `jaw_2_link` shares those of `jaw_1_link`.
-
-    Raises:
-        RobotError: manifold3d is not installed.
-    """
-    try:
-        from . import psm_jaw, psm_shaft, psm_wrist
-        from .psm_shapes import cylinder
-    except ImportError as error:
-        raise RobotError(
-            f"the PSM's meshes need manifold3d ({error}). Install the extra: pip install 'carts[synthesis]'."
-        ) from error
+    """Every mesh of the instrument; `jaw_2_link` shares those of `jaw_1_link`."""
     return (
         Part("shaft_tube", "roll_link", TUBE, psm_shaft.tube, keep_rings=True),
         Part("shaft_clevis", "roll_link", METAL, psm_shaft.clevis),
@@ -112,13 +107,17 @@ def to_mesh(part: Part) -> trimesh.Trimesh:
         RobotError: the part is empty or not closed, that is, a dimension makes no sense.
     """
     solid = part.build()
-    raw = (solid if part.keep_rings else solid.simplify(2e-3)).to_mesh()
+    raw = (solid if part.keep_rings else solid.simplify(4e-3)).to_mesh()
     vertices = np.asarray(raw.vert_properties, dtype=float)[:, :3] * 1e-3
     mesh = trimesh.Trimesh(vertices, np.asarray(raw.tri_verts, dtype=int), process=False)
     if not len(mesh.faces) or not mesh.is_watertight:
         raise RobotError(
             f"part {part.name} of the procedural PSM is not a closed solid. Undo the last change of its dimensions."
         )
+    # Boolean operations leave slivers below a micrometre, whose normals mean nothing: weld them away.
+    mesh.merge_vertices(digits_vertex=6)
+    mesh.update_faces(mesh.nondegenerate_faces(height=1e-9))
+    mesh.remove_unreferenced_vertices()
     return mesh
 
 
@@ -129,7 +128,7 @@ def write(folder: Path) -> list[Path]:
         The written files, the URDF first.
 
     Raises:
-        RobotError: manifold3d is missing or a part is not a closed solid.
+        RobotError: a part is not a closed solid.
     """
     meshes = folder / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
@@ -182,9 +181,7 @@ def _link(name: str) -> list[str]:
         return [f'  <link name="{name}"/>']
     origin = ""
     if mirrored:
-        from .psm_jaw import OTHER_JAW_SHIFT
-
-        origin = f'<origin xyz="0 0 {OTHER_JAW_SHIFT * 1e-3:g}" rpy="{_numbers((0.0, np.pi, 0.0))}"/>'
+        origin = f'<origin xyz="0 0 {psm_jaw.OTHER_JAW_SHIFT * 1e-3:g}" rpy="{_numbers((0.0, np.pi, 0.0))}"/>'
     materials = {color: material for material, color in _MATERIALS}
     visuals = [
         f'    <visual>{origin}<geometry><mesh filename="meshes/{part.name}.ply"/></geometry>'
@@ -244,7 +241,7 @@ def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
     return rotation
 
 
-def _numbers(values: Float[np.ndarray, "n"] | tuple[float, ...]) -> str:
+def _numbers(values: np.ndarray | tuple[float, ...]) -> str:
     # repr keeps every digit of pi / 2; whole numbers are printed short.
     return " ".join(f"{value:g}" if value == int(value) else repr(value) for value in map(float, values))
 

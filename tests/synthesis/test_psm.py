@@ -1,0 +1,191 @@
+"""The procedural PSM: its files, its kinematics, and its likeness to an independent model of the same instrument."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yourdfpy
+from manifold3d import Manifold
+from scipy.spatial import KDTree
+
+from carts_core.errors import RobotError
+from carts_core.rendering import visibility
+from carts_core.resources import shipped_robot
+from carts_core.robot import Robot
+from carts_core.synthesis import psm
+
+JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
+MESHES = sorted((shipped_robot().parent / "meshes").glob("*.ply"))
+
+
+@pytest.fixture(scope="module")
+def regenerated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("psm")
+    psm.write(folder)
+    return folder
+
+
+def _load(path: Path) -> trimesh.Trimesh:
+    mesh = trimesh.load(path, process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
+
+
+@pytest.fixture(scope="module")
+def model() -> yourdfpy.URDF:
+    return yourdfpy.URDF.load(str(shipped_robot()), load_meshes=False)
+
+
+def _random_positions(count: int, seed: int) -> np.ndarray:
+    limits = np.array([*(row.limits for row in psm.DH_TABLE if row.kind != "fixed"), psm.JAW_LIMITS])
+    return np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1], (count, len(JOINTS)))
+
+
+def _dh(alpha: float, a: float, d: float, theta: float) -> np.ndarray:
+    """The modified Denavit-Hartenberg formula, written out (Craig)."""
+    ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
+    return np.array(
+        [[ct, -st, 0, a], [st * ca, ct * ca, -sa, -sa * d], [st * sa, ct * sa, ca, ca * d], [0.0, 0.0, 0.0, 1.0]]
+    )
+
+
+def _tip_by_the_book(q: np.ndarray) -> np.ndarray:
+    right = np.pi / 2
+    rows = [
+        (right, 0.0, 0.0, q[0] + right),
+        (-right, 0.0, 0.0, q[1] - right),
+        (right, 0.0, q[2] - 0.4318, 0.0),
+        (0.0, 0.0, 0.4162, q[3]),
+        (-right, 0.0, 0.0, q[4] - right),
+        (-right, 0.0091, 0.0, q[5] - right),
+        (-right, 0.0, 0.0102, right),
+    ]
+    return np.linalg.multi_dot([_dh(*row) for row in rows])
+
+
+def test_regenerated_urdf_is_the_shipped_one(regenerated: Path) -> None:
+    assert (regenerated / "psm_lnd.urdf").read_text() == shipped_robot().read_text()
+
+
+def test_no_mesh_is_shipped_that_the_script_does_not_write(regenerated: Path) -> None:
+    assert [path.name for path in MESHES] == sorted(path.name for path in (regenerated / "meshes").iterdir())
+
+
+@pytest.mark.parametrize("path", MESHES, ids=lambda path: path.stem)
+def test_regenerated_mesh_has_the_shipped_geometry(path: Path, regenerated: Path) -> None:
+    shipped, again = _load(path), _load(regenerated / "meshes" / path.name)
+    assert len(shipped.faces) == len(again.faces)
+    assert KDTree(shipped.vertices).query(again.vertices)[0].max() < 1e-6
+    assert KDTree(again.vertices).query(shipped.vertices)[0].max() < 1e-6
+    assert shipped.area == pytest.approx(again.area, rel=1e-6)
+
+
+def test_meshes_are_small_and_closed() -> None:
+    assert sum(path.stat().st_size for path in shipped_robot().parent.rglob("*")) < 1_000_000
+    for path in MESHES:
+        mesh = _load(path)
+        assert mesh.is_watertight, path.name
+        assert mesh.volume > 0, path.name
+
+
+def test_the_robot_is_loaded_without_decimation() -> None:
+    robot = Robot.load(shipped_robot())
+    shipped = sum(len(_load(path).faces) * (2 if "jaw" in path.name else 1) for path in MESHES)
+    loaded = sum(len(mesh.faces) for mesh in robot.meshes)
+    assert 8_000 < loaded < 14_000
+    assert loaded == shipped
+    assert robot.joint_names == JOINTS
+
+
+def test_forward_kinematics_agree_with_the_dh_formula(model: yourdfpy.URDF) -> None:
+    assert tuple(model.actuated_joint_names) == JOINTS
+    for q in _random_positions(1000, seed=0):
+        model.update_cfg(dict(zip(JOINTS, q, strict=True)))
+        expected = _tip_by_the_book(q)
+        np.testing.assert_allclose(model.get_transform("tool_tip_link", "base_link"), expected, rtol=0, atol=1e-9)
+
+
+def test_each_jaw_turns_by_half_the_opening(model: yourdfpy.URDF) -> None:
+    model.update_cfg({"jaw": 0.8})
+    for link, angle in (("jaw_1_link", 0.4), ("jaw_2_link", -0.4)):
+        T_yaw_jaw = model.get_transform(link, "wrist_yaw_link")
+        assert np.arctan2(T_yaw_jaw[1, 0], T_yaw_jaw[0, 0]) == pytest.approx(angle)
+
+
+def test_closed_jaws_meet_face_to_face() -> None:
+    insert = _load(shipped_robot().parent / "meshes" / "jaw_insert.ply")
+    # The gripping faces lie on the plane x = 0, the teeth of either reach into the other's.
+    assert 0.0 < insert.bounds[1, 0] < 1e-4
+    roots = insert.vertices[:, 0][insert.vertices[:, 0] < 0.0].max()
+    assert -2e-4 < roots < 0.0
+
+
+def test_dimensions_are_the_published_ones() -> None:
+    size = {path.stem: _load(path).extents * 1e3 for path in MESHES}
+    assert size["shaft_tube"][:2] == pytest.approx(8.4, abs=0.02)
+    assert size["shaft_clevis"][:2] == pytest.approx(8.4, abs=0.05)
+    assert size["wrist_body"] == pytest.approx([13.6, 6.3, 6.3], abs=0.1)
+    assert size["jaw_body"][1] == pytest.approx(12.1, abs=0.1)
+
+
+def test_a_part_that_is_empty_is_reported_by_name() -> None:
+    part = psm.Part("left_out", "roll_link", psm.METAL, lambda: Manifold.cube((1, 1, 1)) - Manifold.cube((2, 2, 2)))
+    with pytest.raises(RobotError, match=r"left_out.*not a closed solid"):
+        psm.to_mesh(part)
+
+
+def test_without_manifold3d_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("carts_core.synthesis.psm")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "manifold3d", None)
+    with pytest.raises(RobotError, match=r"carts\[synthesis\]"):
+        importlib.import_module("carts_core.synthesis.psm")
+
+
+def _silhouette(robot: Robot, q: np.ndarray, T_camera_base: np.ndarray) -> np.ndarray:
+    Ts_base_link = robot.forward_kinematics(torch.tensor(q)).numpy()
+    vertices, faces, count = [], [], 0
+    for mesh in robot.meshes:
+        T_camera_link = T_camera_base @ Ts_base_link[mesh.link]
+        vertices.append(mesh.vertices @ T_camera_link[:3, :3].T + T_camera_link[:3, 3])
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    face_ids, _ = visibility(np.concatenate(vertices), np.concatenate(faces), (600, 600, 320, 240), 640, 480)
+    return face_ids >= 0
+
+
+def _view(robot: Robot, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """T_camera_base of an endoscope 60 to 150 mm from the wrist that does not look along the shaft."""
+    wrist = robot.link_transform(torch.tensor(q), "wrist_yaw_link").numpy()[:3, 3]
+    shaft = robot.link_transform(torch.tensor(q), "roll_link").numpy()[:3, 2]
+    while True:
+        forward = rng.normal(size=3)
+        forward /= np.linalg.norm(forward)
+        if abs(forward @ shaft) < 0.9:
+            break
+    right = np.cross(forward, shaft)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    T_camera_base = np.eye(4)
+    T_camera_base[:3, :3] = rotation
+    T_camera_base[:3, 3] = -rotation @ (wrist - rng.uniform(0.06, 0.15) * forward)
+    return T_camera_base
+
+
+def test_silhouette_is_that_of_an_independent_model(shared_dir: Path) -> None:
+    ours = Robot.load(shipped_robot())
+    other = Robot.load(shared_dir / "robots/psm_classic_lnd/psm.urdf", base_link="PSM1_base_link")
+    assert other.joint_names == JOINTS
+    rng, dice = np.random.default_rng(1), []
+    for q in _random_positions(20, seed=1):
+        T_camera_base = _view(ours, q, rng)
+        a, b = _silhouette(ours, q, T_camera_base), _silhouette(other, q, T_camera_base)
+        assert b.sum() > 2000
+        dice.append(2 * (a & b).sum() / (a.sum() + b.sum()))
+    assert np.mean(dice) > 0.975
+    assert min(dice) > 0.96
+    print(f"Dice with the independent model: mean {np.mean(dice):.4f}, lowest {min(dice):.4f}")
