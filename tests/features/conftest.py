@@ -1,0 +1,41 @@
+"""A small network and small training images, for tests that need one."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from carts_core.features.domain_randomization import PairGenerator, PairSettings, TrainingPair
+from carts_core.features.network import Architecture, FeatureNetwork
+from carts_core.features.weights import save_weights
+from carts_core.robot import Robot
+
+
+@pytest.fixture
+def small_architecture() -> Architecture:
+    return Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
+
+
+@pytest.fixture
+def small_network(small_architecture: Architecture) -> FeatureNetwork:
+    """Random weights, and batch norms that have seen something, so that folding them matters."""
+    torch.manual_seed(1)
+    network = FeatureNetwork(small_architecture)
+    with torch.no_grad():
+        for _ in range(5):
+            network(torch.rand(4, 3, 32, 48))
+    return network.eval()
+
+
+@pytest.fixture
+def small_weights(small_network: FeatureNetwork, tmp_path: Path) -> Path:
+    path = tmp_path / "small.safetensors"
+    save_weights(small_network, path, {"step": 3}, (320, 240))
+    return path
+
+
+@pytest.fixture(scope="session")
+def pairs(shipped_psm: Robot) -> list[TrainingPair]:
+    """Some training pairs of the shipped robot."""
+    generator = PairGenerator([shipped_psm], PairSettings(), seed=5)
+    return [generator() for _ in range(24)]

@@ -1,0 +1,184 @@
+import numpy as np
+import pytest
+
+from carts_core.errors import SettingsError
+from carts_core.features.domain_randomization import (
+    BACKGROUND,
+    HEAD,
+    SHAFT,
+    AppearanceRanges,
+    PairGenerator,
+    PairSettings,
+    TrainingPair,
+)
+from carts_core.features.domain_randomization.backgrounds import random_background
+from carts_core.features.domain_randomization.gbuffer import render_gbuffer
+from carts_core.features.domain_randomization.geometry import RobotGeometry
+from carts_core.features.domain_randomization.lens import tone
+from carts_core.features.domain_randomization.placement import perturbed, random_intrinsics, random_placement
+from carts_core.features.domain_randomization.ranges import DARKEST_BRIGHTNESS
+from carts_core.features.domain_randomization.shading import shade
+from carts_core.robot import Robot
+
+SIZE = (192, 160)
+
+
+@pytest.fixture(scope="module")
+def geometry(shipped_psm: Robot) -> RobotGeometry:
+    return RobotGeometry(shipped_psm)
+
+
+def test_a_pair_is_two_images_and_their_classes(pairs: list[TrainingPair]):
+    for pair in pairs:
+        assert pair.observed.shape == pair.hybrid.shape == (160, 192, 3)
+        assert pair.observed.dtype == pair.hybrid.dtype == np.uint8
+        for classes in (pair.observed_classes, pair.hybrid_classes):
+            assert classes.shape == (160, 192)
+            assert set(np.unique(classes)) <= {BACKGROUND, SHAFT, HEAD}
+
+
+def test_the_same_seed_makes_the_same_pairs_and_another_seed_others(shipped_psm: Robot):
+    first, again, other = (PairGenerator([shipped_psm], PairSettings(), seed)() for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first.observed, again.observed)
+    np.testing.assert_array_equal(first.hybrid, again.hybrid)
+    assert not np.array_equal(first.observed, other.observed)
+
+
+def test_images_show_instruments_of_many_sizes_at_every_border(pairs: list[TrainingPair]):
+    shares = [float((pair.observed_classes > 0).mean()) for pair in pairs]
+    assert min(shares) < 0.08 < 0.15 < max(shares)
+    masks = np.stack([pair.observed_classes > 0 for pair in pairs])
+    for border in (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1]):
+        assert border.any(axis=1).sum() >= 2
+
+
+def test_about_half_of_the_hybrids_show_the_observed_kinematics(pairs: list[TrainingPair]):
+    overlaps = []
+    for pair in pairs:
+        a, b = pair.observed_classes > 0, pair.hybrid_classes > 0
+        overlaps.append(2 * (a & b).sum() / max(a.sum() + b.sum(), 1))
+    same = np.array(overlaps) > 0.97
+    assert 5 <= same.sum() <= len(pairs) - 5
+
+
+def test_the_hybrid_shows_the_rendering_exactly_where_its_classes_say(shipped_psm: Robot):
+    settings = PairSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
+    pair = PairGenerator([shipped_psm], settings, seed=11)()
+    overlap = (pair.observed_classes > 0) & (pair.hybrid_classes > 0)
+    union = (pair.observed_classes > 0) | (pair.hybrid_classes > 0)
+    # The observed image is antialiased and the hybrid one is not, so borders may differ by a pixel.
+    assert overlap.sum() > 0.93 * union.sum()
+
+
+def test_no_image_is_low_light(pairs: list[TrainingPair]):
+    brightness = np.array([pair.observed.mean() / 255 for pair in pairs])
+    assert brightness.min() > 0.08
+    assert np.median(brightness) > 0.25
+
+
+def test_low_light_cannot_be_asked_for():
+    with pytest.raises(SettingsError, match=r"brightness starts at 0\.3.*must not be trained on"):
+        AppearanceRanges(brightness=(0.3, 1.0))
+
+
+def test_the_camera_never_darkens_below_the_floor():
+    ranges = AppearanceRanges(gamma=(1, 1), contrast=(1, 1))
+    rng = np.random.default_rng(0)
+    grey = np.full((8, 8, 3), 0.5, np.float32)
+    assert min(float(tone(rng, grey, ranges).mean()) for _ in range(300)) >= 0.5 * DARKEST_BRIGHTNESS - 1e-3
+
+
+@pytest.mark.parametrize("arguments", [{"noise": (0.1, 0.0)}, {"blur": (-1, 1)}, {"jpeg_quality": (50, 120)}])
+def test_a_range_that_makes_no_sense_is_refused(arguments: dict):
+    with pytest.raises(SettingsError):
+        AppearanceRanges(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"width": 100}, {"two_arms": 1.5}, {"coverage": (0.5, 0.1)}, {"field_width": 64}]
+)
+def test_pair_settings_out_of_range_are_refused(arguments: dict):
+    with pytest.raises(SettingsError, match="give"):
+        PairSettings(**arguments)
+
+
+def test_backgrounds_are_bright_enough_and_differ():
+    images = [random_background(np.random.default_rng(seed), *SIZE) for seed in range(20)]
+    assert all(image.shape == (160, 192, 3) and image.min() >= 0 for image in images)
+    assert min(float(image.mean()) for image in images) > 0.15
+    assert np.std([image.mean((0, 1)) for image in images], axis=0).min() > 0.05
+
+
+def test_the_shaft_is_found_and_points_away_from_the_jaws(geometry: RobotGeometry, shipped_psm: Robot):
+    shaft = shipped_psm.meshes[geometry.shaft]
+    assert np.ptp(shaft.vertices, axis=0).max() > 0.1
+    heights = (shaft.vertices - geometry.shaft_end) @ geometry.shaft_axis
+    assert heights.min() == pytest.approx(0, abs=1e-6)
+    Ts = geometry.link_transforms(np.zeros(len(shipped_psm.joint_names)))
+    jaw = shipped_psm.meshes[-1]
+    T_shaft_jaw = np.linalg.inv(Ts[shaft.link]) @ Ts[jaw.link]
+    tip = T_shaft_jaw[:3, :3] @ jaw.vertices.mean(0) + T_shaft_jaw[:3, 3]
+    assert (tip - geometry.shaft_end) @ geometry.shaft_axis < 0
+
+
+def test_placements_put_the_wrist_in_front_of_the_camera_near_the_image(geometry: RobotGeometry):
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        intrinsics = random_intrinsics(rng, *SIZE, 320)
+        placement = random_placement(rng, geometry, intrinsics, *SIZE)
+        T = placement.T_camera_base
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+        x, y, z = _wrist(geometry, placement)
+        assert 0.05 <= z <= 0.25
+        fx, fy, cx, cy = intrinsics
+        assert -0.13 * SIZE[0] <= fx * x / z + cx <= 1.13 * SIZE[0]
+        assert -0.13 * SIZE[1] <= fy * y / z + cy <= 1.13 * SIZE[1]
+
+
+def _wrist(geometry: RobotGeometry, placement) -> np.ndarray:
+    shaft_link = geometry.part_link[geometry.shaft]
+    T = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
+    return T[:3, :3] @ geometry.shaft_end + T[:3, 3]
+
+
+def test_wrong_kinematics_move_the_wrist_by_millimetres(geometry: RobotGeometry):
+    rng = np.random.default_rng(4)
+    placement = random_placement(rng, geometry, random_intrinsics(rng, *SIZE, 320), *SIZE)
+    distances = [
+        np.linalg.norm(_wrist(geometry, perturbed(rng, geometry, placement, 1.0)) - _wrist(geometry, placement))
+        for _ in range(50)
+    ]
+    assert 0.002 < np.median(distances) < 0.01
+    unmoved = perturbed(rng, geometry, placement, 0.0)
+    np.testing.assert_allclose(unmoved.T_camera_base, placement.T_camera_base, atol=1e-9)
+
+
+def test_the_gbuffer_holds_points_on_the_ray_and_normals_towards_the_camera(geometry: RobotGeometry):
+    rng = np.random.default_rng(6)
+    intrinsics = (200.0, 200.0, 96.0, 80.0)
+    placement = random_placement(rng, geometry, intrinsics, *SIZE)
+    Ts = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)
+    view = render_gbuffer([geometry], [geometry.posed(Ts)], intrinsics, *SIZE)
+    assert len(view.rows) > 50
+    u = view.points[:, 0] / view.points[:, 2] * 200 + 96
+    v = view.points[:, 1] / view.points[:, 2] * 200 + 80
+    np.testing.assert_allclose(u, view.columns + 0.5, atol=1e-3)
+    np.testing.assert_allclose(v, view.rows + 0.5, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(view.normals, axis=1), 1, atol=1e-3)
+    assert ((view.normals * view.points).sum(1) <= 1e-6).all()
+    # A point given in its link's frame and moved to the camera is the point that the pixel sees.
+    T = Ts[geometry.part_link[view.part]]
+    moved = np.einsum("nij,nj->ni", T[:, :3, :3], view.points_link) + T[:, :3, 3]
+    assert np.percentile(np.linalg.norm(moved - view.points, axis=1), 99) < 2e-4
+
+
+def test_shading_differs_from_draw_to_draw_and_stays_in_range(geometry: RobotGeometry):
+    rng = np.random.default_rng(7)
+    intrinsics = (200.0, 200.0, 96.0, 80.0)
+    placement = random_placement(rng, geometry, intrinsics, *SIZE)
+    Ts = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)
+    view = render_gbuffer([geometry], [geometry.posed(Ts)], intrinsics, *SIZE)
+    colors = [shade(rng, view, [geometry], np.array([0.6, 0.4, 0.4])) for _ in range(12)]
+    assert all(np.isfinite(color).all() and color.min() >= 0 and color.max() <= 1 for color in colors)
+    assert np.std([color.mean() for color in colors]) > 0.02

@@ -1,0 +1,54 @@
+import pytest
+import torch
+
+from carts_core.errors import SettingsError
+from carts_core.features.network import Architecture, FeatureNetwork, standardize
+
+
+def test_features_have_the_size_of_the_image_and_the_first_levels_channels(small_network: FeatureNetwork):
+    assert small_network.features(torch.rand(2, 3, 32, 48)).shape == (2, 4, 32, 48)
+    assert small_network.logits(torch.rand(2, 3, 32, 48)).shape == (2, 1, 32, 48)
+
+
+def test_any_multiple_of_the_stride_is_a_valid_size():
+    network = FeatureNetwork().eval()
+    assert network.architecture.stride == 16
+    for height, width in ((16, 16), (48, 112), (240, 320)):
+        assert network.features(torch.rand(1, 3, height, width)).shape[-2:] == (height, width)
+
+
+def test_a_size_that_does_not_fit_is_refused_with_the_stride(small_network: FeatureNetwork):
+    with pytest.raises(SettingsError, match=r"\(1, 3, 30, 48\).*multiples of 4"):
+        small_network.features(torch.rand(1, 3, 30, 48))
+
+
+def test_folding_batch_norms_changes_nothing_but_the_speed(small_network: FeatureNetwork):
+    images = torch.rand(2, 3, 32, 48)
+    folded = small_network.folded()
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in folded.modules())
+    torch.testing.assert_close(folded.features(images), small_network.features(images), atol=1e-5, rtol=1e-4)
+
+
+def test_exposure_and_a_uniform_veil_do_not_reach_the_first_convolution():
+    image = torch.rand(1, 3, 16, 16)
+    veiled = 0.5 * image + torch.tensor([0.3, 0.2, 0.1])[None, :, None, None]
+    torch.testing.assert_close(standardize(veiled), standardize(image), atol=2e-2, rtol=2e-2)
+
+
+def test_an_empty_image_is_not_amplified_to_noise():
+    flat = torch.full((1, 3, 16, 16), 0.4) + 1e-4 * torch.randn(1, 3, 16, 16)
+    assert standardize(flat).abs().max() < 0.05
+
+
+def test_an_architecture_survives_json():
+    architecture = Architecture(widths=(8, 16), encoder_convolutions=(1, 2), decoder_convolutions=(3,))
+    assert Architecture.from_json(architecture.to_json()) == architecture
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"widths": (8,)}, {"widths": (8, 0)}, {"encoder_convolutions": (1,)}, {"decoder_convolutions": (1, 1, 1, 0)}],
+)
+def test_an_impossible_architecture_is_refused(arguments: dict):
+    with pytest.raises(SettingsError, match="give"):
+        Architecture(**arguments)

@@ -1,0 +1,169 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from carts_core.errors import SettingsError, WeightsError
+from carts_core.features import FeatureExtractor
+from carts_core.features.checkpoint import CHECKPOINT_FILE, load_checkpoint
+from carts_core.features.domain_randomization import PairSettings
+from carts_core.features.loader import training_batches, validation_set
+from carts_core.features.network import Architecture
+from carts_core.features.training import TrainingProgress, schedule, train
+from carts_core.features.training_config import TrainingConfig
+
+SMALL = {
+    "batch_pairs": 2,
+    "learning_rate": 1e-2,
+    "warmup": 5,
+    "average": 0.8,
+    "validation_every": 15,
+    "validation_pairs": 2,
+    "checkpoint_every": 5,
+    "workers": 0,
+    "threads": 1,
+}
+
+
+def small_config(**changes) -> TrainingConfig:
+    architecture = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
+    images = PairSettings(width=64, height=48, field_width=80)
+    return TrainingConfig(**({**SMALL, "steps": 30, "architecture": architecture, "images": images} | changes))
+
+
+@pytest.fixture(autouse=True)
+def _threads_as_before():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_a_run_learns_and_leaves_weights_a_checkpoint_and_a_report(tmp_path: Path):
+    events: list[TrainingProgress] = []
+    result = train(small_config(), tmp_path, events.append)
+    assert events[-1].step == events[-1].steps == 30
+    assert events[-1].loss < events[0].loss
+    assert events[-1].validation == result.validation
+    extractor = FeatureExtractor.load(result.weights)
+    assert extractor.working_size == (80, 60)
+    assert extractor.training["step"] == 30
+    assert extractor.training["config"]["robots"] == ["psm_lnd.urdf"]
+    page = result.report.read_text()
+    assert "| 30 |" in page
+    for picture in ("curves.png", "predictions.jpg"):
+        assert picture in page
+        assert (result.report.parent / picture).stat().st_size > 5_000
+
+
+_RUN = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_training import small_config
+from carts_core.features.training import train
+train(small_config(steps=100_000), Path(sys.argv[1]))
+"""
+
+
+def test_a_killed_run_goes_on_where_its_last_checkpoint_was(tmp_path: Path):
+    process = subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path), str(Path(__file__).parent)])
+    try:
+        deadline = time.monotonic() + 240
+        while not (tmp_path / CHECKPOINT_FILE).is_file():
+            assert process.poll() is None and time.monotonic() < deadline, "no checkpoint was written"
+            time.sleep(0.2)
+        time.sleep(1.0)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    before = load_checkpoint(tmp_path)
+    assert before is not None and before.step >= 5
+    steps = before.step + 12
+    result = train(small_config(steps=steps), tmp_path)
+    after = load_checkpoint(tmp_path)
+    assert after is not None and after.step == steps
+    logged = [entry["step"] for entry in after.history.losses]
+    assert logged == sorted(set(logged)) and logged[-1] == steps
+    # The optimizer's own step count proves that its moments were restored and not started anew.
+    counts = {int(value) for name, value in after.tensors.items() if name.endswith("/step")}
+    assert counts == {steps}
+    # The loss goes on from where it was: a network that started anew would be back at its first loss.
+    first = after.history.losses[0]["loss"]
+    resumed = after.history.losses[-1]["loss"]
+    assert resumed < first
+    assert FeatureExtractor.load(result.weights).training["step"] == steps
+
+
+def test_a_restored_network_is_the_one_that_was_saved(tmp_path: Path):
+    train(small_config(steps=10), tmp_path)
+    first = load_checkpoint(tmp_path)
+    train(small_config(steps=10), tmp_path)
+    again = load_checkpoint(tmp_path)
+    assert first is not None and again is not None
+    assert first.tensors.keys() == again.tensors.keys()
+    assert all(torch.equal(value, again.tensors[name]) for name, value in first.tensors.items())
+
+
+def test_the_same_seed_trains_the_same_network(tmp_path: Path):
+    for name in ("a", "b"):
+        train(small_config(steps=6), tmp_path / name)
+    a, b = (load_checkpoint(tmp_path / name) for name in ("a", "b"))
+    assert a is not None and b is not None
+    for name, value in a.tensors.items():
+        torch.testing.assert_close(value, b.tensors[name], rtol=1e-4, atol=1e-5)
+
+
+def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
+    train(small_config(steps=5), tmp_path)
+    with pytest.raises(SettingsError, match=r"learning_rate was 0\.01 and is 0\.5.*another output folder"):
+        train(small_config(steps=10, learning_rate=0.5), tmp_path)
+
+
+def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
+    (tmp_path / CHECKPOINT_FILE).write_bytes(b"half a file")
+    with pytest.raises(WeightsError, match=r"checkpoint\.safetensors cannot be read.*Delete the file"):
+        train(small_config(), tmp_path)
+
+
+def test_worker_processes_deliver_batches():
+    images, classes = next(training_batches(small_config(workers=1), first_step=0))
+    assert images.shape == (2, 2, 3, 48, 64) and images.dtype == torch.uint8
+    assert classes.shape == (2, 2, 48, 64)
+
+
+def test_the_validation_set_is_always_the_same_and_not_the_training_stream():
+    config = small_config()
+    images, _ = validation_set(config)
+    again, _ = validation_set(config)
+    assert torch.equal(images, again)
+    first, _ = next(training_batches(config, first_step=0))
+    assert not torch.equal(first[0].float() / 255, images[0])
+
+
+def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():
+    values = [schedule(step, warmup=10, steps=100) for step in range(101)]
+    assert values[0] == pytest.approx(0.1)
+    assert max(values) == pytest.approx(1.0, abs=1e-3)
+    assert values[100] == pytest.approx(0.01)
+    assert all(a >= b for a, b in zip(values[10:], values[11:], strict=False))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"steps": 0}, {"average": 1.0}, {"learning_rate": 0.0}, {"robots": ()}, {"workers": -1}, {"reuse": 0}]
+)
+def test_settings_out_of_range_are_refused(changes: dict):
+    with pytest.raises(SettingsError, match="give"):
+        small_config(**changes)
+
+
+def test_settings_survive_json(tmp_path: Path):
+    train(small_config(steps=5), tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None
+    assert json.loads(checkpoint.config_json)["images"]["width"] == 64
