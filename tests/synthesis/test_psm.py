@@ -124,7 +124,7 @@ def test_closed_jaws_meet_face_to_face() -> None:
     assert -2e-4 < roots < 0.0
 
 
-def test_dimensions_are_the_published_ones() -> None:
+def test_overall_dimensions_are_those_of_the_instrument() -> None:
     size = {path.stem: _load(path).extents * 1e3 for path in MESHES}
     assert size["shaft_tube"][:2] == pytest.approx(8.4, abs=0.02)
     assert size["shaft_clevis"][:2] == pytest.approx(8.4, abs=0.05)
