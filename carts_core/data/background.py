@@ -60,7 +60,10 @@ def estimate_background(
         low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]
         high = np.take_along_axis(values, np.ceil(middle).astype(np.intp), 0)[0]
         result[rows] = np.minimum((low + high + 1) // 2, 255).astype(np.uint8)
-    return fill(result, seen == 0)
+    hole = seen == 0
+    # Next to what is always covered the arm itself may show, where it is off by more than the margin.
+    rim = widen(hole)
+    return fill(result, hole if rim.all() else rim)
 
 
 def fill(

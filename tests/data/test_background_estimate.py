@@ -44,6 +44,14 @@ def test_what_is_never_uncovered_is_filled_in_smoothly():
     assert np.abs(filled[hole].astype(int) - ramp[hole]).max() < 25
 
 
+def test_an_arm_that_shows_beside_what_is_always_covered_leaves_no_line():
+    grey, cover = np.full((60, 80, 3), 120, np.uint8), np.zeros((60, 80), bool)
+    grey[:, 28:41] = 0
+    cover[:, 30:40] = True
+    # The bar is wider than its cover by 2 and 1 columns: the margin of an image 80 wide is 2.
+    assert (estimate_background([(grey, cover)] * 3) == 120).all()
+
+
 def test_a_scene_that_is_always_covered_is_refused():
     with pytest.raises(SequenceError, match=r"cover every pixel of every frame. Check T_camera_world"):
         estimate_background([(SCENE, np.ones((60, 80), bool))])
