@@ -50,6 +50,9 @@ class ViewerApp:
         url: Where the page is.
         page: The page, for tests and scripts.
         mailbox: Where intents go.
+        scene: The recording's arms and cameras.
+        display: What puts states on the page.
+        joints: The panel with the joints' sliders.
     """
 
     def __init__(
@@ -64,6 +67,7 @@ class ViewerApp:
     ) -> None:
         """Start serving an open sequence; arguments as in `open`."""
         self._report = report
+        self.scene = sequence.scene
         self._session = Session(sequence)
         self._painter = Painter(sequence, device)
         state = self._first_state()
@@ -78,9 +82,9 @@ class ViewerApp:
         self.joints: JointsPanel
         panels = self._build(state)
         stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
-        self._display = PageDisplay(self.page, self._session, self._painter, stage, panels)
+        self.display = PageDisplay(self.page, self._session, self._painter, stage, panels)
         self.page.on_drawn(self._on_drawn)
-        self._worker = Worker(self.mailbox, self._controller, self._display)
+        self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
 
     @classmethod
@@ -156,7 +160,6 @@ class ViewerApp:
             opacity=0.6,
             settings=OptimizerSettings(),
             free=FreeParameters(),
-            scores=self._painter.scores(pose.scene, frame, camera),
         )
 
     def _build(self, state: ViewState) -> list[Panel]:
@@ -202,7 +205,7 @@ class ViewerApp:
         self._worker.report(text)
 
     def _on_drawn(self, tab: int) -> None:
-        self._display.drawn(tab)
+        self.display.drawn(tab)
         self.mailbox.put(ask.Drawn())
 
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:

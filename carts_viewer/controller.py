@@ -16,7 +16,7 @@ from carts_viewer.layers import Layer
 from carts_viewer.picture import Painter
 from carts_viewer.running import ActiveRun, OptimizerFactory
 from carts_viewer.session import Session
-from carts_viewer.state import Curves, ExportState, Maps, Phase, Pose, RunState, Source, ViewState
+from carts_viewer.state import Curves, ExportState, Maps, Phase, Pose, RunState, Scores, Source, ViewState
 
 SPEEDS = (0.5, 60.0)
 """Slowest and fastest playing [frames/s]."""
@@ -81,7 +81,13 @@ class Controller:
             self._next_frame_at = time.monotonic() + 1.0 / self.state.fps
             self._show(index=(self.state.index + 1) % len(self._session.sequence))
 
-    def complete(self) -> None:
+    def score(self) -> None:
+        """Compare the pose with the truth, if that was not done yet."""
+        state = self.state
+        if state.scores is None:
+            self._set(scores=self._painter.scores(state.pose.scene, state.frame, state.camera))
+
+    def map(self) -> None:
         """Compute what the chosen layer shows beyond the pose, if that is not there yet."""
         state = self.state
         if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
@@ -283,8 +289,7 @@ class Controller:
         self._pose(pose)
 
     def _pose(self, pose: Pose, maps: Maps | None = None) -> None:
-        scores = self._painter.scores(pose.scene, self.state.frame, self.state.camera)
-        self._set(pose=pose, scores=scores, maps=maps, undoable=self._session.undoable)
+        self._set(pose=pose, scores=None, maps=maps, undoable=self._session.undoable)
 
     # ---- The optimizer ---------------------------------------------------------------------------------------------
 
@@ -321,11 +326,12 @@ class Controller:
             self._end_run(_REASONS.get(reason or "", reason))
             return
         self._accept(run, iterate)
+        self.score()
         curves = self.state.run.curves
         self._set_run(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
-                (*curves.scores, self.state.scores),
+                (*curves.scores, self.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
             )
         )

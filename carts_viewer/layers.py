@@ -39,18 +39,21 @@ def nothing(height: int, width: int) -> Rgba:
     return np.zeros((height, width, 4), np.uint8)
 
 
-def shaded(image: Float[np.ndarray, "height width 3"], arm_ids: ArmIds, opacity: float) -> Rgba:
+def shaded(image: Float[np.ndarray, "3 height width"], arm_ids: ArmIds, opacity: float) -> Rgba:
     """The rendered arm itself; `image` is RGB in [0, 1]."""
     picture = nothing(*arm_ids.shape)
-    picture[..., :3] = np.clip(image * 255.0 + 0.5, 0, 255)
-    picture[..., 3] = np.where(arm_ids >= 0, _byte(opacity), 0)
+    # Most of a frame is background, so only the arm's own pixels are converted.
+    rows, columns = np.nonzero(arm_ids >= 0)
+    picture[rows, columns, :3] = np.clip(image[:, rows, columns].T * 255.0 + 0.5, 0, 255)
+    picture[rows, columns, 3] = _byte(opacity)
     return picture
 
 
 def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
     """Each arm's pixels in its colour."""
     colors, _ = _palette(arm_ids)
-    return _faded(colors[arm_ids + 1], opacity)
+    colors[1:, 3] = _byte(opacity)
+    return np.take(colors, arm_ids + 1, axis=0)
 
 
 def contour(arm_ids: ArmIds, opacity: float) -> Rgba:
@@ -68,9 +71,11 @@ def against_truth(
     predicted: Bool[np.ndarray, "height width"], truth: Bool[np.ndarray, "height width"], opacity: float
 ) -> Rgba:
     """True and false positives and negatives in the paper's colours."""
-    table = np.array([(*color, 255) for color in TRUTH_COLORS.values()], np.uint8)
-    index = np.select([predicted & truth, predicted, truth], [0, 1, 2], 3)
-    return _faded(table[index], opacity)
+    positive, false_positive, false_negative, negative = TRUTH_COLORS.values()
+    table = np.array(
+        [(*color, _byte(opacity)) for color in (negative, false_negative, false_positive, positive)], np.uint8
+    )
+    return np.take(table, 2 * predicted.astype(np.uint8) + truth, axis=0)
 
 
 def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[int, int], opacity: float) -> Rgba:

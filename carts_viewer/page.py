@@ -107,6 +107,11 @@ class Page:
         rules.append(f"{boxes[0]} {{ margin-left: 6px !important }}")
         self.server.gui.add_html(f"<style>{' '.join(rules)}</style>")
 
+    @property
+    def drawn_id(self) -> str:
+        """The `id` of the field in which a tab says that it has drawn an overlay."""
+        return self._drawn._impl.uuid
+
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
         return handle._impl.uuid
@@ -132,7 +137,7 @@ class Page:
         return _response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
-        configuration = json.dumps({"drawn": self._drawn._impl.uuid})
+        configuration = json.dumps({"drawn": self.drawn_id})
         return (
             _index_of_viser()
             .replace(

@@ -1,5 +1,6 @@
 """The overlay of a pose over its frame at the frame's own size, and how well it fits the truth."""
 
+import numpy as np
 import torch
 
 from carts_core.data import Frame, Sequence
@@ -19,10 +20,16 @@ class Painter:
         self._measured_joints = sequence.measured_joints
         self._device = device
         self._renderers: dict[str, Renderer] = {}
+        self._last: tuple[SceneState | None, str, layers.ArmIds] = (None, "", np.zeros((0, 0), int))
 
     def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
-        return self._renderer(camera).segment(state.to(self._device))[0]
+        # Overlay and scores of one pose are asked for one after the other.
+        last_state, last_camera, arm_ids = self._last
+        if last_state is not state or last_camera != camera:
+            arm_ids = self._renderer(camera).segment(state.to(self._device))[0]
+            self._last = (state, camera, arm_ids)
+        return arm_ids
 
     def overlay(
         self, state: SceneState, frame: Frame, camera: str, layer: Layer, opacity: float, maps: Maps | None
@@ -65,8 +72,9 @@ class Painter:
     @torch.no_grad()
     def _shaded(self, state: SceneState, camera: str, opacity: float) -> layers.Rgba:
         rendering = self._renderer(camera)(state.to(self._device))
-        image = rendering.image[0].permute(1, 2, 0).cpu().numpy()
-        return layers.shaded(image, rendering.arm_ids[0].cpu().numpy(), opacity)
+        arm_ids = rendering.arm_ids[0].cpu().numpy()
+        self._last = (state, camera, arm_ids)
+        return layers.shaded(rendering.image[0].cpu().numpy(), arm_ids, opacity)
 
     def _renderer(self, camera: str) -> Renderer:
         if camera not in self._renderers:

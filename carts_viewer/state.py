@@ -104,8 +104,8 @@ class ViewState:
     run: RunState = field(default_factory=RunState)
     maps: Maps | None = None
     """Of the shown pose, frame and domain; None while nobody needs them."""
-    scores: Scores = field(default_factory=Scores)
-    """Of the shown pose."""
+    scores: Scores | None = None
+    """Of the shown pose; None until they are computed, which is after its picture has been sent."""
     undoable: int = 0
     """How many changes can be taken back."""
     busy: str | None = None

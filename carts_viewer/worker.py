@@ -100,8 +100,10 @@ class Worker:
 
     def _publish(self) -> None:
         if self._pictured is not self._controller.state and self._display.ready_in() <= 0.0:
-            self._controller.complete()
+            self._controller.map()
             self._display.show_picture(self._controller.state)
+            # Numbers come after the picture: somebody may be dragging.
+            self._controller.score()
             self._pictured = self._controller.state
         if self._shown is not self._controller.state:
             self._display.show_panels(self._controller.state)

@@ -7,7 +7,7 @@ from carts_viewer.controller import SPEEDS
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
-from carts_viewer.state import Source, ViewState
+from carts_viewer.state import Scores, Source, ViewState
 
 _SOURCES = {
     Source.MEASURED: "joints as measured",
@@ -23,6 +23,8 @@ class BrowsePanel:
         gui = page.server.gui
         sequence = session.sequence
         self._count = len(sequence)
+        # Shown on while those of a newer pose are being computed, or the line would jump.
+        self._scores = Scores()
         with gui.add_folder("Sequence"):
             # A slider needs two ends even for a sequence of a single frame.
             self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
@@ -51,7 +53,17 @@ class BrowsePanel:
         write(self._camera, state.camera)
         self._play.label = "Stop" if state.playing else "Play"
         self._play.icon = viser.Icon.PLAYER_STOP if state.playing else viser.Icon.PLAYER_PLAY
-        self._caption.content = (
-            f'<p class="carts-caption">Frame <b>{escaped(state.frame.frame_id)}</b> '
-            f"({state.index + 1} of {self._count}) · {_SOURCES[state.pose.source]}</p>"
-        )
+        self._caption.content = f'<p class="carts-caption">{self._describe(state)}</p>'
+
+    def _describe(self, state: ViewState) -> str:
+        """The frame in words: its name, where its joints come from, and how well they fit the truth."""
+        parts = [
+            f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})",
+            _SOURCES[state.pose.source],
+        ]
+        scores = self._scores = state.scores or self._scores
+        if scores.dice is not None:
+            parts.append(f"Dice <b>{scores.dice:.3f}</b>")
+        if scores.joint_degrees is not None:
+            parts.append(f"joint error <b>{scores.joint_degrees:.2f}°</b>")
+        return " · ".join(parts)

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import viser
 
-from carts_viewer.intents import Intent
+from carts_viewer.intents import Intent, Refresh
 from carts_viewer.state import ViewState
 
 Emit = Callable[[Intent], None]
@@ -21,7 +21,7 @@ class Panel(Protocol):
         """Bring the widgets up to date."""
 
 
-def on_input(handle: Any, intent: Callable[[Any], Intent | None], emit: Emit) -> None:
+def on_input(handle: Any, intent: Callable[[Any], Intent], emit: Emit) -> None:
     """When a person changes the widget, emit what `intent` makes of its value.
 
     Our own writes (they have no client), numbers that are not finite and choices that do not exist are not input.
@@ -30,10 +30,10 @@ def on_input(handle: Any, intent: Callable[[Any], Intent | None], emit: Emit) ->
 
     @handle.on_update
     async def _(event: viser.GuiEvent) -> None:
-        if event.client_id is not None and valid(handle):
-            asked = intent(handle.value)
-            if asked is not None:
-                emit(asked)
+        if event.client_id is None:
+            return
+        # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
+        emit(intent(handle.value) if valid(handle) else Refresh())
 
 
 def on_click(handle: viser.GuiButtonHandle, intent: Callable[[int], Intent], emit: Emit) -> None:

@@ -1,0 +1,232 @@
+"""Measures the viewer: how long a moved slider takes to become an overlay, and whether memory stays flat.
+
+    python -m carts_viewer.bench [SEQUENCE]
+
+The sliders are moved over a real websocket, as a browser moves them (at most 20 times a second).
+"""
+
+import argparse
+import asyncio
+import dataclasses
+import os
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import viser
+import zstandard
+from viser import _messages as messages
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from carts_core.resources import sample_sequence
+from carts_viewer import intents as ask
+from carts_viewer.app import ViewerApp
+from carts_viewer.stage import OVERLAY
+from carts_viewer.state import Phase
+
+_MOVES_PER_SECOND = 20
+_SETTLE = 0.5
+_ITERATIONS = 500
+
+
+class RawTab:
+    """A tab without a browser: speaks viser's protocol, sets widgets to anything, and notes arriving overlays."""
+
+    def __init__(self, url: str, drawn: str | None = None) -> None:
+        """
+        Args:
+            url: The page's address.
+            drawn: Id of the field in which a tab says that it has drawn an overlay; None for a tab that never says so.
+        """
+        self._url = url.replace("http://", "ws://")
+        self._drawn = drawn
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._connection: ClientConnection | None = None
+        self.overlays: list[tuple[float, bytes]] = []
+        """Time of arrival [s, perf_counter] and PNG of every overlay."""
+        self.values: dict[str, Any] = {}
+        """Newest value of every widget that the server has set, by id."""
+
+    def __enter__(self) -> "RawTab":
+        self._thread.start()
+        asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(20)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result(20)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(10)
+
+    def set(self, element: str, value: Any) -> None:
+        """Set a widget's value, whatever the page would allow."""
+        self._send(messages.GuiUpdateMessage(element, {"value": value}))
+
+    def _send(self, message: messages.Message) -> None:
+        asyncio.run_coroutine_threadsafe(self._push(message), self._loop).result(20)
+
+    async def _push(self, message: messages.Message) -> None:
+        assert self._connection is not None
+        await self._connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    async def _open(self) -> None:
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        self._connection = await connect(self._url, subprotocols=[protocol], max_size=None, compression=None)
+        # viser counts a tab as connected once it has said where its camera is.
+        await self._push(
+            messages.ViewerCameraMessage(
+                (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.1), (0.0, -1.0, 0.0)
+            )
+        )
+        self._reader = asyncio.create_task(self._read(self._connection))
+
+    async def _close(self) -> None:
+        assert self._connection is not None
+        await self._connection.close()
+        await asyncio.gather(self._reader, return_exceptions=True)
+
+    async def _read(self, connection: ClientConnection) -> None:
+        zstd = zstandard.ZstdDecompressor()
+        async for data in connection:
+            assert isinstance(data, bytes)
+            arrived = time.perf_counter()
+            size, packed = (int.from_bytes(data[start : start + 8], "little") for start in (0, 8))
+            inner = msgspec.msgpack.decode(zstd.decompress(data[16 : 16 + packed], max_output_size=size))
+            for message in inner["messages"]:
+                await self._note(message, arrived)
+
+    async def _note(self, message: dict[str, Any], arrived: float) -> None:
+        updates = message.get("updates", {})
+        if message["type"] == "GuiUpdateMessage" and "value" in updates:
+            self.values[message["uuid"]] = updates["value"]
+        if message.get("name") == OVERLAY and "_data" in (updates or message.get("props", {})):
+            self.overlays.append((arrived, (updates or message["props"])["_data"]))
+            if self._drawn is not None:
+                await self._push(messages.GuiUpdateMessage(self._drawn, {"value": f"{id(self)} {len(self.overlays)}"}))
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Times from a moved slider to its overlay [ms]."""
+
+    median: float
+    p95: float
+    worst: float
+    stale: bool
+    """Whether the last overlay of a drag was not the one of the last value."""
+
+
+def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True) -> Latency:
+    """Drag the first joint's slider and wait for overlays.
+
+    Args:
+        app: The viewer.
+        drags: How many drags.
+        seconds: Duration of each [s].
+        draws: Whether the tab says when it has drawn; one that does not is as slow as the viewer ever waits for.
+    """
+    arm = app.state.frame.measured
+    name = next(iter(arm))
+    slider = app.page.element_id(app.joints.slider(name, 0))
+    shown = _record_pictures(app, name)
+    times: list[float] = []
+    stale = False
+    with RawTab(app.url, app.page.drawn_id if draws else None) as tab:
+        app.wait_until_shown()
+        for _ in range(drags):
+            start = float(np.degrees(arm[name][0]))
+            moves: list[tuple[float, float]] = []
+            for step in range(int(seconds * _MOVES_PER_SECOND)):
+                value = round(start + 0.1 * (step + 1), 6)
+                moves.append((time.perf_counter(), value))
+                tab.set(slider, value)
+                time.sleep(1.0 / _MOVES_PER_SECOND)
+            app.wait_until_shown()
+            time.sleep(_SETTLE)
+            pictures = [(at, np.degrees(value)) for at, value in shown if at >= moves[0][0]]
+            arrivals = [at for at, _ in tab.overlays if at >= moves[0][0]]
+            stale |= not pictures or abs(pictures[-1][1] - moves[-1][1]) > 1e-3
+            times += [_wait_for(at, value, pictures, arrivals) for at, value in moves]
+            app.mailbox.put(ask.BackToMeasured())
+            app.wait_until_shown()
+            shown.clear()
+    ms = 1e3 * np.array(times)
+    return Latency(float(np.median(ms)), float(np.percentile(ms, 95)), float(ms.max()), stale)
+
+
+def _record_pictures(app: ViewerApp, arm: str) -> list[tuple[float, float]]:
+    """A list that fills with the time and the first joint [rad] of every picture that the worker starts to make."""
+    shown: list[tuple[float, float]] = []
+    show = app.display.show_picture
+    row = [own.name for own in app.scene.arms].index(arm)
+
+    def recorded(state: Any) -> None:
+        show(state)
+        shown.append((time.perf_counter(), float(state.pose.scene.joint_positions[row][0])))
+
+    app.display.show_picture = recorded
+    return shown
+
+
+def _wait_for(moved: float, value: float, pictures: list[tuple[float, float]], arrivals: list[float]) -> float:
+    """From a move to the arrival of the first picture of its value or of a later one [s]; inf when none came."""
+    made = next((at for at, shown in pictures if shown >= value - 1e-3), None)
+    if made is None:
+        return float("inf")
+    # A picture has arrived at the first arrival not much before its making was noted: both clocks are this process's.
+    return next((at - moved for at in arrivals if at >= made - 0.02), float("inf"))
+
+
+def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> list[tuple[int, float]]:
+    """Resident memory [MB] after every tenth of a long run, as (iterations, MB)."""
+    app.mailbox.put(ask.SetSetting("iterations", iterations))
+    app.mailbox.put(ask.SetSetting("tolerance", 0.0))
+    app.mailbox.put(ask.Run())
+    samples: list[tuple[int, float]] = []
+    while not samples or samples[-1][0] < iterations:
+        time.sleep(0.05)
+        done = len(app.state.run.curves.loss) - 1
+        if app.state.error is not None:
+            raise RuntimeError(app.state.error)
+        if done >= len(samples) * iterations // 10:
+            samples.append((done, resident_megabytes()))
+        if app.state.run.phase is Phase.IDLE and app.state.run.reason is not None:
+            samples.append((done, resident_megabytes()))
+            break
+    return samples
+
+
+def resident_megabytes() -> float:
+    """Memory of this process [MB], as Linux reports it."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
+    parser.add_argument("--weights", type=Path, default=None)
+    parser.add_argument("--iterations", type=int, default=_ITERATIONS)
+    arguments = parser.parse_args()
+    with ViewerApp.open(arguments.sequence, port=0, weights=arguments.weights) as app:
+        app.wait_until_shown(120)
+        camera = app.scene.camera(app.state.camera)
+        print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")
+        for draws, name in ((True, "tab that draws at once"), (False, "tab that never answers")):
+            latency = slider_latency(app, draws=draws)
+            figures = ", ".join(
+                f"{key} {value:.0f} ms" for key, value in dataclasses.asdict(latency).items() if key != "stale"
+            )
+            print(f"slider to overlay, {name}: {figures}; stale at the end of a drag: {latency.stale}")
+        for iterations, megabytes in memory_while_optimizing(app, arguments.iterations):
+            print(f"memory after {iterations} iterations: {megabytes:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""A running viewer of a tiny sequence, a tab without a browser, and a real browser."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import torch
+from playwright.sync_api import Browser, sync_playwright
+
+from carts_core.features.network import Architecture, FeatureNetwork
+from carts_core.features.weights import save_weights
+from carts_viewer.app import ViewerApp
+
+FLAGS = (
+    "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
+    "--disable-sync"
+).split()
+
+
+@pytest.fixture(scope="session")
+def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a small untrained network: its features are edges and blobs, which is enough to optimize on."""
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        save_weights(FeatureNetwork(Architecture()).eval(), path, {}, (320, 240))
+    return path
+
+
+@pytest.fixture
+def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[Callable[..., ViewerApp]]:
+    """Opens the viewer of a tiny sequence; arguments are those of `tiny_sequence`."""
+    with ExitStack() as stack:
+
+        def make(**options) -> ViewerApp:
+            path = tiny_sequence(**options)
+            app = stack.enter_context(ViewerApp.open(path, port=0, weights=untrained_weights))
+            app.wait_until_shown(60)
+            return app
+
+        yield make
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """Headless Chromium: `CARTS_CHROMIUM`, or the one on the path."""
+    executable = os.environ.get("CARTS_CHROMIUM") or shutil.which("chromium")
+    if executable is None:
+        pytest.skip("no Chromium: set CARTS_CHROMIUM to its executable")
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=executable, args=FLAGS)
+        yield chromium
+        chromium.close()
