@@ -95,6 +95,6 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
         return Checkpoint(int(metadata["step"]), metadata["config"], history, tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
         raise WeightsError(
-            f"checkpoint {path} cannot be read ({error}). Allowed is what `carts train` writes. Delete the file to start "
-            "this run again."
+            f"checkpoint {path} cannot be read ({error}). Allowed is what `carts train` writes. Delete the file to "
+            "start this run again."
         ) from error

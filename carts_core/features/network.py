@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -74,7 +75,7 @@ class FeatureNetwork(nn.Module):
         counts = self.architecture.encoder_convolutions
         self.encoder = nn.ModuleList(_block(i, o, n) for i, o, n in zip(inputs, widths, counts, strict=True))
         counts = self.architecture.decoder_convolutions
-        self.reduce = nn.ModuleList(nn.Conv2d(i, o, 1) for o, i in zip(widths[:-1], widths[1:], strict=True))
+        self.reduce = nn.ModuleList(nn.Conv2d(i, o, 1) for o, i in pairwise(widths))
         self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
         self.head = nn.Conv2d(widths[0], 1, 1)
 
@@ -114,7 +115,7 @@ class FeatureNetwork(nn.Module):
         copy.eval()
         for block in (*copy.encoder, *copy.decoder):
             _fold(block)
-        return copy.to(next(self.parameters()).device, memory_format=torch.channels_last).requires_grad_(False)
+        return channels_last(copy.to(next(self.parameters()).device)).requires_grad_(False)
 
     def _check(self, images: Tensor) -> None:
         stride = self.architecture.stride
@@ -123,6 +124,14 @@ class FeatureNetwork(nn.Module):
                 f"the feature network got a tensor of shape {tuple(images.shape)}. Give [batch, 3, height, width] "
                 f"with height and width multiples of {stride}; pad or crop the image."
             )
+
+
+def channels_last(network: FeatureNetwork) -> FeatureNetwork:
+    """The network with its weights in channels-last order, which is faster on CPUs and newer GPUs."""
+    for parameter in network.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network
 
 
 def standardize(images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:

@@ -14,6 +14,7 @@ CLASSES = 3
 """Background, shaft, head."""
 
 _NEIGHBOURHOOD = 21
+_TINY = 1e-8
 _OTHER_PART = 0.6
 
 
@@ -69,7 +70,7 @@ class Objective(nn.Module):
             ),
             "parts": functional.cross_entropy(self.parts(features), classes.flatten(0, 1).long()),
         }
-        total = sum((getattr(self.weights, name) * term for name, term in terms.items()), logits.new_zeros(()))
+        total = torch.stack([getattr(self.weights, name) * term for name, term in terms.items()]).sum()
         return total, terms
 
 
@@ -90,9 +91,10 @@ def consistency_loss(
     Where both images show the same class the cosine should be 1; where one shows background and the other an
     instrument, not above 0; where one shows the shaft and the other the head, not above 0.6.
     """
-    similarity = functional.cosine_similarity(features_a, features_b, dim=1, eps=1e-4)
+    overlap = (features_a * features_b).sum(1)
+    similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
     instrument = ((classes_a > 0) | (classes_b > 0)).to(similarity.dtype)
-    near = functional.max_pool2d(instrument[:, None], _NEIGHBOURHOOD, 1, _NEIGHBOURHOOD // 2)[:, 0]
+    near = _dilated(instrument)
     same = near * (classes_a == classes_b)
     moved = ((classes_a > 0) != (classes_b > 0)).to(similarity.dtype)
     other_part = instrument * (classes_a != classes_b) * (1 - moved)
@@ -101,6 +103,12 @@ def consistency_loss(
         + _weighted_mean(similarity.clamp(min=0), moved)
         + _weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
     )
+
+
+def _dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
+    # A square's maximum is the maximum along rows of the maxima along columns.
+    rows = functional.max_pool2d(mask[:, None], (_NEIGHBOURHOOD, 1), 1, (_NEIGHBOURHOOD // 2, 0))
+    return functional.max_pool2d(rows, (1, _NEIGHBOURHOOD), 1, (0, _NEIGHBOURHOOD // 2))[:, 0]
 
 
 def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from ..errors import SettingsError
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .loader import training_batches, validation_set
-from .network import FeatureNetwork
+from .network import FeatureNetwork, channels_last
 from .objective import Objective
 from .report import write_report
 from .training_config import TrainingConfig
@@ -80,7 +80,7 @@ class _Run:
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         self.config, self.output = config, output
         torch.manual_seed(config.seed)
-        self.network = FeatureNetwork(config.architecture).to(config.device, memory_format=torch.channels_last)
+        self.network = channels_last(FeatureNetwork(config.architecture).to(config.device))
         self.objective = Objective(config.architecture.widths[0], config.objective).to(config.device)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
         parameters = [*self.network.parameters(), *self.objective.parameters()]
@@ -98,8 +98,8 @@ class _Run:
         if changed:
             details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
             raise SettingsError(
-                f"{self.output} holds a run with other settings: {details}. Give the same settings to go on with it, or "
-                "another output folder to start anew."
+                f"{self.output} holds a run with other settings: {details}. Give the same settings to go on with it, "
+                "or another output folder to start anew."
             )
         checkpoint.restore(self.modules, self.optimizer)
         self.step, self.history = checkpoint.step, checkpoint.history

@@ -21,7 +21,7 @@ class TrainingConfig:
     batch_pairs: int = 8
     """Pairs of an observed and a hybrid image per step."""
     reuse: int = 2
-    """How often a pair is used, mirrored by chance after the first time; making one costs as much as learning from it."""
+    """How often a pair is used, mirrored by chance after the first time: making one takes as long as learning it."""
     learning_rate: float = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
     weight_decay: float = 1e-4
@@ -68,8 +68,8 @@ class TrainingConfig:
                 raise SettingsError(f"{name} is {getattr(self, name)}; give 0 or more.")
         if not self.learning_rate > 0 or not self.weight_decay >= 0:
             raise SettingsError(
-                f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and a "
-                "decay of 0 or more."
+                f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and "
+                "a decay of 0 or more."
             )
         if not 0 <= self.average < 1:
             raise SettingsError(f"average is {self.average}; give a decay from 0 (no average) to below 1.")
@@ -78,6 +78,6 @@ class TrainingConfig:
         stride = self.architecture.stride
         if self.images.width % stride or self.images.height % stride:
             raise SettingsError(
-                f"training images of {self.images.width}x{self.images.height} px do not fit the network; give multiples "
-                f"of {stride}."
+                f"training images of {self.images.width}x{self.images.height} px do not fit the network; give "
+                f"multiples of {stride}."
             )

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...rendering import visibility
-from .geometry import PosedRobot, RobotGeometry
+from .geometry import Intrinsics, PosedRobot, RobotGeometry
 
 
 @dataclass(frozen=True)
@@ -16,10 +16,10 @@ class GBuffer:
 
     size: tuple[int, int]
     """Width and height of the image [px]."""
-    rows: Int[np.ndarray, "n"]
-    columns: Int[np.ndarray, "n"]
-    arm: Int[np.ndarray, "n"]
-    part: Int[np.ndarray, "n"]
+    rows: Int[np.ndarray, " n"]
+    columns: Int[np.ndarray, " n"]
+    arm: Int[np.ndarray, " n"]
+    part: Int[np.ndarray, " n"]
     """Index into `Robot.meshes`."""
     points: Float[np.ndarray, "n 3"]
     """In the camera's frame [m]."""
@@ -39,7 +39,7 @@ class GBuffer:
 def render_gbuffer(
     geometries: Sequence[RobotGeometry],
     posed: Sequence[PosedRobot],
-    intrinsics: tuple[float, ...],
+    intrinsics: Intrinsics,
     width: int,
     height: int,
 ) -> GBuffer:

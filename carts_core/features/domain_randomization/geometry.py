@@ -8,6 +8,9 @@ from jaxtyping import Float, Int
 
 from ...robot import Robot
 
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy [px]."""
+
 
 @dataclass(frozen=True)
 class PosedRobot:

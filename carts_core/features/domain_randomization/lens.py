@@ -53,7 +53,9 @@ def _noise(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges
 def _jpeg(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:
     quality = int(rng.uniform(*ranges.jpeg_quality))
     coded = cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / 255
+    decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1].astype(np.float32) / 255
 
 
 def _round_mask(rng: np.random.Generator, width: int, height: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from ..hybrid import hybrid
 from .backgrounds import random_background
 from .clutter import add_clutter, cast_shadow
 from .gbuffer import GBuffer, render_gbuffer
-from .geometry import RobotGeometry
+from .geometry import Intrinsics, RobotGeometry
 from .lens import photograph, tone
 from .placement import Placement, perturbed, random_intrinsics, random_placement
 from .ranges import AppearanceRanges
@@ -129,17 +129,19 @@ class PairGenerator:
         self._variants[key] = variant, uses + 1
         return variant
 
-    def _visible_placements(self, variant: Variant) -> tuple[tuple[float, ...], list[Placement], GBuffer]:
+    def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
+        """Arms of which the camera sees neither too little nor too much; after some tries, whatever it sees."""
         settings, rng = self._settings, self._rng
         size = settings.width, settings.height
-        for _ in range(_TRIES):
+        tries = 0
+        while True:
             intrinsics = random_intrinsics(rng, *size, settings.field_width)
             placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
             view = _look(variant.geometries, placements, intrinsics, *size)
             share = len(view.rows) / (settings.width * settings.height)
-            if settings.coverage[0] <= share <= settings.coverage[1]:
-                break
-        return intrinsics, placements, view
+            tries += 1
+            if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
+                return intrinsics, placements, view
 
     def _observe(
         self, variant: Variant, fine: GBuffer, background: np.ndarray, coverage: np.ndarray, camera_seed: int
@@ -166,7 +168,7 @@ class PairGenerator:
         return image
 
     def _render_hybrid(
-        self, variant: Variant, placements: list[Placement], intrinsics: tuple[float, ...], background: np.ndarray
+        self, variant: Variant, placements: list[Placement], intrinsics: Intrinsics, background: np.ndarray
     ) -> np.ndarray:
         state = SceneState(
             tuple(torch.tensor(placement.joint_positions, dtype=torch.float32) for placement in placements),
@@ -183,7 +185,7 @@ class PairGenerator:
 def _look(
     geometries: Sequence[RobotGeometry],
     placements: Sequence[Placement],
-    intrinsics: tuple[float, ...],
+    intrinsics: Intrinsics,
     width: int,
     height: int,
     supersampling: int = 1,
@@ -192,7 +194,8 @@ def _look(
         geometry.posed(placement.T_camera_base @ geometry.link_transforms(placement.joint_positions))
         for geometry, placement in zip(geometries, placements, strict=True)
     ]
-    scaled = tuple(value * supersampling for value in intrinsics)
+    fx, fy, cx, cy = intrinsics
+    scaled = fx * supersampling, fy * supersampling, cx * supersampling, cy * supersampling
     return render_gbuffer(geometries, posed, scaled, width * supersampling, height * supersampling)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .geometry import RobotGeometry
+from .geometry import Intrinsics, RobotGeometry
 
 DEPTH = (0.05, 0.25)
 """Distance of the wrist from the camera [m]."""
@@ -21,20 +21,20 @@ ELEVATION = (-20.0, 60.0)
 class Placement:
     """One arm in front of the camera."""
 
-    joint_positions: Float[np.ndarray, "dofs"]
+    joint_positions: Float[np.ndarray, " dofs"]
     """[rad, m], in the order of `Robot.joint_names`."""
     T_camera_base: Float[np.ndarray, "4 4"]
 
 
-def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> tuple[float, ...]:
-    """fx, fy, cx, cy [px] of a camera whose full image is `field` px wide and of which `width` x `height` px are seen."""
+def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> Intrinsics:
+    """fx, fy, cx, cy [px] of a camera that is `field` px wide and of which a part of `width` x `height` px is seen."""
     focal = rng.uniform(*FOCAL_LENGTH) * field
     cx, cy = rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height
     return focal, focal * rng.uniform(0.98, 1.02), cx, cy
 
 
 def random_placement(
-    rng: np.random.Generator, geometry: RobotGeometry, intrinsics: tuple[float, ...], width: int, height: int
+    rng: np.random.Generator, geometry: RobotGeometry, intrinsics: Intrinsics, width: int, height: int
 ) -> Placement:
     """A random configuration whose wrist is in or near the image and whose shaft leaves it across a random border."""
     joints = _random_joints(rng, geometry)

@@ -21,8 +21,8 @@ class _Surface:
     """Material per pixel; n pixels."""
 
     albedo: Float[np.ndarray, "n 3"]
-    roughness: Float[np.ndarray, "n"]
-    metalness: Float[np.ndarray, "n"]
+    roughness: Float[np.ndarray, " n"]
+    metalness: Float[np.ndarray, " n"]
 
 
 def shade(

@@ -24,15 +24,10 @@ class Variant:
     renderer: Renderer
     """The optimizer's renderer of the same arms, for hybrid images."""
 
-    @property
-    def scene(self) -> Scene:
-        """The scene that `renderer` renders; its base frames are placeholders."""
-        return self.renderer.scene
-
 
 def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
     """A scene of `arms` arms, each a robot of `robots` with random colours and thickness."""
-    chosen = [_vary(rng, robots[rng.integers(len(robots))]) for _ in range(arms)]
+    chosen = [_vary(rng, robots[int(rng.integers(len(robots)))]) for _ in range(arms)]
     scene = Scene(
         tuple(Arm(f"arm{index}", robot, np.eye(4)) for index, robot in enumerate(chosen)),
         (Camera("training", width, height, (float(width), float(width), width / 2, height / 2), np.eye(4)),),
