@@ -50,7 +50,9 @@ class ViewerApp:
         url: Where the page is.
         page: The page, for tests and scripts.
         mailbox: Where intents go.
+        sequence: The recording.
         scene: The recording's arms and cameras.
+        stage: What is seen in 3D, frame and overlay included.
         display: What puts states on the page.
         joints: The panel with the joints' sliders.
     """
@@ -67,6 +69,8 @@ class ViewerApp:
     ) -> None:
         """Start serving an open sequence; arguments as in `open`."""
         self._report = report
+        self._closed = False
+        self.sequence = sequence
         self.scene = sequence.scene
         self._session = Session(sequence)
         self._painter = Painter(sequence, device)
@@ -81,8 +85,8 @@ class ViewerApp:
         self.url = self.page.url
         self.joints: JointsPanel
         panels = self._build(state)
-        stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
-        self.display = PageDisplay(self.page, self._session, self._painter, stage, panels)
+        self.stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
+        self.display = PageDisplay(self.page, self._session, self._painter, self.stage, panels)
         self.page.on_drawn(self._on_drawn)
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
@@ -128,7 +132,10 @@ class ViewerApp:
         return self._controller.state
 
     def close(self) -> None:
-        """Stop the worker and the server."""
+        """Stop the worker and the server; closing again does nothing."""
+        if self._closed:
+            return
+        self._closed = True
         self._worker.stop()
         self.page.close()
 

@@ -6,7 +6,7 @@ browser sends with a websocket, is the origin that the page itself was loaded fr
 """
 
 import ipaddress
-from collections.abc import Mapping
+from collections.abc import Sequence
 from urllib.parse import urlsplit
 
 from carts_core.errors import SettingsError
@@ -29,18 +29,18 @@ def check_loopback(host: str) -> None:
         )
 
 
-def refusal(headers: Mapping[str, str]) -> str | None:
-    """Why a request with these headers must not be answered; None when it may.
+def refusal(hosts: Sequence[str], origins: Sequence[str]) -> str | None:
+    """Why a request must not be answered; None when it may.
 
     Args:
-        headers: The request's headers; `Host` is required, `Origin` is checked when present.
+        hosts: Every `Host` header of the request; there must be exactly one.
+        origins: Every `Origin` header; programs other than browsers send none.
     """
-    host = headers.get("Host", "")
-    if _hostname(f"//{host}") not in _LOOPBACK_NAMES:
-        return f"The viewer answers on 127.0.0.1 and localhost only, and was asked for {host!r}."
-    origin = headers.get("Origin")
-    if origin is not None and origin != f"http://{host}":
-        return f"The viewer answers its own page only, and this request came from {origin!r}."
+    if len(hosts) != 1 or _hostname(f"//{hosts[0]}") not in _LOOPBACK_NAMES:
+        return f"The viewer answers on 127.0.0.1 and localhost only, and was asked for {', '.join(hosts)!r}."
+    for origin in origins:
+        if origin != f"http://{hosts[0]}":
+            return f"The viewer answers its own page only, and this request came from {origin!r}."
     return None
 
 

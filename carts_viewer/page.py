@@ -112,13 +112,18 @@ class Page:
         """The `id` of the field in which a tab says that it has drawn an overlay."""
         return self._drawn._impl.uuid
 
+    def find(self, label: str) -> Any:
+        """The widget with this label (for tests and scripts)."""
+        handles = self.server.gui._gui_input_handle_from_uuid.values()
+        return next(handle for handle in handles if getattr(handle, "label", None) == label)
+
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
         return handle._impl.uuid
 
     def _respond(self, request: Request) -> Response | None:
         """Our own answer to a request, or None to let viser answer it."""
-        reason = refusal(request.headers)
+        reason = refusal(request.headers.get_all("Host"), request.headers.get_all("Origin"))
         if reason is not None:
             return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
         path = request.path.partition("?")[0]

@@ -58,6 +58,10 @@ class Stage:
         """Put an overlay for this camera's image between the image and the lens."""
         self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
+    def sent(self, name: str) -> bytes:
+        """The image file that `FRAME` or `OVERLAY` was last sent as."""
+        return self._planes[name][1]._data
+
     def show_pose(self, state: SceneState, camera: str) -> None:
         """Move arms and cameras to where they are, seen from this camera."""
         extrinsics = {

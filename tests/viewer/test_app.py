@@ -1,0 +1,196 @@
+"""The running app over real sockets, without a browser."""
+
+import http.client
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from carts_core.errors import SequenceError, SettingsError
+from carts_viewer import intents as ask
+from carts_viewer.app import ViewerApp, serve
+from carts_viewer.bench import RawTab
+from carts_viewer.layers import Layer, mask
+from carts_viewer.picture import Painter
+from carts_viewer.stage import OVERLAY
+
+
+def _get(app: ViewerApp, path: str, **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(app.url.removeprefix("http://"), timeout=20)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse()
+
+
+def _wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end, "it did not come true in 20 s"
+        time.sleep(0.02)
+
+
+def _picture(png: bytes) -> np.ndarray:
+    return cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
+
+
+def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer(masks=False)
+    app.mailbox.put(ask.ShowLayer(Layer.MASK))
+    slider = app.joints.slider("PSM1", 0)
+    with RawTab(app.url) as tab:
+        for value in np.linspace(-5.0, 5.0, 100):
+            tab.set(app.page.element_id(slider), float(value))
+        _wait_for(lambda: app.state.pose.scene.joint_positions[0][0] == pytest.approx(math.radians(5.0)))
+        state = app.wait_until_shown()
+        _wait_for(lambda: tab.overlays[-1][1] == app.stage.sent(OVERLAY))
+        fresh = Painter(app.sequence).arm_ids(state.pose.scene, "left")
+        assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
+        assert 1 <= len(tab.overlays) < 100
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e12, -1e12])
+def test_a_raw_client_cannot_move_a_joint_out_of_its_limits(
+    open_viewer: Callable[..., ViewerApp], value: float
+) -> None:
+    app = open_viewer()
+    slider = app.joints.slider("PSM1", 0)
+    with RawTab(app.url) as tab:
+        tab.set(app.page.element_id(slider), value)
+        _wait_for(lambda: math.isfinite(slider.value) and abs(slider.value) < 1e6)
+        state = app.wait_until_shown()
+    limits = app.scene.arms[0].robot.joint_limits[0]
+    assert limits[0] - 1e-5 <= state.pose.scene.joint_positions[0][0] <= limits[1] + 1e-5
+    assert state.error is None
+
+
+def test_a_choice_that_does_not_exist_is_put_right_in_every_tab(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer(cameras=("left", "right"))
+    dropdown = app.page.find("Camera")
+    with RawTab(app.url) as rogue, RawTab(app.url) as other:
+        rogue.set(app.page.element_id(dropdown), "no such camera")
+        _wait_for(lambda: dropdown.value == "left")
+        _wait_for(lambda: other.values.get(app.page.element_id(dropdown)) == "left")
+    assert app.state.camera == "left" and app.state.error is None
+
+
+def test_two_tabs_see_one_state(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    slider = app.page.element_id(app.page.find("Frame"))
+    with RawTab(app.url) as first, RawTab(app.url) as second:
+        first.set(slider, 3)
+        _wait_for(lambda: second.values.get(slider) == 3)
+        assert app.wait_until_shown().index == 2
+
+
+def test_a_missing_image_is_an_error_in_the_page_and_the_server_stays_up(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    image = app.sequence.path.parent / "regular" / "left" / "003.png"
+    image.rename(image.with_suffix(".gone"))
+    app.mailbox.put(ask.ShowFrame(2))
+    state = app.wait_until_shown()
+    assert state.error is not None and "003.png" in state.error and state.index == 0
+    image.with_suffix(".gone").rename(image)
+    app.mailbox.put(ask.ShowFrame(2))
+    state = app.wait_until_shown()
+    assert state.index == 2 and state.error is None
+    assert _get(app, "/").status == 200
+
+
+def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    with ViewerApp.open(tiny_sequence(), port=0, weights=tmp_path / "none.safetensors") as app:
+        app.mailbox.put(ask.Run())
+        state = app.wait_until_shown(60)
+        assert "none.safetensors" in (state.error or "") and state.busy is None
+        app.mailbox.put(ask.MoveFrame(1))
+        assert app.wait_until_shown().index == 1
+
+
+def test_the_page_carries_our_script_style_and_title(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    response = _get(app, "/")
+    page = response.read().decode()
+    assert "<title>tiny · CaRTS</title>" in page and "/static/page.js" in page and "/static/page.css" in page
+    assert response.headers["X-Frame-Options"] == "DENY"
+    for name, kind in (("page.js", "javascript"), ("page.css", "text/css"), ("icon.svg", "svg")):
+        found = _get(app, f"/static/{name}")
+        assert found.status == 200 and kind in found.headers["Content-Type"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/static/", "/static/../pyproject.toml", "/static/..%2fpyproject.toml", "/static//etc/passwd", "/../x"]
+)
+def test_no_file_outside_the_static_folder_is_served(open_viewer: Callable[..., ViewerApp], path: str) -> None:
+    assert _get(open_viewer(), path).status == 404
+
+
+def test_requests_for_another_host_or_from_another_site_are_refused(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    assert _get(app, "/", Host="evil.example").status == 403
+    assert _get(app, "/", Origin="http://evil.example").status == 403
+    protocol = [Subprotocol("viser-v1.1.1")]
+    for options in ({"origin": "http://evil.example"}, {"additional_headers": {"Host": "evil.example"}}):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(app.url.replace("http", "ws"), subprotocols=protocol, **options)  # type: ignore[arg-type]
+        assert refused.value.response.status_code == 403
+    with connect(app.url.replace("http", "ws"), subprotocols=protocol, origin=app.url):  # type: ignore[arg-type]
+        pass
+
+
+def test_a_busy_port_moves_up_and_the_url_says_so(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    taken = int(app.url.rsplit(":", 1)[1])
+    with ViewerApp.open(app.sequence.path, port=taken) as second:
+        assert second.url != app.url and _get(second, "/").status == 200
+
+
+def test_an_address_that_others_can_reach_is_refused_before_anything_is_opened() -> None:
+    with pytest.raises(SettingsError, match="ssh -L"):
+        ViewerApp.open(Path("does not matter.toml"), host="192.168.0.1")
+
+
+def test_a_sequence_that_does_not_open_is_an_error_that_names_it() -> None:
+    with pytest.raises(SequenceError, match=r"nowhere\.toml"):
+        ViewerApp.open(Path("nowhere.toml"))
+
+
+def test_serve_ends_with_code_2_and_a_message_when_the_sequence_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        serve(Path("nowhere.toml"))
+    assert ended.value.code == 2
+    assert "nowhere.toml is missing" in capsys.readouterr().err
+
+
+def test_serve_prints_the_address_and_ends_cleanly_on_ctrl_c(tiny_sequence: Callable[..., Path]) -> None:
+    program = (
+        "import sys; from pathlib import Path; from carts_viewer.app import serve; serve(Path(sys.argv[1]), port=0)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, str(tiny_sequence())], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    watchdog = threading.Timer(120, process.kill)
+    watchdog.start()
+    assert process.stdout is not None
+    lines = iter(process.stdout.readline, "")
+    ready = next(line for line in lines if "Ready" in line)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    watchdog.cancel()
+    assert "http://127.0.0.1:" in ready
+    assert process.returncode == 0 and "Traceback" not in errors
+
+
+def test_closing_twice_and_closing_while_running_do_no_harm(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    app.mailbox.put(ask.Run())
+    app.close()
+    app.close()

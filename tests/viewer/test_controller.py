@@ -1,0 +1,275 @@
+"""What intents do to the state, with the real optimizer, without threads or a page."""
+
+import io
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError, SettingsError
+from carts_core.export import read_kinematics_csv
+from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_viewer import intents as ask
+from carts_viewer.controller import Controller
+from carts_viewer.layers import Layer
+from carts_viewer.picture import Painter
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.session import Session
+from carts_viewer.state import Phase, Source, ViewState
+
+
+@dataclass
+class Desk:
+    """A controller and what it delivered."""
+
+    controller: Controller
+    session: Session
+    painter: Painter
+    delivered: list[tuple[int, str, bytes]] = field(default_factory=list)
+
+    @property
+    def state(self) -> ViewState:
+        return self.controller.state
+
+    def do(self, *intents: ask.Intent) -> ViewState:
+        for intent in intents:
+            self.controller.handle(intent)
+        return self.state
+
+    def finish(self) -> ViewState:
+        while self.controller.patience() == 0.0:
+            self.controller.advance()
+        return self.state
+
+    def joint(self, index: int = 0) -> float:
+        return float(self.session.joints(self.state.pose.scene)["PSM1"][index])
+
+
+@pytest.fixture
+def desk(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[Desk]:
+    sequence = Sequence.open(tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke")))
+    session, painter = Session(sequence), Painter(sequence)
+    frame = session.frame(0, "regular", "left")
+    settings = OptimizerSettings(iterations=4, working_width=96, attention_radius=4, wide_attention_radius=8)
+    state = ViewState(0, frame, "regular", "left", session.measured(frame), Layer.MASK, 0.5, settings, FreeParameters())
+    factory = OptimizerFactory(sequence, weights=untrained_weights, report=lambda line: None)
+    delivered: list[tuple[int, str, bytes]] = []
+    controller = Controller(state, session, painter, factory, lambda *file: delivered.append(file))
+    yield Desk(controller, session, painter, delivered)
+
+
+def test_frames_beyond_the_ends_are_the_ends(desk: Desk) -> None:
+    assert desk.do(ask.ShowFrame(99)).index == 2
+    assert desk.do(ask.MoveFrame(1)).index == 2
+    assert desk.do(ask.ShowFrame(-5)).index == 0
+
+
+@pytest.mark.parametrize("intent", [ask.ShowCamera("top"), ask.ShowDomain("rain")])
+def test_an_unknown_camera_or_domain_is_refused_with_the_known_ones(desk: Desk, intent: ask.Intent) -> None:
+    with pytest.raises(CartsError, match="this sequence has: "):
+        desk.do(intent)
+    assert (desk.state.camera, desk.state.domain) == ("left", "regular")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_value_that_is_no_number_is_refused(desk: Desk, value: float) -> None:
+    before = desk.joint()
+    for intent in (ask.SetJoint("PSM1", 0, value), ask.SetOpacity(value), ask.SetSpeed(value), ask.Perturb(value, 0)):
+        with pytest.raises(CartsError, match="not a number"):
+            desk.do(intent)
+    assert desk.joint() == before
+
+
+def test_numbers_out_of_range_are_clamped(desk: Desk) -> None:
+    assert desk.do(ask.SetOpacity(7.0)).opacity == 1.0
+    assert desk.do(ask.SetSpeed(1e9)).fps <= 60.0
+    desk.do(ask.SetJoint("PSM1", 0, 1e9))
+    assert desk.joint() == pytest.approx(desk.session.joint_range("PSM1", 0).upper, abs=1e-6)
+
+
+def test_a_correction_survives_a_visit_to_other_frames_cameras_and_domains(desk: Desk) -> None:
+    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.ShowCamera("right"), ask.ShowDomain("smoke"))
+    assert desk.joint() == pytest.approx(0.2)
+    desk.do(ask.MoveFrame(1))
+    assert desk.state.pose.source is Source.MEASURED
+    desk.do(ask.MoveFrame(-1))
+    assert desk.joint() == pytest.approx(0.2) and desk.state.pose.source is Source.EDITED
+
+
+def test_back_to_measured_forgets_the_correction(desk: Desk) -> None:
+    before = desk.joint()
+    desk.do(ask.Perturb(3.0, 1), ask.BackToMeasured())
+    assert desk.joint() == pytest.approx(before) and not desk.session.corrected()
+
+
+def test_undo_returns_to_the_frame_of_the_change(desk: Desk) -> None:
+    before = desk.joint()
+    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.MoveFrame(2), ask.Undo())
+    assert desk.state.index == 0 and desk.joint() == pytest.approx(before) and desk.state.undoable == 0
+
+
+def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
+    desk.do(ask.Perturb(2.0, 0), ask.Run())
+    assert desk.state.run.phase is Phase.RUNNING
+    desk.controller.advance()
+    first = desk.state
+    assert len(first.run.curves.loss) == 1 and first.maps is not None
+    state = desk.finish()
+    assert state.run.phase is Phase.IDLE and state.run.reason == "All iterations done"
+    assert len(state.run.curves.loss) == 5 and len(state.run.curves.scores) == 5
+    assert min(state.run.curves.loss) < state.run.curves.loss[0]
+    assert state.maps is not None and state.maps.iterate.loss == min(state.run.curves.loss)
+    assert state.pose.source is Source.OPTIMIZED and desk.session.corrected()[0] is state.pose
+
+
+def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:
+    desk.do(ask.Run())
+    desk.controller.advance()
+    desk.do(ask.Pause())
+    assert desk.state.run.phase is Phase.PAUSED and desk.controller.patience() is None
+    desk.do(ask.Run())
+    assert len(desk.finish().run.curves.loss) == 5
+
+
+def test_step_does_one_iteration_and_pauses(desk: Desk) -> None:
+    desk.do(ask.Step())
+    assert len(desk.state.run.curves.loss) == 2 and desk.state.run.phase is Phase.PAUSED
+    desk.do(ask.Step())
+    assert len(desk.state.run.curves.loss) == 3
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_reset_returns_to_the_start_of_the_run(desk: Desk, finished: bool) -> None:
+    desk.do(ask.Perturb(2.0, 0))
+    start = desk.joint()
+    desk.do(ask.Run())
+    desk.controller.advance()
+    desk.controller.advance()
+    if finished:
+        desk.finish()
+    state = desk.do(ask.Reset())
+    assert desk.joint() == pytest.approx(start)
+    assert state.run.curves.loss == () and state.run.phase is Phase.IDLE
+
+
+def test_a_whole_run_is_one_step_of_undo(desk: Desk) -> None:
+    desk.do(ask.Perturb(2.0, 0))
+    start = desk.joint()
+    desk.do(ask.Run())
+    desk.finish()
+    desk.do(ask.Undo())
+    assert desk.joint() == pytest.approx(start)
+
+
+@pytest.mark.parametrize(
+    "intent", [ask.SetJoint("PSM1", 0, 0.1), ask.MoveFrame(1), ask.SetSetting("iterations", 9), ask.ShowDomain("smoke")]
+)
+def test_a_run_stops_when_what_it_works_on_changes(desk: Desk, intent: ask.Intent) -> None:
+    desk.do(ask.Run())
+    desk.controller.advance()
+    state = desk.do(intent)
+    assert state.run.phase is Phase.IDLE
+    assert desk.controller.patience() is None
+
+
+def test_a_setting_out_of_range_is_kept_out_and_run_says_why(desk: Desk) -> None:
+    state = desk.do(ask.SetSetting("iterations", 0))
+    assert state.settings.iterations == 4 and "iterations" in (state.settings_error or "")
+    with pytest.raises(SettingsError, match="iterations is 0"):
+        desk.do(ask.Run())
+    assert desk.do(ask.SetSetting("iterations", 3)).settings_error is None
+    assert len(desk.do(ask.Run()) and desk.finish().run.curves.loss) == 4
+
+
+def test_a_locked_joint_does_not_move(desk: Desk) -> None:
+    name = desk.session.scene.arms[0].robot.joint_names[0]
+    desk.do(ask.Perturb(2.0, 0), ask.SetFreeJoint("PSM1", name, False))
+    before, other = desk.joint(0), desk.joint(1)
+    desk.do(ask.Run())
+    desk.finish()
+    assert desk.joint(0) == pytest.approx(before) and desk.joint(1) != pytest.approx(other)
+    assert desk.do(ask.SetFreeJoint("PSM1", name, True)).free == FreeParameters()
+
+
+def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk) -> None:
+    desk.do(ask.SetFreeGroup("extrinsics", True), ask.Run())
+    state = desk.finish()
+    calibrated = [camera.T_camera_world for camera in desk.session.scene.cameras]
+    left, right = state.pose.scene.T_camera_world.numpy()
+    assert np.abs(left - calibrated[0]).max() > 1e-5
+    assert np.allclose(right, calibrated[1], atol=1e-6)
+
+
+def test_a_run_with_all_cameras_has_a_map_for_each(desk: Desk) -> None:
+    desk.do(ask.SetCameras(True), ask.Run())
+    desk.controller.advance()
+    maps = desk.state.maps
+    assert maps is not None and maps.cameras == ("left", "right") and len(maps.iterate.attention) == 2
+
+
+@pytest.mark.parametrize("layer", [Layer.ATTENTION, Layer.SIMILARITY])
+def test_maps_are_there_without_a_run_when_they_are_looked_at(desk: Desk, layer: Layer) -> None:
+    desk.do(ask.ShowLayer(layer))
+    desk.controller.map()
+    state = desk.state
+    assert state.maps is not None
+    picture = desk.painter.overlay(state.pose.scene, state.frame, "left", layer, 1.0, state.maps)
+    assert picture[..., 3].all() and np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 1
+
+
+def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
+    desk.do(ask.Perturb(4.0, 3), ask.ShowCamera("right"), ask.ExportMask(7))
+    client, name, content = desk.delivered[0]
+    mask = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (client, name) == (7, "tiny_001_right.png")
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)
+
+
+def test_export_all_holds_every_mask_and_says_where_each_row_comes_from(desk: Desk, tmp_path: Path) -> None:
+    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.MoveFrame(1), ask.Run())
+    desk.finish()
+    desk.do(ask.ExportAll(3))
+    assert desk.state.export is not None and desk.state.export.total == 3
+    desk.finish()
+    assert desk.state.export is None
+    client, name, content = desk.delivered[0]
+    assert (client, name) == (3, "tiny.zip")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        masks = {f"masks/{camera}/00{number}.png" for camera in ("left", "right") for number in (1, 2, 3)}
+        assert set(archive.namelist()) == masks | {"kinematics.csv"}
+        archive.extract("kinematics.csv", tmp_path)
+        mask = cv2.imdecode(np.frombuffer(archive.read("masks/right/002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+    rows = read_kinematics_csv(tmp_path / "kinematics.csv", desk.session.scene)
+    assert [row.source for row in rows] == ["edited", "optimized", "measured"]
+    assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
+    assert rows[2].joint_positions["PSM1"] == pytest.approx(desk.session.sequence.measured["PSM1"][2], abs=1e-6)
+    assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)
+
+
+def test_an_export_can_be_cancelled(desk: Desk) -> None:
+    desk.do(ask.ExportAll(3))
+    desk.controller.advance()
+    desk.do(ask.CancelExport())
+    assert desk.state.export is None and desk.controller.patience() is None and not desk.delivered
+
+
+def test_playing_goes_round(desk: Desk) -> None:
+    desk.do(ask.ShowFrame(2), ask.SetSpeed(60.0), ask.Play(True))
+    desk.controller.advance()
+    assert desk.state.index == 0 and desk.state.playing
+    assert not desk.do(ask.Play()).playing
+
+
+def test_an_error_stops_everything_and_is_part_of_the_state(desk: Desk) -> None:
+    desk.do(ask.Run(), ask.Play(True), ask.ExportAll(1))
+    desk.controller.fail(CartsError("the disk is on fire"))
+    state = desk.state
+    assert state.error == "the disk is on fire" and not state.playing and state.export is None
+    assert state.run.phase is Phase.IDLE and desk.controller.patience() is None
+    assert desk.do(ask.DismissError()).error is None
