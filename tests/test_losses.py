@@ -1,0 +1,53 @@
+"""The losses' forms and what biases them."""
+
+import pytest
+import torch
+
+from carts_core.losses import attention, attentional_loss, cosine_similarity, smooth_l1
+
+
+def square(size: int, half: int) -> torch.Tensor:
+    image = torch.zeros(1, size, size)
+    image[:, size // 2 - half : size // 2 + half, size // 2 - half : size // 2 + half] = 1
+    return image
+
+
+def test_attention_dilates_by_its_radius() -> None:
+    point = torch.zeros(1, 21, 21)
+    point[0, 10, 10] = 1
+    assert attention(point, 3).sum() == 49
+
+
+def test_attention_has_no_gradient() -> None:
+    assert not attention(torch.rand(1, 8, 8, requires_grad=True), 2).requires_grad
+
+
+def test_equal_features_have_similarity_one_and_empty_ones_too() -> None:
+    features = torch.rand(1, 4, 5, 5)
+    features[..., 0] = 0
+    assert torch.allclose(cosine_similarity(features, features), torch.ones(1, 5, 5), atol=1e-4)
+
+
+def test_opposite_features_have_similarity_minus_one() -> None:
+    features = torch.rand(1, 4, 5, 5) + 0.1
+    assert torch.allclose(cosine_similarity(features, -features), -torch.ones(1, 5, 5), atol=1e-3)
+
+
+@pytest.mark.parametrize(("loss", "expected"), [("acs_paper", -1), ("acs_reference", 1), ("acs", 0)])
+def test_only_the_normalised_form_does_not_depend_on_the_silhouettes_size(loss: str, expected: int) -> None:
+    similarity = torch.full((1, 40, 40), 0.5)
+    small = attentional_loss(similarity, square(40, 5), loss)  # pyright: ignore[reportArgumentType]
+    large = attentional_loss(similarity, square(40, 10), loss)  # pyright: ignore[reportArgumentType]
+    assert float(torch.sign((large - small).round(decimals=6))) == expected
+
+
+def test_the_papers_form_is_the_papers_equation() -> None:
+    similarity, weight = torch.rand(1, 6, 7), torch.rand(1, 6, 7)
+    expected = 1 - (similarity * weight).sum() / (6 * 7)
+    assert torch.allclose(attentional_loss(similarity, weight, "acs_paper")[0], expected)
+
+
+def test_smooth_l1_is_zero_for_equal_predictions_only() -> None:
+    prediction = torch.rand(1, 4, 4)
+    assert float(smooth_l1(prediction, prediction)) == 0.0
+    assert float(smooth_l1(prediction, 1 - prediction)) > 0.0
