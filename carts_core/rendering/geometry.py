@@ -12,70 +12,68 @@ from ..scene import Scene, SceneState
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """All triangles of all arms. Links are numbered through all arms."""
+    """All triangles of all arms. Links are numbered through all arms, and vertices stand in the order of their links.
 
-    vertices: Float[Tensor, "V 3"]
+    Vectors are columns (`3 V`, not `V 3`), because products along a short last dimension are slow.
+    """
+
+    vertices: Float[Tensor, "3 V"]
     """In link frames [m]."""
-    vertex_links: Int[Tensor, " V"]
+    vertex_counts: tuple[int, ...]
+    """Number of vertices per link."""
     faces: Int[Tensor, "F 3"]
     face_links: Int[Tensor, " F"]
     face_arms: Int[Tensor, " F"]
-    face_colors: Float[Tensor, "F 3"]
-    face_planes: Float[Tensor, "F 4"]
-    """Unit plane normal n and offset d of each triangle in its link's frame: n . p = d."""
-    face_barycentric: Float[Tensor, "F 2 4"]
-    """Affine maps from a point on the triangle to its second and third barycentric coordinate."""
-    face_normals: Float[Tensor, "F 3 3"]
-    """Unit vertex normals of each triangle's corners, in its link's frame."""
+    face_colors: Float[Tensor, "3 F"]
+    face_barycentric: Float[Tensor, "8 F"]
+    """Affine maps from a point on the triangle to its second and third barycentric coordinate, one after the other."""
+    face_normals: Float[Tensor, "9 F"]
+    """Unit vertex normals of each triangle's corners, in its link's frame, one after the other."""
 
     @staticmethod
     def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
         """Gather the link meshes of a scene."""
-        vertices, normals, links, faces, face_links, arms, colors = [], [], [], [], [], [], []
+        vertices, normals, faces, face_links, arms, colors, counts = [], [], [], [], [], [], []
         first_link, first_vertex = 0, 0
         for arm_index, arm in enumerate(scene.arms):
-            for mesh in arm.robot.meshes:
-                count = len(mesh.faces)
+            counts += [0] * len(arm.robot.link_names)
+            for mesh in sorted(arm.robot.meshes, key=lambda mesh: mesh.link):
+                link, count = first_link + mesh.link, len(mesh.faces)
                 vertices.append(mesh.vertices)
                 normals.append(mesh.normals)
-                links.append(np.full(len(mesh.vertices), first_link + mesh.link))
+                counts[link] += len(mesh.vertices)
                 faces.append(mesh.faces + first_vertex)
-                face_links.append(np.full(count, first_link + mesh.link))
+                face_links.append(np.full(count, link))
                 arms.append(np.full(count, arm_index))
                 colors.append(np.broadcast_to(mesh.color, (count, 3)))
                 first_vertex += len(mesh.vertices)
             first_link += len(arm.robot.link_names)
         vertex, face = np.concatenate(vertices).astype(np.float64), np.concatenate(faces)
-        planes, barycentric = _triangle_maps(vertex[face])
 
-        def tensor(array, dtype=torch.float32) -> Tensor:
+        def tensor(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
 
         return SceneGeometry(
-            tensor(vertex),
-            tensor(np.concatenate(links), torch.int64),
+            tensor(vertex.T),
+            tuple(counts),
             tensor(face, torch.int32),
             tensor(np.concatenate(face_links), torch.int64),
             tensor(np.concatenate(arms), torch.int64),
-            tensor(np.concatenate(colors)),
-            tensor(planes),
-            tensor(barycentric),
-            tensor(np.concatenate(normals)[face]),
+            tensor(np.concatenate(colors).T),
+            tensor(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
+            tensor(np.concatenate(normals)[face].reshape(-1, 9).T),
         )
 
 
-def _triangle_maps(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Planes [F, 4] and barycentric maps [F, 2, 4] of triangles [F, 3, 3]."""
+def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
+    """Affine maps [F, 2, 4] from a point on a triangle [F, 3, 3] to two of its barycentric coordinates."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(ab, ac)
     squared = np.maximum((cross**2).sum(-1, keepdims=True), 1e-30)
-    normal = cross / np.sqrt(squared)
-    planes = np.concatenate([normal, (normal * a).sum(-1, keepdims=True)], -1)
-    # w_b grows along the direction in the plane that is normal to the opposite edge a-c, and likewise w_c.
-    gradient_b, gradient_c = np.cross(ac, cross) / squared, np.cross(cross, ab) / squared
-    maps = np.stack([gradient_b, gradient_c], 1)
+    # A coordinate grows along the direction in the plane that is normal to the edge opposite its corner.
+    maps = np.stack([np.cross(ac, cross) / squared, np.cross(cross, ab) / squared], 1)
     offsets = -np.einsum("fki,fi->fk", maps, a)
-    return planes, np.concatenate([maps, offsets[..., None]], -1)
+    return np.concatenate([maps, offsets[..., None]], -1)
 
 
 def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch cameras links 4 4"]:
@@ -88,3 +86,9 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
         dim=-3,
     )
     return state.T_camera_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
+
+
+def vertices_in_camera(geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "links 4 4"]) -> Float[Tensor, "3 V"]:
+    """All vertices in the frame of one camera [m]."""
+    parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
+    return torch.cat([T[:3, :3] @ part + T[:3, 3:] for T, part in zip(Ts_camera_link, parts, strict=True)], 1)

@@ -26,29 +26,30 @@ class _CarryMotion(torch.autograd.Function):
     def backward(ctx, *gradients: Tensor):
         (gradient,) = gradients
         image, pixels, inverse_depth = ctx.saved_tensors
-        moving = image.new_zeros(*inverse_depth.shape, 2)
-        for axis, dim in ((0, 2), (1, 1)):
-            length = image.shape[dim] - 1
-            first, second = _halves(image, dim, length)
-            gradient_first, gradient_second = _halves(gradient, dim, length)
-            share = -0.5 * ((second - first) * (gradient_first + gradient_second)).sum(-1)
-            z_first, z_second = _halves(inverse_depth, dim, length)
-            first_is_near = z_first >= z_second
-            moving.narrow(dim, 0, length)[..., axis] += share * first_is_near
-            moving.narrow(dim, 1, length)[..., axis] += share * ~first_is_near
-        return gradient, moving.view(-1, 2)[pixels], None, None
-
-
-def _halves(image: Tensor, dim: int, length: int) -> tuple[Tensor, Tensor]:
-    return image.narrow(dim, 0, length), image.narrow(dim, 1, length)
+        height, width = inverse_depth.shape[1:]
+        flat_image, flat_gradient = image.flatten(1), gradient.flatten(1)
+        nearness = inverse_depth.flatten()
+        here_image, here_gradient, here_near = flat_image[:, pixels], flat_gradient[:, pixels], nearness[pixels]
+        column, row = pixels % width, pixels // width % height
+        moving = image.new_zeros(2, len(pixels))
+        for axis, step, position, length in ((0, 1, column, width), (1, width, row, height)):
+            for sign in (1, -1):
+                exists = position < length - 1 if sign > 0 else position > 0
+                # A pixel at the image's border is its own neighbour, which adds nothing.
+                other = torch.where(exists, pixels + sign * step, pixels)
+                # Of two equally near points the first one carries the motion.
+                near = here_near >= nearness[other] if sign > 0 else here_near > nearness[other]
+                change = (flat_image[:, other] - here_image) * (flat_gradient[:, other] + here_gradient)
+                moving[axis] -= 0.5 * sign * change.sum(0) * near
+        return gradient, moving, None, None
 
 
 def carry_motion(
-    image: Float[Tensor, "views height width channels"],
-    positions: Float[Tensor, "K 2"],
+    image: Float[Tensor, "channels views height width"],
+    positions: Float[Tensor, "2 K"],
     pixels: Int[Tensor, " K"],
     inverse_depth: Float[Tensor, "views height width"],
-) -> Float[Tensor, "views height width channels"]:
+) -> Float[Tensor, "channels views height width"]:
     """The image, unchanged in value, moving with its visible points.
 
     Args:
@@ -57,4 +58,4 @@ def carry_motion(
         pixels: index of these pixels in the flattened `views x height x width`.
         inverse_depth: 1 / depth [1/m], 0 for background.
     """
-    return _CarryMotion.apply(image, positions, pixels, inverse_depth)
+    return _CarryMotion.apply(image, positions, pixels, inverse_depth)  # pyright: ignore[reportReturnType]

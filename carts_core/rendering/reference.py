@@ -17,7 +17,7 @@ def visibility_ref(
 ) -> tuple[Int[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Cast a ray through each pixel centre at each triangle (Möller and Trumbore) and keep the nearest hit.
 
-    Returns the same as `visibility_numba`. Depth is along the optical axis, and hits before the near plane do not count,
+    Returns the same as `visibility_numba`. Depth is along the optical axis. Hits before the near plane do not count,
     which is what clipping there means.
     """
     fx, fy, cx, cy = intrinsics

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..scene import Scene, SceneState
-from .geometry import SceneGeometry, link_transforms
+from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
-from .shading import phong, rotate, visible_points
-from .visibility_numba import visibility_numba
+from .shading import phong, visible_points
+from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch
 
 
@@ -24,14 +24,26 @@ class Rendering:
     """Linear RGB in [0, 1], black where no robot is (Î of the paper)."""
     silhouette: Float[Tensor, "*batch cameras height width"]
     """1 where a robot is, 0 elsewhere (Ŝ of the paper); its gradient is that of the boundary."""
-    arm_ids: Int[Tensor, "*batch cameras height width"]
-    """Index of the visible arm, -1 for background."""
-    depth: Float[Tensor, "*batch cameras height width"]
-    """Depth of the visible surface [m], 0 for background; without gradient."""
+    face_ids: Int[Tensor, "*batch cameras height width"]
+    """Index of the visible triangle in the scene's geometry, -1 for background."""
+    inverse_depth: Float[Tensor, "*batch cameras height width"]
+    """1 / depth of the visible surface [1/m], 0 for background; without gradient."""
+    face_arms: Int[Tensor, " F"]
+    """Arm of each triangle."""
+
+    @property
+    def arm_ids(self) -> Int[Tensor, "*batch cameras height width"]:
+        """Index of the visible arm, -1 for background."""
+        return torch.where(self.face_ids >= 0, self.face_arms[self.face_ids.long()], -1)
+
+    @property
+    def depth(self) -> Float[Tensor, "*batch cameras height width"]:
+        """Depth of the visible surface [m], 0 for background; without gradient."""
+        return torch.where(self.face_ids >= 0, 1.0 / self.inverse_depth, 0.0)
 
     def arm_masks(self, arms: int) -> Bool[Tensor, "*batch cameras {arms} height width"]:
         """The visible part of each arm."""
-        index = torch.arange(arms, device=self.arm_ids.device)[:, None, None]
+        index = torch.arange(arms, device=self.face_ids.device)[:, None, None]
         return self.arm_ids[..., None, :, :] == index
 
 
@@ -70,23 +82,25 @@ class Renderer:
         Ts, intrinsics = self._views(state)
         batch = Ts.shape[:-4]
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
-        face_ids, depth = self._visibility(views_T.detach(), views_K.detach())
-        points = visible_points(self.geometry, face_ids, views_T.detach(), views_K.detach())
-        T = views_T[points.view, self.geometry.face_links[points.face]]
-        point = rotate(T[:, :3, :3], points.point_link) + T[:, :3, 3]
-        normal = rotate(T[:, :3, :3], points.normal_link)
-        color = phong(self.geometry.face_colors[points.face], point, normal, self.scene.light)
-        values = torch.cat([color, torch.ones_like(color[:, :1])], -1)
-        dense = values.new_zeros(face_ids.numel(), 4).index_copy(0, points.pixel, values).view(*face_ids.shape, 4)
-        if torch.is_grad_enabled() and (T.requires_grad or views_K.requires_grad):
-            K = views_K[points.view]
-            position = K[:, :2] * point[:, :2] / point[:, 2:] + K[:, 2:]
-            inverse_depth = torch.where(face_ids >= 0, 1.0 / depth, 0.0)
+        face_ids, inverse_depth = self._visibility(views_T.detach(), views_K.detach())
+        points = visible_points(self.geometry, face_ids, inverse_depth, views_T.detach(), views_K.detach())
+        point, normal = points.transformed(views_T)
+        color = phong(self.geometry.face_colors[:, points.face], point, normal, self.scene.light)
+        values = torch.cat([color, torch.ones_like(color[:1])])
+        dense = values.new_zeros(4, face_ids.numel()).index_copy(1, points.pixel, values).view(4, *face_ids.shape)
+        if torch.is_grad_enabled() and (point.requires_grad or views_K.requires_grad):
+            K = points.intrinsics(views_K)
+            position = K[:2] * point[:2] / point[2:] + K[2:]
             dense = carry_motion(dense, position, points.pixel, inverse_depth)
         shape = (*batch, len(self._indices), self.height, self.width)
-        image = dense.view(*shape, 4).movedim(-1, -3)
-        arm_ids = torch.where(face_ids >= 0, self.geometry.face_arms[face_ids.long()], -1)
-        return Rendering(image[..., :3, :, :], image[..., 3, :, :], arm_ids.view(shape), depth.view(shape))
+        image = dense.movedim(0, 1).view(*shape[:-2], 4, *shape[-2:])
+        return Rendering(
+            image[..., :3, :, :],
+            image[..., 3, :, :],
+            face_ids.view(shape),
+            inverse_depth.view(shape),
+            self.geometry.face_arms,
+        )
 
     @torch.no_grad()
     def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
@@ -110,19 +124,16 @@ class Renderer:
 
     @torch.no_grad()
     def _visibility(self, views_T: Tensor, views_K: Tensor) -> tuple[Tensor, Tensor]:
-        """Visible triangle and depth [views, height, width]."""
-        geometry = self.geometry
+        """Visible triangle and inverse depth [views, height, width]."""
         ids, depths = [], []
         for T_camera_link, intrinsics in zip(views_T, views_K, strict=True):
-            T = T_camera_link[geometry.vertex_links]
-            vertices = rotate(T[:, :3, :3], geometry.vertices) + T[:, :3, 3]
+            vertices = vertices_in_camera(self.geometry, T_camera_link)
             if self.device.type == "cpu":
-                face_ids, depth = visibility_numba(
-                    vertices.numpy(), self._faces, tuple(intrinsics.tolist()), self.width, self.height
-                )
-                face_ids, depth = torch.from_numpy(face_ids), torch.from_numpy(depth)
+                seen = rasterize(vertices.T.numpy(), self._faces, intrinsics.tolist(), self.width, self.height)
+                face_ids, inverse_depth = (torch.from_numpy(array) for array in seen)
             else:
-                face_ids, depth = visibility_torch(vertices, geometry.faces, intrinsics, self.width, self.height)
+                face_ids, depth = visibility_torch(vertices.T, self.geometry.faces, intrinsics, self.width, self.height)
+                inverse_depth = torch.where(face_ids >= 0, 1.0 / depth, 0.0)
             ids.append(face_ids)
-            depths.append(depth)
+            depths.append(inverse_depth)
         return torch.stack(ids), torch.stack(depths)

@@ -2,6 +2,7 @@
 
 Points and normals are taken in the frame of their link, where they stand still; what the state moves is the link. So a
 point's shading has the gradient of its turning against light and camera, and its projection the gradient of its motion.
+Vectors are columns (`3 K`), and points stand in the order of their links, so that a link's points move by one product.
 """
 
 from dataclasses import dataclass
@@ -13,67 +14,90 @@ from torch import Tensor
 from ..scene import Light
 from .geometry import SceneGeometry
 
-_GRAZING = 1e-9
-
 
 @dataclass(frozen=True)
 class VisiblePoints:
     """What the visible pixels see. `K` counts visible pixels through all views. Nothing here carries a gradient."""
 
-    view: Int[Tensor, " K"]
-    """Index of the view (a camera of a hypothesis)."""
     pixel: Int[Tensor, " K"]
     """Index into the flattened `views x height x width`."""
     face: Int[Tensor, " K"]
-    point_link: Float[Tensor, "K 3"]
+    groups: tuple[tuple[int, int, int], ...]
+    """View, link and number of points of each run of points on the same link in the same view."""
+    point_link: Float[Tensor, "3 K"]
     """The surface point, in the frame of its link [m]."""
-    normal_link: Float[Tensor, "K 3"]
+    normal_link: Float[Tensor, "3 K"]
     """Interpolated normal there, in the frame of its link."""
 
+    def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
+        """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
+        counts = [count for _, _, count in self.groups]
+        points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
+        moved, turned = [], []
+        for (view, link, _), point, normal in zip(self.groups, points, normals, strict=True):
+            T = Ts_camera_link[view, link]
+            moved.append(T[:3, :3] @ point + T[:3, 3:])
+            turned.append(T[:3, :3] @ normal)
+        if not moved:
+            return self.point_link, self.normal_link
+        return torch.cat(moved, 1), torch.cat(turned, 1)
 
-def rotate(matrix: Float[Tensor, "K 3 3"], vector: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3"]:
-    """Rows of `matrix @ vector`."""
-    return (matrix * vector[:, None, :]).sum(-1)
-
-
-def rotate_back(matrix: Float[Tensor, "K 3 3"], vector: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3"]:
-    """Rows of `matrix^T @ vector`."""
-    return (matrix * vector[:, :, None]).sum(-2)
+    def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
+        """fx, fy, cx, cy of each point's view."""
+        if len(intrinsics) == 1:
+            return intrinsics[0][:, None]
+        views = [intrinsics[view][:, None].expand(-1, count) for view, _, count in self.groups]
+        return torch.cat(views, 1) if views else intrinsics.new_zeros(4, 0)
 
 
 @torch.no_grad()
 def visible_points(
     geometry: SceneGeometry,
     face_ids: Int[Tensor, "views height width"],
+    inverse_depth: Float[Tensor, "views height width"],
     Ts_camera_link: Float[Tensor, "views links 4 4"],
     intrinsics: Float[Tensor, "views 4"],
 ) -> VisiblePoints:
-    """Meet each visible pixel's ray with the plane of its triangle."""
-    view, y, x = (face_ids >= 0).nonzero(as_tuple=True)
-    face = face_ids[view, y, x].long()
-    T = Ts_camera_link[view, geometry.face_links[face]]
-    fx, fy, cx, cy = intrinsics[view].unbind(-1)
-    ray = torch.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, torch.ones_like(fx)], -1)
-    origin, direction = -rotate_back(T[:, :3, :3], T[:, :3, 3]), rotate_back(T[:, :3, :3], ray)
-    plane = geometry.face_planes[face]
-    towards = (plane[:, :3] * direction).sum(-1)
-    towards = torch.where(towards.abs() < _GRAZING, torch.full_like(towards, _GRAZING), towards)
-    depth = (plane[:, 3] - (plane[:, :3] * origin).sum(-1)) / towards
-    point = origin + depth[:, None] * direction
-    maps = geometry.face_barycentric[face]
-    # A ray that grazes its triangle may leave it by a rounding error.
-    weight = ((maps[..., :3] * point[:, None, :]).sum(-1) + maps[..., 3]).clamp(0.0, 1.0)
-    corners = geometry.face_normals[face]
-    normal = corners[:, 0] + weight[:, :1] * (corners[:, 1] - corners[:, 0])
-    normal = normal + weight[:, 1:] * (corners[:, 2] - corners[:, 0])
-    height, width = face_ids.shape[1:]
-    pixel = (view * height + y) * width + x
-    return VisiblePoints(view, pixel, face, point, torch.nn.functional.normalize(normal, dim=-1))
+    """The surface point and the normal that each visible pixel sees."""
+    views, height, width = face_ids.shape
+    links = Ts_camera_link.shape[1]
+    pixel = (face_ids.flatten() >= 0).nonzero()[:, 0]
+    face = face_ids.flatten()[pixel].long()
+    view = pixel // (height * width)
+    key = (view * links + geometry.face_links[face]).short()
+    key, order = key.sort(stable=True)
+    pixel, face = pixel[order], face[order]
+    counts = torch.bincount(key, minlength=views * links).tolist()
+    groups = tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
+    fx, fy, cx, cy = VisiblePoints(pixel, face, groups, pixel, pixel).intrinsics(intrinsics)
+    inside = pixel % (height * width)
+    depth = 1.0 / inverse_depth.flatten()[pixel]
+    x, y = ((inside % width) + 0.5 - cx) / fx, ((inside // width) + 0.5 - cy) / fy
+    points = torch.stack([x * depth, y * depth, depth])
+    point_link = torch.cat(
+        [
+            Ts_camera_link[view, link, :3, :3].T @ (part - Ts_camera_link[view, link, :3, 3:])
+            for (view, link, _), part in zip(groups, points.split([count for *_, count in groups], 1), strict=True)
+        ]
+        or [points],
+        1,
+    )
+    maps = geometry.face_barycentric[:, face].view(2, 4, -1)
+    # A pixel at the rim of its triangle may leave it by a rounding error.
+    weight = ((maps[:, :3] * point_link).sum(1) + maps[:, 3]).clamp(0.0, 1.0)
+    a, b, c = geometry.face_normals[:, face].view(3, 3, -1)
+    normal = a + weight[0] * (b - a) + weight[1] * (c - a)
+    return VisiblePoints(pixel, face, groups, point_link, unit(normal))
+
+
+def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
+    """Columns scaled to length 1."""
+    return vectors * vectors.square().sum(0).clamp(min=1e-24).rsqrt()
 
 
 def phong(
-    color: Float[Tensor, "K 3"], points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"], light: Light
-) -> Float[Tensor, "K 3"]:
+    color: Float[Tensor, "3 K"], points: Float[Tensor, "3 K"], normals: Float[Tensor, "3 K"], light: Light
+) -> Float[Tensor, "3 K"]:
     """Phong shading with one point light, two-sided.
 
     Args:
@@ -85,12 +109,14 @@ def phong(
     Returns:
         Linear RGB in [0, 1].
     """
-    to_light = torch.nn.functional.normalize(points.new_tensor(light.position) - points, dim=-1)
-    to_camera = torch.nn.functional.normalize(-points, dim=-1)
-    facing = (normals * to_camera).sum(-1, keepdim=True)
-    normals = torch.where(facing < 0, -normals, normals)
-    cosine = (normals * to_light).sum(-1, keepdim=True)
-    reflected = 2.0 * cosine * normals - to_light
-    highlight = (reflected * to_camera).sum(-1, keepdim=True).clamp(min=1e-4) ** light.shininess
-    lit = color * (light.ambient + light.diffuse * cosine.clamp(min=0.0))
-    return (lit + light.specular * highlight * (cosine > 0)).clamp(max=1.0)
+    to_light = unit(points.new_tensor(light.position)[:, None] - points)
+    to_camera = -unit(points)
+    towards_camera = (normals * to_camera).sum(0)
+    # A surface that is seen from behind is lit from behind.
+    side = torch.where(towards_camera.detach() < 0, -1.0, 1.0)
+    cosine = (normals * to_light).sum(0) * side
+    # The mirrored direction of the light is 2 (n . l) n - l; only its cosine to the camera is needed.
+    mirrored = 2.0 * cosine * towards_camera * side - (to_light * to_camera).sum(0)
+    highlight = light.specular * mirrored.clamp(min=1e-4) ** light.shininess * (cosine > 0)
+    lit = light.ambient + light.diffuse * cosine.clamp(min=0.0)
+    return (color * lit + highlight).clamp(max=1.0)

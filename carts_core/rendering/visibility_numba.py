@@ -1,5 +1,7 @@
 """Which triangle does this pixel see? The compiled kernel for the CPU."""
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 from jaxtyping import Float, Int
@@ -79,14 +81,14 @@ def _rasterize(vertices, faces, fx, fy, cx, cy, face_ids, inverse_depth):
             _fill_triangle(face, u, v, inverse_z, 0, 2, 3, face_ids, inverse_depth)
 
 
-def visibility_numba(
+def rasterize(
     vertices_camera: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    intrinsics: tuple[float, float, float, float],
+    intrinsics: Sequence[float],
     width: int,
     height: int,
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The nearest triangle at every pixel centre, and its depth.
+    """The nearest triangle at every pixel centre, and the inverse of its depth.
 
     Args:
         vertices_camera: in the camera's frame [m].
@@ -95,21 +97,25 @@ def visibility_numba(
         width, height: size of the image [px].
 
     Returns:
-        `face_ids` (int32, `BACKGROUND` where nothing is seen) and `depth` (float32, [m], 0 where nothing is seen).
+        `face_ids` (int32, `BACKGROUND` where nothing is seen) and `inverse_depth` (float32, [1/m], 0 there).
     """
     face_ids = np.full((height, width), BACKGROUND, np.int32)
-    inverse_depth = np.zeros((height, width))
+    inverse_depth = np.zeros((height, width), np.float32)
+    vertices = np.ascontiguousarray(vertices_camera, np.float64)
     fx, fy, cx, cy = (float(value) for value in intrinsics)
-    _rasterize(
-        np.ascontiguousarray(vertices_camera, np.float64),
-        np.ascontiguousarray(faces, np.int32),
-        fx,
-        fy,
-        cx,
-        cy,
-        face_ids,
-        inverse_depth,
-    )
-    with np.errstate(divide="ignore"):
-        depth = np.where(face_ids >= 0, 1.0 / inverse_depth, 0.0)
-    return face_ids, depth.astype(np.float32)
+    _rasterize(vertices, np.ascontiguousarray(faces, np.int32), fx, fy, cx, cy, face_ids, inverse_depth)
+    return face_ids, inverse_depth
+
+
+def visibility_numba(
+    vertices_camera: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    intrinsics: Sequence[float],
+    width: int,
+    height: int,
+) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """The nearest triangle at every pixel centre, and its depth [m], 0 where nothing is seen; see `rasterize`."""
+    face_ids, inverse_depth = rasterize(vertices_camera, faces, intrinsics, width, height)
+    depth = np.zeros_like(inverse_depth)
+    np.divide(1.0, inverse_depth, out=depth, where=face_ids >= 0)
+    return face_ids, depth
