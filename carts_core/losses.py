@@ -34,7 +34,10 @@ def cosine_similarity(
 
 
 def attentional_loss(
-    similarity: Float[Tensor, "*batch h w"], weight: Float[Tensor, "*batch h w"], loss: Loss
+    similarity: Float[Tensor, "*batch h w"],
+    weight: Float[Tensor, "*batch h w"],
+    loss: Loss,
+    pixels: int | None = None,
 ) -> Float[Tensor, "*batch"]:
     """ACS loss of the paper (its equation for L) in one of its forms, per image.
 
@@ -42,11 +45,13 @@ def attentional_loss(
         similarity: of features, at most 1; for `l1` the negated difference of predictions.
         weight: attention map, in [0, 1].
         loss: which form.
+        pixels: w x h of the whole image, where the maps are a window of it that holds all attention.
     """
+    pixels = pixels or similarity.shape[-2] * similarity.shape[-1]
     if loss == "acs_paper":
-        return 1.0 - (similarity * weight).mean((-2, -1))
+        return 1.0 - (similarity * weight).sum((-2, -1)) / pixels
     if loss == "acs_reference":
-        return ((1.0 - similarity) * weight).mean((-2, -1))
+        return ((1.0 - similarity) * weight).sum((-2, -1)) / pixels
     area = weight.sum((-2, -1)).clamp(min=1.0)
     return ((1.0 - similarity) * weight).sum((-2, -1)) / area
 

@@ -17,6 +17,10 @@ from ..rendering import Renderer, Rendering
 from ..scene import Scene
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
+from .window import Window
+
+_SURROUNDINGS = 16
+"""What the network sees beyond the attention [px of the working image]."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class Evaluation:
     prior: float
     rendering: Rendering
     similarity: Float[Tensor, "cameras h w"]
+    """1 outside the window that was compared."""
     attention: Float[Tensor, "cameras h w"]
 
 
@@ -62,10 +67,10 @@ class FrameObjective:
         self._extractor = extractor
         width, height = working_size(scene, settings.working_width, extractor.stride)
         self.renderer = Renderer(scene, width=width, height=height, device=extractor.device)
-        observed = self._stack(scene, images, "image")
-        self.background = self._stack(scene, backgrounds, "background")
-        with torch.no_grad():
-            self._observed = self._represent(observed)
+        self._images = self._stack(scene, images, "image")
+        self._background = self._stack(scene, backgrounds, "background")
+        self._window: Window | None = None
+        self._observed = self._images
 
     def _stack(self, scene: Scene, images: Mapping[str, np.ndarray], what: str) -> Float[Tensor, "cameras 3 h w"]:
         resized = []
@@ -96,23 +101,50 @@ class FrameObjective:
             offsets: unknowns, with or without gradient.
             wide: descend in the wide attention (coarse) and not in the final one (fine).
         """
+        settings = self.settings
         rendering = self.renderer(self.parameters.state(offsets))
-        image = hybrid(rendering.image, rendering.silhouette, self.background)
-        represented = self._represent(image)
-        fine = attention(rendering.silhouette, self.settings.attention_radius)
-        if self.settings.loss == "l1":
+        window = self._look_at(rendering.silhouette.detach(), wide)
+        silhouette = window.of(rendering.silhouette)
+        represented = self._represent(hybrid(window.of(rendering.image), silhouette, window.of(self._background)))
+        fine = attention(silhouette, settings.attention_radius)
+        if settings.loss == "l1":
             similarity = 1.0 - (represented - self._observed).abs()
             value = smooth_l1(self._observed, represented).mean()
             loss, used = value, fine
         else:
+            pixels = self.renderer.width * self.renderer.height
             similarity = cosine_similarity(self._observed, represented)
-            used = attention(rendering.silhouette, self.settings.wide_attention_radius) if wide else fine
-            value = attentional_loss(similarity, used, self.settings.loss).mean()
-            loss = attentional_loss(similarity.detach(), fine, self.settings.loss).mean() if wide else value
-        prior = self.settings.prior_weight * offsets.square().sum()
+            used = attention(silhouette, settings.wide_attention_radius) if wide else fine
+            value = attentional_loss(similarity, used, settings.loss, pixels).mean()
+            loss = attentional_loss(similarity.detach(), fine, settings.loss, pixels).mean() if wide else value
+        prior = settings.prior_weight * offsets.square().sum()
         return Evaluation(
-            value + prior, float(loss.detach()), float(prior.detach()), rendering, similarity.detach(), used
+            value + prior,
+            float(loss.detach()),
+            float(prior.detach()),
+            rendering,
+            window.paste(similarity.detach(), torch.ones_like(rendering.silhouette)),
+            window.paste(used, torch.zeros_like(rendering.silhouette)),
         )
+
+    def _look_at(self, silhouette: Float[Tensor, "cameras h w"], wide: bool) -> Window:
+        """The window that is compared: all that the attention covers, with some surroundings for the network.
+
+        It stays where it is as long as it holds the attention, so that observed features are computed once.
+        """
+        size = (self.renderer.width, self.renderer.height)
+        if self.settings.loss == "l1":
+            wanted = tight = Window(0, 0, *size)
+        else:
+            radius = self.settings.wide_attention_radius if wide else self.settings.attention_radius
+            tight = Window.around(silhouette, radius, 1, size)
+            wanted = Window.around(silhouette, radius + _SURROUNDINGS, self._extractor.stride, size)
+        outgrown = self._window is not None and self._window.area > 1.5 * wanted.area
+        if self._window is None or outgrown or not self._window.holds(tight):
+            self._window = wanted
+            with torch.no_grad():
+                self._observed = self._represent(wanted.of(self._images))
+        return self._window
 
 
 def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:
