@@ -15,6 +15,8 @@ from ..errors import SettingsError
 CONTRAST_FLOOR = 0.02
 """Standard deviation [1] below which an image counts as empty and is not amplified any further."""
 
+_SMOOTHINGS = 2
+
 
 @dataclass(frozen=True)
 class Architecture:
@@ -26,6 +28,8 @@ class Architecture:
     """3x3 convolutions per level on the way down. Full resolution costs most, so it has one."""
     decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
     """3x3 convolutions per level on the way up, from full resolution down."""
+    local_mean: bool = True
+    """Take the local mean off an image first, and not that of the whole image: a smooth veil then changes less."""
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
@@ -54,17 +58,22 @@ class Architecture:
         """Read what `to_json` wrote.
 
         Raises:
-            ValueError, TypeError: the text is not an architecture.
+            ValueError, TypeError, KeyError, AttributeError: the text is not an architecture.
             SettingsError: it is one that cannot exist.
         """
-        return Architecture(**{name: tuple(int(n) for n in counts) for name, counts in json.loads(text).items()})
+        values = json.loads(text)
+        local_mean = bool(values.pop("local_mean"))
+        return Architecture(
+            **{name: tuple(int(n) for n in counts) for name, counts in values.items()}, local_mean=local_mean
+        )
 
 
 class FeatureNetwork(nn.Module):
     """U-Net of convolution, batch norm and ReLU; skips are added, not concatenated, which halves the last level's cost.
 
-    Images are standardised first (per channel the mean, over all channels the deviation), so that exposure and a
-    uniform haze change nothing before the first convolution.
+    Images are standardised first: their local mean is taken off and what is left gets unit deviation. Exposure, colour
+    casts and anything that smoothly veils the image then change little before the first convolution, without the
+    network ever having been shown such a thing.
     """
 
     def __init__(self, architecture: Architecture | None = None) -> None:
@@ -89,7 +98,7 @@ class FeatureNetwork(nn.Module):
             SettingsError: another number of channels, or a size that is no such multiple.
         """
         self._check(images)
-        x = standardize(images)
+        x = standardize(images, self.architecture.stride if self.architecture.local_mean else None)
         skips: list[Tensor] = []
         for level, encode in enumerate(self.encoder):
             x = encode(functional.max_pool2d(x, 2) if level else x)
@@ -134,11 +143,22 @@ def channels_last(network: FeatureNetwork) -> FeatureNetwork:
     return network
 
 
-def standardize(images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
-    """Each image with zero mean per channel and unit deviation over all channels."""
-    centred = images - images.mean(dim=(2, 3), keepdim=True)
-    variance = centred.square().mean(dim=(1, 2, 3), keepdim=True)
-    return centred * torch.rsqrt(variance + CONTRAST_FLOOR**2)
+def standardize(images: Float[Tensor, "batch 3 h w"], block: int | None) -> Float[Tensor, "batch 3 h w"]:
+    """Images without their mean per channel, each with unit deviation over all pixels and channels.
+
+    Args:
+        images: RGB in [0, 1]; h and w are multiples of `block`.
+        block: the mean is a local one, smooth over about four blocks [px]; None takes that of the whole image.
+    """
+    if block is None:
+        detail = images - images.mean(dim=(2, 3), keepdim=True)
+    else:
+        mean = functional.avg_pool2d(images, block)
+        for _ in range(_SMOOTHINGS):
+            mean = functional.avg_pool2d(mean, 3, stride=1, padding=1, count_include_pad=False)
+        detail = images - functional.interpolate(mean, scale_factor=block, mode="bilinear", align_corners=False)
+    variance = detail.square().mean(dim=(1, 2, 3), keepdim=True)
+    return detail * torch.rsqrt(variance + CONTRAST_FLOOR**2)
 
 
 def _block(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:

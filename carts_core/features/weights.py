@@ -52,6 +52,7 @@ def save_weights(network: FeatureNetwork, path: Path, training: dict, working_si
     }
     partial = path.with_name(path.name + ".part")
     save_file({name: value.contiguous() for name, value in network.state_dict().items()}, partial, metadata)
+    partial.chmod(0o644)  # safetensors keeps its files to their owner, which a shipped file must not be
     partial.replace(path)
 
 

@@ -29,19 +29,33 @@ def test_folding_batch_norms_changes_nothing_but_the_speed(small_network: Featur
     torch.testing.assert_close(folded.features(images), small_network.features(images), atol=1e-5, rtol=1e-4)
 
 
-def test_exposure_and_a_uniform_veil_do_not_reach_the_first_convolution():
+@pytest.mark.parametrize("block", [None, 4])
+def test_exposure_and_a_uniform_veil_do_not_reach_the_first_convolution(block: int | None):
     image = torch.rand(1, 3, 16, 16)
     veiled = 0.5 * image + torch.tensor([0.3, 0.2, 0.1])[None, :, None, None]
-    torch.testing.assert_close(standardize(veiled), standardize(image), atol=2e-2, rtol=2e-2)
+    torch.testing.assert_close(standardize(veiled, block), standardize(image, block), atol=2e-2, rtol=2e-2)
+
+
+def test_a_slope_of_brightness_disappears_with_the_local_mean_only():
+    texture = torch.rand(1, 3, 64, 64)
+    sloping = 0.5 * texture + torch.linspace(0, 0.5, 64)
+    middle = (..., slice(16, 48), slice(16, 48))
+
+    def change(block: int | None) -> float:
+        return float((standardize(sloping, block) - standardize(texture, block))[middle].abs().mean())
+
+    assert change(4) < 0.1 * change(None)
 
 
 def test_an_empty_image_is_not_amplified_to_noise():
     flat = torch.full((1, 3, 16, 16), 0.4) + 1e-4 * torch.randn(1, 3, 16, 16)
-    assert standardize(flat).abs().max() < 0.05
+    assert standardize(flat, 4).abs().max() < 0.05
 
 
 def test_an_architecture_survives_json():
-    architecture = Architecture(widths=(8, 16), encoder_convolutions=(1, 2), decoder_convolutions=(3,))
+    architecture = Architecture(
+        widths=(8, 16), encoder_convolutions=(1, 2), decoder_convolutions=(3,), local_mean=False
+    )
     assert Architecture.from_json(architecture.to_json()) == architecture
 
 

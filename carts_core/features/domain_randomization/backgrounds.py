@@ -84,11 +84,40 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
     image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
     for _ in range(rng.integers(0, 8)):
         image = _vessel(rng, image)
-    if rng.random() < 0.6:  # wet spots mirror the light
+    if rng.random() < 0.5:
+        image = _wet_relief(rng, image)
+    elif rng.random() < 0.5:  # wet spots mirror the light
         wet = smooth_noise(rng, width, height, rng.uniform(15, 45), 2) + 0.5 * relief
         spots = np.clip((wet - rng.uniform(2.0, 3.0)) * 2, 0, 1)[..., None]
         image = image + spots * (rng.uniform(0.7, 1.0) - image)
     return image
+
+
+def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Folds lit by a lamp at the lens, with the white highlights of a wet surface, small and large."""
+    height, width = image.shape[:2]
+    relief = smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(14))), int(rng.integers(1, 4)))
+    if rng.random() < 0.4:  # creases
+        relief = -np.abs(relief)
+    steepness = rng.uniform(4, 14)
+    slope_x, slope_y = (
+        cv2.Sobel(relief, cv2.CV_32F, 1, 0) * steepness / 8,
+        cv2.Sobel(relief, cv2.CV_32F, 0, 1) * steepness / 8,
+    )
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    focal = rng.uniform(0.8, 1.6) * width
+    tilt_x, tilt_y = (x - rng.uniform(0.2, 0.8) * width) / focal, (y - rng.uniform(0.2, 0.8) * height) / focal
+    # The lamp is at the lens, so a point shines where its normal meets the view ray.
+    facing = (1 + slope_x * tilt_x + slope_y * tilt_y) / np.sqrt(
+        (1 + slope_x**2 + slope_y**2) * (1 + tilt_x**2 + tilt_y**2)
+    )
+    facing = np.clip(facing, 0, 1)
+    shininess = np.exp(rng.uniform(np.log(15), np.log(300)))
+    highlight = rng.uniform(0, 1.3) * facing**shininess
+    if rng.random() < 0.5:  # glisten
+        highlight = highlight * np.clip(1 + smooth_noise(rng, width, height, width / rng.uniform(3, 10), 1), 0, 3)
+    shade = 1 + rng.uniform(0.2, 0.8) * (facing - facing.mean())
+    return image * shade[..., None] + highlight[..., None]
 
 
 def _vessel(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:

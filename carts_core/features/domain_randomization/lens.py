@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from .backgrounds import smooth_noise
 from .ranges import AppearanceRanges
 
 Image = Float[np.ndarray, "h w 3"]
@@ -39,7 +40,14 @@ def tone(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Im
 def _vignette(rng: np.random.Generator, width: int, height: int, ranges: AppearanceRanges) -> np.ndarray:
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x, y = x / width - 0.5, y / height - 0.5
-    return 1 - rng.uniform(*ranges.vignette) * np.clip((x * x + y * y) * 2, 0, 1)[..., None]
+    light = 1 - rng.uniform(*ranges.vignette) * np.clip((x * x + y * y) * 2, 0, 1)
+    if rng.random() < 0.6:
+        light = light * np.exp(
+            rng.uniform(0, ranges.unevenness) * smooth_noise(rng, width, height, rng.uniform(2, 5), 1)
+        )
+        # Light that is uneven is not low light: the image as a whole stays as bright as it was.
+        light = light / light.mean()
+    return np.clip(light, 0.35, 1.6)[..., None]
 
 
 def _noise(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:

@@ -34,9 +34,15 @@ class AppearanceRanges:
     """Quality of the JPEG artefacts, 100 is best."""
     vignette: Range = (0.0, 0.45)
     """Darkening in the image corners [1]."""
+    unevenness: float = 0.4
+    """Largest deviation of the logarithm of the light over the image [1]; its mean is left as it is."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.unevenness <= 1:
+            raise SettingsError(f"unevenness is {self.unevenness}; give a value from 0 to 1.")
         for name in self.__dataclass_fields__:
+            if name == "unevenness":
+                continue
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise SettingsError(f"{name} is ({low}, {high}); give two values with 0 <= lower <= upper.")

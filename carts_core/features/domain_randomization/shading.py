@@ -176,7 +176,7 @@ def _random_shaft(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
 def _random_metal(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
     if rng.random() < 0.85:
         grey = rng.uniform(0.12, 0.75)
-        return grey * np.clip(rng.normal(1, 0.06, 3), 0.6, 1.4), rng.uniform(0.15, 0.7), rng.uniform(0.4, 1.0)
+        return grey * np.clip(rng.normal(1, 0.06, 3), 0.6, 1.4), rng.uniform(0.08, 0.65), rng.uniform(0.5, 1.0)
     return rng.uniform(0.01, 0.7, 3), rng.uniform(0.2, 0.9), rng.uniform(0, 0.5)
 
 
