@@ -163,8 +163,8 @@ class ViewerApp:
             domain=domain,
             camera=camera,
             pose=pose,
-            layer=Layer.SHADED,
-            opacity=0.6,
+            layer=Layer.MASK,
+            opacity=0.5,
             settings=OptimizerSettings(),
             free=FreeParameters(),
         )

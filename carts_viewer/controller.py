@@ -25,7 +25,7 @@ LARGEST_PERTURBATION = 30.0
 DRAG_PAUSE = 0.8
 """A slider that rests longer than this begins a new step of undo [s]."""
 _REASONS = {
-    "iterations": "All iterations done",
+    "iterations": "Done, best iterate kept",
     "not optimized": "Evaluated only, as the solver says",
     "converged": "Converged",
     "cancelled": "Cancelled",

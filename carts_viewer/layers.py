@@ -101,7 +101,8 @@ def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[
 def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:
     """RGBA of background (index 0) and of each arm (its index + 1), and the number of arms seen."""
     count = int(arm_ids.max(initial=-1)) + 1
-    rows = [(0, 0, 0, 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]
+    # The browser interpolates colour and opacity apart, so a black background would leave a dark seam.
+    rows = [(*ARM_COLORS[0], 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]
     return np.array(rows, np.uint8), count
 
 

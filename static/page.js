@@ -95,7 +95,7 @@
     const root = mutable.nodeRefFromName[""];
     const place = (x, y, z) => mutable.camera.position.clone().set(x, y, z)
       .multiplyScalar(image.depth).applyMatrix4(root.matrixWorld);
-    const [from, to] = [place(3.2, -2.6, -2.2), place(0, 0, 2.2)];
+    const [from, to] = [place(4.4, -2.6, -1.6), place(0, 0.2, 2.6)];
     mutable.cameraControl.setLookAt(from.x, from.y, from.z, to.x, to.y, to.z, true);
     refresh();
   }

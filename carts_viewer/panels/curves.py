@@ -8,6 +8,8 @@ from carts_viewer.state import Curves, ViewState
 
 _TEAL, _BLUE, _ORANGE = "#2dd4a7", "#60a5fa", "#fb923c"
 _HEIGHT = 118
+_WHOLE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+_TICKS = uplot.Axis_Ticks(size=4, width=1)
 _TITLE = '<p class="carts-curve"><span style="color: {}">■</span> {} {}</p>'
 
 
@@ -24,13 +26,15 @@ class CurvesPanel:
         if curves is self._shown:
             return
         self._shown = curves
+        # The best iterate is the one of the lowest loss, whatever the other curves say: that is what is kept.
+        best = int(np.argmin(curves.loss)) if curves.loss else 0
         values = (
             curves.loss,
             tuple(score.dice for score in curves.scores),
             tuple(score.joint_degrees for score in curves.scores),
         )
         for chart, series in zip(self._charts, values, strict=True):
-            chart.show(series)
+            chart.show(series, best)
 
 
 _QUANTITIES = (("Loss", _TEAL), ("Dice", _BLUE), ("Joint error [°]", _ORANGE))
@@ -45,7 +49,7 @@ class _Chart:
             (empty, empty),
             (uplot.Series(label="iteration"), uplot.Series(label=name, stroke=color, width=2)),
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
-            axes=(uplot.Axis(size=26), uplot.Axis(size=48)),
+            axes=(uplot.Axis(size=26, incrs=_WHOLE, ticks=_TICKS), uplot.Axis(size=48, space=24, ticks=_TICKS)),
             legend=uplot.Legend(show=False),
             cursor=uplot.Cursor(show=False),
             height=_HEIGHT,
@@ -53,11 +57,17 @@ class _Chart:
             visible=False,
         )
 
-    def show(self, series: tuple[float | None, ...]) -> None:
+    def show(self, series: tuple[float | None, ...], best: int) -> None:
         known = [value for value in series if value is not None]
         self._title.visible = self._plot.visible = bool(known)
         if not known:
             return
-        self._title.content = _TITLE.format(self._color, self._name, f"<b>{known[-1]:.4g}</b>")
+        self._title.content = _TITLE.format(self._color, self._name, self._newest_and_best(series, best))
         values = np.array([np.nan if value is None else value for value in series], float)
         self._plot.data = (np.arange(len(values), dtype=float), values)
+
+    @staticmethod
+    def _newest_and_best(series: tuple[float | None, ...], best: int) -> str:
+        newest, kept = series[-1], series[best]
+        text = "" if newest is None else f"<b>{newest:.4g}</b>"
+        return text if kept is None else f"{text} · <b>{kept:.4g}</b> at the best, iteration {best}"

@@ -57,7 +57,7 @@ class HelpPanel:
 
     def __init__(self, page: Page, layers: list[Layer], perturb: Callable[[], ask.Intent], emit: Emit) -> None:
         gui = page.server.gui
-        table = ["| Key | |", "|---|---|"]
+        table = ["| Key | What it does |", "|---|---|"]
         for shortcut, make in shortcuts(layers, perturb):
             command = gui.add_command(shortcut.label, hotkey=shortcut.hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             table.append(f"| **{shortcut.key}** | {shortcut.label} |")

@@ -45,10 +45,10 @@ class JointsPanel:
         window = gui.add_dropdown("Slider range", list(_WINDOWS), initial_value="± 20")
         self._degrees = gui.add_number("Perturb by °/mm", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
-        perturb = gui.add_button("Perturb all joints", icon=viser.Icon.ARROWS_SHUFFLE)
-        measured = gui.add_button("Back to measured", icon=viser.Icon.HISTORY)
-        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP)
-        page.row(measured, self._undo, weights=(3, 2))
+        perturb = gui.add_button("Perturb all joints", color="gray")
+        self._undo = gui.add_button("Undo", color="gray")
+        page.row(perturb, self._undo, weights=(5, 3))
+        measured = gui.add_button("Back to measured", icon=viser.Icon.HISTORY, color="gray")
         on_click(perturb, lambda _: self.perturb(), emit)
         on_click(measured, lambda _: ask.BackToMeasured(), emit)
         on_click(self._undo, lambda _: ask.Undo(), emit)
@@ -97,9 +97,9 @@ class JointsPanel:
             )
             self._sliders[arm, joint] = (limits, slider)
             on_input(slider, self._intent(arm, joint, limits), emit)
-        reset = gui.add_button(f"{arm} back to measured", icon=viser.Icon.HISTORY)
-        page.row(reset)
-        on_click(reset, lambda _: ask.BackToMeasured(arm), emit)
+        if len(self._session.scene.arms) > 1:
+            reset = gui.add_button(f"{arm} back to measured", icon=viser.Icon.HISTORY, color="gray")
+            on_click(reset, lambda _: ask.BackToMeasured(arm), emit)
 
     def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], ask.Intent]:
         return lambda shown: ask.SetJoint(arm, joint, from_shown(limits, shown))

@@ -26,7 +26,7 @@ class OptimizePanel:
     def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
         gui = page.server.gui
         self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY, color="teal")
-        self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, disabled=True)
+        self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, color="gray", disabled=True)
         page.row(self._run, self._pause)
         self._step = gui.add_button("Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, color="gray")
         self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import math
+import re
 import textwrap
 from dataclasses import fields
 from functools import cache
@@ -94,7 +95,11 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 def _widget(gui: Any, name: str, value: Any, hints: dict[str, str]) -> Any:
     choices = get_args(get_type_hints(OptimizerSettings)[name])
-    label, hint = humanized(name), hints.get(name)
+    hint = hints.get(name)
+    unit = re.search(r"\[([^\]]*)\]", hint or "")
+    # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
+    short = unit.group(1).split()[0] if unit else "1"
+    label = humanized(name) if short == "1" else f"{humanized(name)} [{short}]"
     if choices:
         return gui.add_dropdown(label, list(choices), initial_value=value, hint=hint)
     if isinstance(value, bool):

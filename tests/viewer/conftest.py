@@ -32,11 +32,13 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[Callable[..., ViewerApp]]:
-    """Opens the viewer of a tiny sequence; arguments are those of `tiny_sequence`."""
+    """Opens the viewer of a tiny sequence; arguments are those of `tiny_sequence`, and
+    `prepare`, which gets the sequence's folder before it is opened."""
     with ExitStack() as stack:
 
-        def make(**options) -> ViewerApp:
+        def make(prepare: Callable[[Path], None] = lambda folder: None, **options) -> ViewerApp:
             path = tiny_sequence(**options)
+            prepare(path.parent)
             app = stack.enter_context(ViewerApp.open(path, port=0, weights=untrained_weights))
             app.wait_until_shown(60)
             return app

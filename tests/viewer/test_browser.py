@@ -1,0 +1,268 @@
+"""The whole thing, as a person uses it: in headless Chromium, with real pixels."""
+
+import io
+import math
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from viewer_canvas import Canvas, eventually, mark_frames
+
+from carts_viewer import intents as ask
+from carts_viewer.app import ViewerApp
+from carts_viewer.picture import Painter
+from carts_viewer.state import Phase
+
+pytestmark = pytest.mark.browser
+
+WINDOW = (1280, 800)
+
+
+@dataclass
+class Tab:
+    """One tab of the viewer."""
+
+    app: ViewerApp
+    page: Page
+    canvas: Canvas
+
+    def button(self, name: str) -> None:
+        # Controls of one panel share a sender that keeps the newest message of 50 ms, so a hasty click could be lost.
+        self.page.wait_for_timeout(80)
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def type_value(self, handle: object, value: float) -> None:
+        """Type into the number field beside a slider, as a person does."""
+        field = self.page.locator(f"[id='{self.app.page.element_id(handle)}'] + * input")
+        field.click()
+        field.press("Control+a")
+        field.press_sequentially(f"{value:g}", delay=60)
+        field.press("Tab")
+
+
+@pytest.fixture
+def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
+    """Opens a tab of a viewer, in a window of any size, when the first picture is there."""
+    with ExitStack() as stack:
+
+        def make(app: ViewerApp, window: tuple[int, int] = WINDOW) -> Tab:
+            context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
+            stack.callback(context.close)
+            page = context.new_page()
+            page.goto(app.url)
+            page.wait_for_function("window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+            # viser warns that this browser has no graphics card, on top of our tool bar.
+            page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
+            return Tab(app, page, Canvas(app, page))
+
+        yield make
+
+
+@pytest.fixture
+def open_marked(open_viewer: Callable[..., ViewerApp]) -> Callable[..., ViewerApp]:
+    """Opens a viewer whose frames carry discs, through an uneven lens off the centre, with a solid mask on top."""
+
+    def uneven(text: str) -> str:
+        return re.sub(r"K = .*", "K = [[390.0, 0.0, 130.0], [0.0, 372.0, 128.0], [0.0, 0.0, 1.0]]", text)
+
+    def make() -> ViewerApp:
+        app = open_viewer(width=320, height=240, edit=uneven, masks=False, prepare=mark_frames)
+        app.mailbox.put(ask.SetOpacity(1.0))
+        app.wait_until_shown()
+        return app
+
+    return make
+
+
+@pytest.mark.parametrize("window", [(1280, 800), (1000, 950), (1700, 620)])
+def test_the_overlay_lies_on_the_frame_at_any_window_shape(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
+) -> None:
+    tab = open_tab(open_marked(), window)
+    assert tab.canvas.eventually_registered() <= 1.5
+
+
+def test_a_window_that_changes_its_shape_keeps_the_overlay_in_place(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_marked())
+    tab.page.set_viewport_size({"width": 1100, "height": 900})
+    assert tab.canvas.eventually_registered() <= 1.5
+
+
+def test_zooming_with_the_wheel_and_dragging_keep_the_overlay_in_place(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_marked())
+    before = tab.canvas.where()
+    tab.page.mouse.move(640, 400)
+    tab.page.mouse.wheel(0, -400)
+    after = tab.canvas.where(lambda map_: map_[0, 0] > 1.7 * before[0, 0])
+    # What was under the pointer stays there.
+    box = tab.page.locator("canvas").first.bounding_box()
+    assert box is not None
+    pointer = np.array([640 - box["x"], 400 - box["y"]])
+    image = np.linalg.solve(before[:, :2], pointer - before[:, 2])
+    assert after @ [*image, 1.0] == pytest.approx(pointer, abs=2.0)
+    tab.page.mouse.down()
+    tab.page.mouse.move(670, 415)
+    tab.page.mouse.up()
+    dragged = tab.canvas.where(lambda map_: abs(map_[0, 2] - after[0, 2]) > 25)
+    assert dragged[:, 2] - after[:, 2] == pytest.approx([30, 15], abs=2.0)
+    assert tab.canvas.eventually_registered() <= 1.5
+
+
+def test_the_3d_view_turns_and_the_endoscope_view_comes_back_exactly(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_marked())
+    tab.canvas.eventually_registered()
+    straight = tab.canvas.look()
+    tab.button("3D view")
+    eventually(tab.canvas.look, lambda look: np.abs(look.astype(int) - straight).mean() > 5)
+    tab.page.mouse.move(640, 400)
+    tab.page.mouse.down()
+    tab.page.mouse.move(740, 440, steps=5)
+    tab.page.mouse.up()
+    tab.button("Endoscope view")
+    assert tab.canvas.eventually_registered() <= 1.5
+    # Looking through the endoscope, a drag must not turn the view any more.
+    tab.page.mouse.move(640, 400)
+    tab.page.mouse.down()
+    tab.page.mouse.move(740, 440, steps=5)
+    tab.page.mouse.up()
+    assert tab.canvas.eventually_registered() <= 1.5
+
+
+def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_marked()
+    tab = open_tab(app)
+    tab.canvas.eventually_registered()
+    before = tab.canvas.look()
+    slider = app.joints.slider("PSM1", 0)
+    value = round(slider.value + 4.0, 2)
+    tab.type_value(slider, value)
+    eventually(
+        lambda: float(app.state.pose.scene.joint_positions[0][0]), lambda at: abs(at - math.radians(value)) < 1e-4
+    )
+    assert tab.canvas.eventually_registered() <= 1.5
+    assert np.abs(tab.canvas.look().astype(int) - before).max() > 100
+
+
+def test_run_lets_the_loss_fall_and_the_overlay_follow(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(width=160, height=120)
+    for name, value in (
+        ("iterations", 8),
+        ("working_width", 96),
+        ("attention_radius", 4),
+        ("wide_attention_radius", 8),
+    ):
+        app.mailbox.put(ask.SetSetting(name, value))
+    tab = open_tab(app)
+    tab.button("Perturb all joints")
+    eventually(lambda: app.state.undoable, lambda count: count == 1)
+    start = app.stage.sent("/overlay")
+    tab.button("Run")
+    eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and len(run.curves.loss) == 9, timeout=90)
+    loss = app.state.run.curves.loss
+    assert min(loss[1:]) < loss[0]
+    expect(tab.page.get_by_text("Done, best iterate kept")).to_be_visible()
+    expect(tab.page.get_by_text(f"iteration {int(np.argmin(loss))}").first).to_be_visible()
+    app.wait_until_shown()
+    assert app.stage.sent("/overlay") != start
+    charts = tab.page.evaluate(
+        "Object.values(window.__viserTestpoints.uplots).map(entry => Array.from(entry.chart.data[1]))"
+    )
+    assert any(np.allclose(chart, loss) for chart in charts)
+
+
+def test_exports_arrive_as_downloads_and_hold_what_is_shown(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    tab = open_tab(app)
+    tab.button("Perturb all joints")
+    eventually(lambda: app.state.undoable, lambda count: count == 1)
+    tab.page.get_by_text("Export", exact=True).click()
+    with tab.page.expect_download() as started:
+        tab.button("Export mask")
+    mask = cv2.imread(str(started.value.path()), cv2.IMREAD_UNCHANGED)
+    shown = Painter(app.sequence).arm_ids(app.state.pose.scene, "left") >= 0
+    assert started.value.suggested_filename == "tiny_001_left.png"
+    assert np.array_equal(mask > 0, shown)
+    with tab.page.expect_download() as started:
+        tab.button("Export all")
+    with zipfile.ZipFile(io.BytesIO(Path(started.value.path()).read_bytes())) as archive:
+        again = cv2.imdecode(np.frombuffer(archive.read("masks/left/001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+        table = archive.read("kinematics.csv").decode().splitlines()
+    assert np.array_equal(again, mask)
+    assert [line.split(",")[1] for line in table] == ["source", "edited", "measured", "measured"]
+
+
+def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    tab = open_tab(app)
+    (app.sequence.path.parent / "regular" / "left" / "003.png").unlink()
+    tab.type_value(app.page.find("Frame"), 3)
+    message = tab.page.locator(".carts-error[role=alert]")
+    expect(message).to_contain_text("003.png", timeout=20_000)
+    tab.button("Dismiss")
+    expect(message).to_be_hidden()
+    tab.type_value(app.page.find("Frame"), 2)
+    eventually(lambda: app.state.index, lambda index: index == 1)
+
+
+def test_two_tabs_show_the_same(open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
+    app = open_marked()
+    first, second = open_tab(app), open_tab(app, (1000, 900))
+    slider = app.joints.slider("PSM1", 1)
+    value = round(slider.value - 3.0, 2)
+    first.type_value(slider, value)
+    field = second.page.locator(f"[id='{app.page.element_id(slider)}'] + * input")
+    expect(field).to_have_value(f"{value:g}", timeout=20_000)
+    assert first.canvas.eventually_registered() <= 1.5
+    assert second.canvas.eventually_registered() <= 1.5
+
+
+def test_keys_do_what_the_help_says(open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
+    app = open_viewer(masks=False)
+    tab = open_tab(app)
+    tab.page.get_by_text("Help", exact=True).click()
+    expect(tab.page.get_by_text("Next frame")).to_be_visible()
+    for key, check in (
+        ("n", lambda: app.state.index == 1),
+        ("b", lambda: app.state.index == 0),
+        ("p", lambda: app.state.undoable == 1),
+        ("Control+z", lambda: app.state.undoable == 0),
+        ("3", lambda: app.state.layer == "Contour"),
+        ("t", lambda: len(app.state.run.curves.loss) == 2),
+        ("v", lambda: not tab.page.evaluate("carts.view.endoscope")),
+        ("v", lambda: tab.page.evaluate("carts.view.endoscope")),
+    ):
+        tab.page.keyboard.press(key)
+        eventually(check, bool)
+
+
+def test_the_page_asks_no_other_host_for_anything(open_viewer: Callable[..., ViewerApp], browser: Browser) -> None:
+    app = open_viewer()
+    context = browser.new_context()
+    asked: list[str] = []
+    page = context.new_page()
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(app.url)
+    page.wait_for_function("window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+    context.close()
+    assert asked and all(url.startswith((app.url, "data:", "blob:")) for url in asked)
