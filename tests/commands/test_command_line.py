@@ -1,0 +1,133 @@
+"""The `carts` command on small sequences, as a user types it."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+
+from carts_core.cli import BAD_INPUT, main
+from carts_core.commands.selection import parse_frames
+from carts_core.errors import SettingsError
+
+SCORE_KEYS = {
+    *("frame", "camera", "domain", "dice_before", "dice_after", "joint_mae_deg_before", "joint_mae_deg_after"),
+    *("iterations", "seconds", "stopped"),
+}
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> str:
+    return str(tiny_sequence(frames=3, domains=("regular", "smoke"), width=160, height=128))
+
+
+def test_evaluate_writes_scores_of_every_frame_and_their_means(sequence: str, tmp_path: Path) -> None:
+    file = tmp_path / "scores" / "out.json"
+    main(["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--iterations", "2"])
+    scores = json.loads(file.read_text())
+    assert [(s["frame"], s["domain"]) for s in scores["frames"]] == [
+        ("001", "regular"),
+        ("003", "regular"),
+        ("001", "smoke"),
+        ("003", "smoke"),
+    ]
+    assert all(set(score) == SCORE_KEYS for score in [*scores["frames"], scores["mean"]])
+    first = scores["frames"][0]
+    assert first["camera"] == "left" and first["iterations"] == 2 and first["stopped"] == "iterations"
+    assert first["joint_mae_deg_before"] == pytest.approx(0.573, abs=0.001)
+    assert 0.5 < first["dice_before"] < 1 and 0.5 < first["dice_after"] <= 1
+    assert scores["mean"]["iterations"] == 2 and scores["mean"]["frame"] is None
+
+
+def test_evaluate_without_truth_gives_null(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    path, file = tiny_sequence(frames=1, masks=False, truth=False, width=160, height=128), tmp_path / "out.json"
+    main(["evaluate", str(path), "--json", str(file), "--iterations", "1"])
+    (score,) = json.loads(file.read_text())["frames"]
+    assert score["dice_before"] is None and score["joint_mae_deg_after"] is None
+
+
+def test_a_perturbed_start_is_that_far_off_the_truth(sequence: str, tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    main(["evaluate", sequence, "--json", str(file), "--perturb-deg", "2", "--solver", "none", "--frames", "0"])
+    assert json.loads(file.read_text())["frames"][0]["joint_mae_deg_before"] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_optimize_writes_masks_and_kinematics_and_resumes(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--iterations", "2"]
+    main([*command, "--frames", "0-1"])
+    folder = tmp_path / "out" / "regular" / "left"
+    first = (folder / "masks" / "001.png").stat().st_mtime_ns
+    main(command)
+    assert "2 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert (folder / "masks" / "001.png").stat().st_mtime_ns == first
+    with (folder / "kinematics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == ["001", "002", "003"]
+    assert "PSM1.wrist_yaw" in rows[0] and rows[0]["source"] == "optimized"
+    mask = cv2.imread(str(folder / "masks" / "003.png"), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None and mask.shape == (128, 160) and set(mask.flatten().tolist()) == {0, 255}
+    assert not list(folder.rglob("*.part"))
+
+
+def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0"]
+    main([*command, "--iterations", "1"])
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--iterations", "2"])
+    assert stop.value.code == BAD_INPUT
+    assert "--overwrite" in capsys.readouterr().err
+    main([*command, "--iterations", "2", "--overwrite"])
+
+
+@pytest.mark.parametrize("style", ["overlay", "image", "mask"])
+def test_render_writes_a_picture_per_frame(sequence: str, tmp_path: Path, style: str) -> None:
+    main(["render", sequence, "--style", style, "--output", str(tmp_path / "out")])
+    pictures = sorted((tmp_path / "out" / "regular" / "left").glob("*.png"))
+    assert [picture.name for picture in pictures] == ["001.png", "002.png", "003.png"]
+    image = cv2.imread(str(pictures[0]))
+    assert image is not None and image.shape == (128, 160, 3) and image.std() > 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate", "nowhere.toml"], "nowhere.toml"),
+        (["evaluate", "SEQUENCE", "--domain", "fog"], "domain 'fog' is not in"),
+        (["evaluate", "SEQUENCE", "--camera", "third"], "no camera is called 'third'. The cameras are: left"),
+        (["evaluate", "SEQUENCE", "--arms", "PSM9"], "no arm is called 'PSM9'"),
+        (["evaluate", "SEQUENCE", "--frames", "7"], "frame 7 is outside"),
+        (["evaluate", "SEQUENCE", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
+    ],
+)
+def test_bad_input_ends_with_a_message_and_status_2(
+    arguments: list[str], message: str, sequence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([sequence if argument == "SEQUENCE" else argument for argument in arguments])
+    assert stop.value.code == BAD_INPUT
+    assert message in capsys.readouterr().err
+
+
+def test_a_device_that_does_not_exist_is_named(sequence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", sequence, "--device", "abacus"])
+    assert stop.value.code == BAD_INPUT
+    assert "'abacus' does not exist on this machine. Available: cpu" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("all", [0, 1, 2, 3, 4]), ("2", [2]), ("0-2,4", [0, 1, 2, 4]), ("::2", [0, 2, 4]), ("3:", [3, 4])],
+)
+def test_frames_are_numbers_ranges_and_slices(text: str, expected: list[int]) -> None:
+    assert parse_frames(text, 5) == expected
+
+
+@pytest.mark.parametrize("text", ["", "a", "5", "1-9", "-1", "3-2"])
+def test_frames_that_mean_nothing_are_refused(text: str) -> None:
+    with pytest.raises(SettingsError, match="--frames"):
+        parse_frames(text, 5)

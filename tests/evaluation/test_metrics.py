@@ -1,0 +1,48 @@
+"""Dice and joint errors."""
+
+import numpy as np
+import pytest
+from conftest import tiny_scene
+
+from carts_core.evaluation import dice, joint_mae_deg
+from carts_core.perturbation import perturb
+from carts_core.robot import Robot
+
+
+def test_dice_of_equal_disjoint_and_half_overlapping_masks() -> None:
+    a, b = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    assert dice(a, b) == 1.0
+    a[:2], b[2:] = True, True
+    assert dice(a, a) == 1.0 and dice(a, b) == 0.0
+    b[:] = False
+    b[1:3] = True
+    assert dice(a, b) == 0.5
+
+
+def test_the_joint_error_counts_measured_revolute_joints_in_degrees(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
+    truth = {"PSM1": np.zeros(7)}
+    estimate = {"PSM1": np.deg2rad([1.0, -3.0, 500.0, 0.0, 0.0, 0.0, 70.0])}
+    assert joint_mae_deg(tiny.scene, estimate, truth, {"PSM1": ("yaw", "pitch", "insertion")}) == pytest.approx(2.0)
+    assert joint_mae_deg(tiny.scene, estimate, {}, {"PSM1": ("yaw",)}) is None
+
+
+def test_a_perturbation_moves_every_joint_by_its_size_and_the_seed_fixes_it(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
+    start = {"PSM1": tiny.truth[0] + 0.05}
+    moved = perturb(tiny.scene, start, 2.0, seed=3)["PSM1"] - start["PSM1"]
+    expected = np.where([kind == "prismatic" for kind in shipped_psm.joint_types], 2e-3, np.deg2rad(2.0))
+    assert np.allclose(np.abs(moved), expected)
+    assert np.array_equal(perturb(tiny.scene, start, 2.0, seed=3)["PSM1"], moved + start["PSM1"])
+    assert any(
+        not np.array_equal(perturb(tiny.scene, start, 2.0, seed=s)["PSM1"], moved + start["PSM1"]) for s in range(4)
+    )
+
+
+def test_a_perturbation_keeps_to_the_limits_and_the_chosen_joints(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
+    start = {"PSM1": shipped_psm.joint_limits[:, 1].numpy().copy()}
+    moved = perturb(tiny.scene, start, 5.0, seed=0)["PSM1"]
+    assert (moved <= start["PSM1"]).all()
+    only = perturb(tiny.scene, {"PSM1": tiny.truth[0]}, 5.0, 0, {"PSM1": ("yaw",)})["PSM1"] != tiny.truth[0]
+    assert only.tolist() == [True, False, False, False, False, False, False]

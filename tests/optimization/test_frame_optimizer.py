@@ -1,0 +1,137 @@
+"""The steppable optimizer on a small rendered sequence, with the shipped weights."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.data import Frame, Sequence
+from carts_core.errors import SettingsError
+from carts_core.evaluation import dice
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.rendering import Renderer
+
+SHORT = OptimizerSettings(iterations=6)
+
+
+@pytest.fixture(scope="module")
+def extractor() -> FeatureExtractor:
+    return FeatureExtractor.load()
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), width=320, height=240))
+
+
+def optimizer_of(sequence: Sequence, extractor: FeatureExtractor, **options) -> FrameOptimizer:
+    frame = options.pop("frame", None) or sequence.frame(0)
+    backgrounds = {camera.name: sequence.background(camera.name) for camera in sequence.scene.cameras}
+    return FrameOptimizer(sequence.scene, frame, backgrounds, extractor, **{"settings": SHORT, **options})
+
+
+def test_the_first_iterate_is_the_start_and_the_last_one_says_why_it_stopped(
+    sequence: Sequence, extractor: FeatureExtractor
+) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"])
+    iterates = list(optimizer)
+    assert [iterate.index for iterate in iterates] == list(range(7))
+    measured = sequence.frame(0).measured["PSM1"]
+    assert np.allclose(iterates[0].joint_positions()["PSM1"], measured, atol=1e-6)
+    assert not np.allclose(iterates[-1].joint_positions()["PSM1"], measured, atol=1e-4)
+    assert optimizer.stop_reason == "iterations"
+    assert optimizer.step() is None
+
+
+def test_loss_falls_and_dice_rises(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings(iterations=20))
+    first, *_ = list(optimizer)
+    assert optimizer.best is not None
+    assert optimizer.best.loss < first.loss
+    mask = (sequence.frame(0).masks or {})["left"]
+    renderer = Renderer(sequence.scene, cameras=["left"])
+    before, after = (dice(renderer.segment(iterate.state)[0] >= 0, mask) for iterate in (first, optimizer.best))
+    assert after > before
+
+
+def test_the_best_iterate_is_a_copy_that_later_steps_leave_alone(
+    sequence: Sequence, extractor: FeatureExtractor
+) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"])
+    first = optimizer.step()
+    assert first is not None
+    before = first.state.joint_positions[0].clone()
+    list(optimizer)
+    assert np.array_equal(first.state.joint_positions[0].numpy(), before.numpy())
+
+
+def test_two_cameras_share_one_objective(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    iterate = optimizer_of(sequence, extractor).step()
+    assert iterate is not None
+    assert iterate.silhouette.shape == (2, 240, 320)
+    assert iterate.image.shape == (2, 240, 320, 3)
+    assert iterate.attention.shape == iterate.similarity.shape == (2, 240, 320)
+    assert iterate.similarity.max() <= 1.0 + 1e-5
+
+
+def test_reset_goes_back_to_the_start(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"])
+    losses = [iterate.loss for iterate in optimizer]
+    optimizer.reset()
+    assert optimizer.history == [] and optimizer.best is None and optimizer.stop_reason is None
+    assert [iterate.loss for iterate in optimizer] == pytest.approx(losses, abs=1e-4)
+
+
+def test_cancel_keeps_what_was_reached(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"])
+    optimizer.step()
+    optimizer.cancel()
+    assert optimizer.step() is None
+    assert optimizer.stop_reason == "cancelled" and optimizer.best is not None and len(optimizer.history) == 1
+
+
+def test_no_optimization_evaluates_the_start_only(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings(solver="none"))
+    assert len(list(optimizer)) == 1
+    assert optimizer.stop_reason == "not optimized"
+
+
+@pytest.mark.parametrize("loss", ["acs", "acs_paper", "acs_reference", "l1"])
+@pytest.mark.parametrize("solver", ["adam", "gradient_descent"])
+def test_every_loss_and_solver_lowers_its_loss(
+    sequence: Sequence, extractor: FeatureExtractor, loss: str, solver: str
+) -> None:
+    settings = OptimizerSettings(loss=loss, solver=solver, iterations=8, learning_rate=2e-3)  # pyright: ignore
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
+    first, *_ = list(optimizer)
+    assert optimizer.best is not None and optimizer.best.loss < first.loss
+
+
+def test_only_what_is_free_moves(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    free = FreeParameters(joints=False, extrinsics=True)
+    *_, last = list(optimizer_of(sequence, extractor, cameras=["left"], free=free))
+    start = sequence.scene.with_cameras(["left"]).state(sequence.frame(0).measured)
+    assert np.array_equal(last.state.joint_positions[0].numpy(), start.joint_positions[0].numpy())
+    assert not np.allclose(last.state.T_camera_world.numpy(), start.T_camera_world.numpy(), atol=1e-5)
+
+
+def test_a_tolerance_stops_early(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    settings = OptimizerSettings(iterations=200, tolerance=0.9, patience=3)
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
+    assert len(list(optimizer)) == 4
+    assert optimizer.stop_reason == "converged"
+
+
+def test_an_image_of_another_size_is_named(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    frame: Frame = replace(sequence.frame(0), images={"left": np.zeros((10, 10, 3), np.uint8)})
+    with pytest.raises(SettingsError, match=r"image of camera 'left' has shape \(10, 10, 3\), .*\(240, 320, 3\)"):
+        optimizer_of(sequence, extractor, frame=frame, cameras=["left"])
+
+
+def test_a_missing_image_is_named(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    frame = sequence.frame(0, cameras=["left"])
+    with pytest.raises(SettingsError, match="no image of camera 'right' was given; given are: left"):
+        optimizer_of(sequence, extractor, frame=frame)
