@@ -8,5 +8,6 @@ from .config import MotionConfig as MotionConfig
 from .config import RenderConfig as RenderConfig
 from .config import SensorConfig as SensorConfig
 from .config import SynthesisConfig as SynthesisConfig
+from .progress import progress_bar as progress_bar
 from .synthesize import Progress as Progress
 from .synthesize import synthesize as synthesize

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from .config import DomainConfig
 from .noise import smooth_noise, smoothstep
 from .path_tracer import Surface
-from .tissue import EXTENT, TEXTURE, Tissue, sample
+from .tissue import EXTENT, Tissue, sample
 
 _ABSORPTION = np.array([620.0, 4200.0, 4600.0])
 """Absorption of blood for red, green and blue light [1/m]."""
@@ -33,22 +33,22 @@ class Bleeding:
     """
 
     def __init__(self, tissue: Tissue, config: DomainConfig, rng: np.random.Generator) -> None:
-        scale = TEXTURE // 2 / EXTENT
-        shape = (TEXTURE // 2, TEXTURE // 2)
+        shape = (len(tissue.albedo) // 2,) * 2
+        scale = shape[0] / EXTENT
         heights = cv2.resize(tissue.heights, shape, interpolation=cv2.INTER_LINEAR)
         hollow = cv2.GaussianBlur(heights, (0, 0), 0.012 * scale) - heights
         level = smooth_noise(shape, 0.055 * scale, rng, octaves=4, gain=0.45) + 0.7 * hollow / hollow.std()
-        shore = float(np.quantile(level, 1.0 - config.blood_coverage)) if config.blood_coverage > 0 else np.inf
+        shore = _level_of(level, config.blood_coverage)
         pools = smoothstep(level, shore, shore + 0.8) + 0.10 * smoothstep(level, shore - 0.10, shore + 0.05)
         splashes = smooth_noise(shape, 0.006 * scale, rng, octaves=2)
         near = smoothstep(level, shore - 1.0, shore)
         drops = smoothstep(splashes - 2.1 + 0.9 * near, 0.0, 0.35) * (config.blood_coverage > 0)
-        self._depth = (_POOL_DEPTH * np.maximum(pools, 0.45 * drops)).astype(np.float32)
+        film = 0.04 * smoothstep(level, shore - 3.0, shore)
+        self._depth = (_POOL_DEPTH * np.maximum(np.maximum(pools, 0.45 * drops), film)).astype(np.float32)
         waves = smooth_noise(shape, 0.010 * scale, rng, octaves=2)
-        self._waves = np.stack(np.gradient(waves)[::-1], axis=-1).astype(np.float32)
+        self._waves = np.stack([np.gradient(waves, axis=axis) for axis in (1, 0)], axis=-1).astype(np.float32)
         self._tools = smooth_noise((_GRID,) * 3, _GRID / 2.5, rng, octaves=4, gain=0.6)
-        share = config.blood_on_tools
-        self._tool_level = float(np.quantile(self._tools, 1.0 - share)) if share > 0 else np.inf
+        self._tool_level = _level_of(self._tools, config.blood_on_tools)
 
     def stain(
         self,
@@ -95,7 +95,7 @@ class Bleeding:
         glint = 0.025 * (lobe + 2.0) / (8.0 * np.pi) * aligned**lobe * lamp / distance**2 * pooled
         return (base * through + own + glint[..., None]).astype(np.float32)
 
-    def _film(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def _film(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         pattern = map_coordinates(self._tools, (points * (_GRID / _GRID_SIZE)).T, order=1, mode="grid-wrap")
         above = pattern - self._tool_level
         return _FILM_DEPTH * (0.25 * smoothstep(above, -0.05, 0.10) + smoothstep(above, 0.0, 1.0))
@@ -107,3 +107,8 @@ class Bleeding:
         soft = cv2.GaussianBlur(surface.normal.astype(np.float32), (0, 0), surface.normal.shape[1] / 60)
         normal = np.where((surface.link < 0)[..., None], soft + waves, surface.normal)
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+
+
+def _level_of(field: np.ndarray, share: float) -> float:
+    """The level above which a share of the field lies; far above all of it when that share is none."""
+    return float(np.quantile(field, 1.0 - share)) if share > 0 else float(field.max()) + 10.0

@@ -71,6 +71,10 @@ class MotionConfig:
         _require(self, "frame_rate", 0.1, 240)
         _require(self, "control_interval", 0.1, 60)
         _require(self, "wrist_range", 0.0, 1.0)
+        if not all(0.0 <= half <= 0.1 for half in self.reach):
+            raise SettingsError(f"MotionConfig.reach is {self.reach}; each value must lie between 0 and 0.1.")
+        if not 0.0 <= self.jaw_range[0] <= self.jaw_range[1] <= 1.3:
+            raise SettingsError(f"MotionConfig.jaw_range is {self.jaw_range}; give 0 <= smallest <= largest <= 1.3.")
         _require(self, "clearance", 0.0, 0.02)
 
 
@@ -100,16 +104,20 @@ class MeasurementError:
 class RenderConfig:
     """Path tracing."""
 
-    samples: int = 16
+    samples: int = 8
     """Paths per pixel; noise falls with the square root."""
     bounces: int = 3
     """Longest path, counted in segments; 2 has no light between tissue and metal."""
     robot_faces: int = 40_000
     """Triangles per robot, more than the optimizer's renderer uses."""
-    tissue_resolution: int = 420
+    tissue_resolution: int = 520
     """Grid points of the tissue's height field along each side."""
 
+    texture_resolution: int = 1536
+    """Texels of the tissue's colour along each side."""
+
     def __post_init__(self) -> None:
+        _require(self, "texture_resolution", 64, 8192)
         _require(self, "samples", 1, 4096)
         _require(self, "bounces", 2, 16)
         _require(self, "robot_faces", 500, 1_000_000)
@@ -128,11 +136,11 @@ class SensorConfig:
     """Standard deviation of the lens blur for an image 640 px wide [px]."""
     shutter: float = 1 / 80
     """Exposure time, for motion blur [s]."""
-    full_well: float = 2200.0
+    full_well: float = 6000.0
     """Electrons at white: shot noise is sqrt(signal x full_well) electrons."""
-    read_noise: float = 7.0
+    read_noise: float = 12.0
     """Standard deviation of the read noise [electrons]."""
-    sharpening: float = 0.35
+    sharpening: float = 0.2
     """Gain of the edge enhancement that endoscope processors apply."""
     jpeg_quality: int = 85
     """Quality of the JPEG files."""
@@ -160,7 +168,7 @@ class DomainConfig:
     """Part of the instruments' surface with a film or drops of blood."""
     smoke_density: float = 8.0
     """Mean extinction of the smoke [1/m]; at 8 and 0.1 m of depth, 55 % of the light is lost."""
-    smoke_wavelength: float = 0.05
+    smoke_wavelength: float = 0.042
     """Size of the largest eddies [m]."""
     smoke_speed: float = 0.02
     """Speed with which the smoke drifts [m/s]."""
@@ -205,6 +213,7 @@ class SynthesisConfig:
     """Strengths of the conditions."""
 
     def __post_init__(self) -> None:
+        _require(self, "seed", 0, 2**32 - 1)
         unknown = [name for name in self.domains if name not in DOMAINS]
         if unknown or not self.domains:
             raise SettingsError(

@@ -9,7 +9,7 @@ from .config import MeasurementError
 
 def measure(
     truth: Float[np.ndarray, "frames dofs"],
-    times: Float[np.ndarray, "frames"],
+    times: Float[np.ndarray, " frames"],
     error: MeasurementError,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frames dofs"]:

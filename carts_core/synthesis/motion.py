@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..camera import Camera
 from ..errors import SettingsError
@@ -16,6 +16,8 @@ from .config import SynthesisConfig
 from .layout import WORK_POINTS
 from .tissue import Tissue
 
+WRIST_LENGTH = 0.0193
+"""From the wrist's first axis to the point between the jaws' tips [m]: 9.1 + 10.2 mm of the classic PSM."""
 _ATTEMPTS = 400
 _LIMIT_MARGIN = 0.05
 """Part of each joint's range kept free at both ends."""
@@ -51,7 +53,7 @@ def plan_motion(
     )
 
 
-def sample_times(config: SynthesisConfig) -> Float[np.ndarray, "frames"]:
+def sample_times(config: SynthesisConfig) -> Float[np.ndarray, " frames"]:
     """Time of each frame [s]."""
     return np.arange(config.motion.frames) / config.motion.frame_rate
 
@@ -102,24 +104,21 @@ def _draw(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generat
     return reach_tip(arm, config.tip_link, targets, joints)
 
 
-def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     """Roll, wrist pitch and wrist yaw for which the jaws point inwards and down: the best of many random ones."""
     joints = np.zeros((600, 7))
     joints[:, 2] = 0.14
     joints[:, 3] = rng.uniform(-1.8, 1.8, len(joints))
     joints[:, 4:6] = rng.uniform(-0.75, 0.75, (len(joints), 2))
-    samples = torch.from_numpy(joints)
-    closer = samples.clone()
-    # The direction of the jaws, without knowing the URDF's frames: it is what insertion has to undo when the last
-    # two joints turn the tip away, so it is read off as the tip's distance to the wrist's centre of rotation.
-    tips = _tips(arm.robot, config.tip_link, samples).numpy()
-    closer[:, 4:6] = 0.0
-    wrist = _tips(arm.robot, config.tip_link, closer).numpy()
-    shaft = wrist / np.linalg.norm(wrist, axis=-1, keepdims=True)
-    direction = (tips - (wrist - 0.0193 * shaft)) @ arm.T_world_base[:3, :3].T
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    straight = joints.copy()
+    straight[:, 4:6] = 0.0
+    tips, straight_tips = (_tips(arm.robot, config.tip_link, torch.from_numpy(q)).numpy() for q in (joints, straight))
+    # With a straight wrist the tip lies on the shaft's axis, which passes the remote centre at the base's origin.
+    shaft = straight_tips / np.linalg.norm(straight_tips, axis=-1, keepdims=True)
+    jaws = (tips - (straight_tips - WRIST_LENGTH * shaft)) @ arm.T_world_base[:3, :3].T
+    jaws /= np.linalg.norm(jaws, axis=-1, keepdims=True)
     wanted = _INWARDS[number] + rng.normal(0.0, 0.25, 3)
-    return joints[np.argmax(direction @ wanted), 3:6]
+    return joints[np.argmax(jaws @ wanted), 3:6]
 
 
 def _objection(
@@ -150,7 +149,7 @@ def _objection(
             for tissue in tissues:
                 if (points[:, 2] - tissue.height(points[:, 0], points[:, 1])).min() < config.motion.clearance:
                     return "an instrument touches the tissue"
-        if cKDTree(inside[0]).query(inside[1])[0].min() < config.motion.clearance:
+        if KDTree(inside[0]).query(inside[1])[0].min() < config.motion.clearance:
             return "the instruments touch"
     return None
 

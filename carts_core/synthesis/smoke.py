@@ -10,9 +10,9 @@ from .noise import smooth_noise
 
 _GRID = 96
 _STEPS = 18
-_CONTRAST = 0.75
+_CONTRAST = 0.95
 """Standard deviation of the logarithm of the density."""
-_BACKSCATTER = 0.017
+_BACKSCATTER = 0.024
 """Share of the extinguished light that comes back to the lens, per steradian, several scatterings included [1/sr]."""
 _LAMP_SIZE = 0.060
 """Light scattered on the way hides the inverse square law nearer than this [m]."""
@@ -74,14 +74,14 @@ class Smoke:
         for near in edges[:-1]:
             middle = near + 0.5 * step
             slab = (self.density(eye + rays * middle, time) * step).astype(np.float32)
-            there_and_back = np.exp(-1.35 * (depth_so_far + 0.5 * slab))
+            there_and_back = np.exp(-1.2 * (depth_so_far + 0.5 * slab))
             slab_glow = _BACKSCATTER * lamp / (middle**2 + _LAMP_SIZE**2) * slab * there_and_back
             share = np.clip((distance - near) / step, 0.0, 1.0)
             optical += share * cv2.resize(slab, (width, height), interpolation=cv2.INTER_CUBIC)
             glow += share * cv2.resize(slab_glow.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
             depth_so_far += slab
         # The light has to cross the smoke too, but what smoke scatters forwards still arrives: hence less than twice.
-        seen = light * np.exp(-1.35 * optical)[..., None]
+        seen = light * np.exp(-1.2 * optical)[..., None]
         return seen + glow[..., None] * np.array([0.98, 1.0, 1.02], np.float32)
 
 

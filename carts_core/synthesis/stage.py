@@ -1,6 +1,5 @@
 """The two instruments at each moment of a planned motion."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,6 @@ from jaxtyping import Float
 from ..camera import Camera
 from ..scene import Arm
 from .path_tracer import Part, Surface
-
 
 _DARK = 0.3
 """Parts of a darker colour than this are plastic; so is the longest part of the shaft, whatever the URDF paints it."""
@@ -26,7 +24,7 @@ class Stage:
     arms: tuple[Arm, ...]
     joints: tuple[Float[np.ndarray, "frames dofs"], ...]
     """True joint positions [rad, m], one table per arm."""
-    times: Float[np.ndarray, "frames"]
+    times: Float[np.ndarray, " frames"]
     """[s]"""
 
     def Ts_world_link(self, frame: int, time_offset: float = 0.0) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -83,8 +81,3 @@ def _project(points: np.ndarray, T_world_link: np.ndarray, camera: Camera) -> np
     p_camera = points @ T_camera_link[:3, :3].T + T_camera_link[:3, 3]
     fx, fy, _, _ = camera.intrinsics
     return p_camera[:, :2] / p_camera[:, 2:] * (fx, fy)
-
-
-def arm_tables(arms: Sequence[Arm]) -> list[tuple[str, str]]:
-    """(arm, joint) of every column of a kinematics table, in order."""
-    return [(arm.name, joint) for arm in arms for joint in arm.robot.joint_names]

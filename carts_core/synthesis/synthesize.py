@@ -108,7 +108,10 @@ class _Painter:
             # The exposure is fixed by the first frame for the whole sequence, as a camera set up by hand has it.
             first = [self._radiance(tracer, 0, 0) for tracer in self._tracers]
             self._gains = [exposure_gain(radiance, self._config.sensor) for radiance in first]
-        light = [gain * self._radiance(tracer, frame, number) for gain, tracer in zip(self._gains, self._tracers)]
+        light = [
+            gain * self._radiance(tracer, frame, number)
+            for gain, tracer in zip(self._gains, self._tracers, strict=True)
+        ]
         parts = stage.parts(frame)
         surface = self._tracers[0].surface(parts, camera, seed=frame)
         mask = self._tracers[0].coverage(parts, camera) >= 0.5
@@ -135,8 +138,8 @@ class _Painter:
 def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
     """The regular background and another one of another kind."""
     kinds = config.rng("kinds").permutation(KINDS)[:2]
-    resolution = config.render.tissue_resolution
-    regular, other = (grow_tissue(kind, resolution, config.rng("tissue", i)) for i, kind in enumerate(kinds))
+    size = config.render.tissue_resolution, config.render.texture_resolution
+    regular, other = (grow_tissue(kind, *size, config.rng("tissue", i)) for i, kind in enumerate(kinds))
     return regular, other
 
 

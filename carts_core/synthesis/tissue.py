@@ -11,9 +11,6 @@ from .noise import smooth_noise, smoothstep
 
 EXTENT = 0.26
 """Side of the square of tissue, centred on the world's origin [m]."""
-TEXTURE = 1536
-"""Texels along each side."""
-_TEXELS_PER_METRE = TEXTURE / EXTENT
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class _Kind:
 
 _KINDS = {
     "muscle": _Kind((0.47, 0.150, 0.120), (0.27, 0.055, 0.045), (0.52, 0.30, 0.135), 0.26, 0.0026, 0.0009, 7, 0.36),
-    "bowel": _Kind((0.55, 0.28, 0.22), (0.40, 0.13, 0.105), (0.55, 0.38, 0.18), 0.30, 0.0048, 0.0010, 12, 0.33),
+    "bowel": _Kind((0.55, 0.28, 0.22), (0.40, 0.13, 0.105), (0.60, 0.38, 0.20), 0.30, 0.0048, 0.0010, 12, 0.33),
     "liver": _Kind((0.215, 0.055, 0.040), (0.110, 0.022, 0.020), (0.34, 0.15, 0.10), 0.12, 0.0012, 0.0004, 3, 0.30),
     "fat": _Kind((0.56, 0.36, 0.145), (0.46, 0.20, 0.085), (0.45, 0.15, 0.11), 0.26, 0.0022, 0.0016, 9, 0.38),
 }
@@ -55,16 +52,21 @@ class Tissue:
         """Height [m] at points of the plane [m]; beyond the patch, that of its border."""
         return sample(self.heights, x, y)
 
-    def mesh(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 2"]]:
-        """Vertices [m], faces and texture coordinates of the height field."""
+    def mesh(
+        self,
+    ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 2"]]:
+        """Vertices [m], unit normals, faces and texture coordinates of the height field."""
         n = len(self.heights)
         unit = np.linspace(0.0, 1.0, n)
         v, u = np.meshgrid(unit, unit, indexing="ij")
         vertices = np.stack([(u - 0.5) * EXTENT, (v - 0.5) * EXTENT, self.heights], axis=-1)
+        slope_y, slope_x = np.gradient(self.heights.astype(np.float64), EXTENT / (n - 1))
+        normals = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=-1)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         index = np.arange(n * n).reshape(n, n)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
         faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in ((a, b, c), (a, c, d))])
-        return vertices.reshape(-1, 3), faces, np.stack([u, v], axis=-1).reshape(-1, 2)
+        return vertices.reshape(-1, 3), normals.reshape(-1, 3), faces, np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
 def sample(field: Float[np.ndarray, "n n"], x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -74,40 +76,39 @@ def sample(field: Float[np.ndarray, "n n"], x: np.ndarray, y: np.ndarray) -> np.
     return map_coordinates(field, np.stack([rows, columns]), order=1, mode="nearest")
 
 
-def grow_tissue(kind: str, resolution: int, rng: np.random.Generator) -> Tissue:
+def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generator) -> Tissue:
     """Tissue of one kind.
 
     Args:
         kind: one of `KINDS`.
         resolution: grid points of the height field along each side.
+        texels: texels of colour and roughness along each side.
         rng: source of randomness.
     """
-    look = _KINDS[kind]
-    warp = _noise(0.035, rng, octaves=2), _noise(0.035, rng, octaves=2)
+    look, paint = _KINDS[kind], _Canvas(texels, rng)
 
-    patches = _warped(_noise(0.060, rng, octaves=4, gain=0.42), warp, 0.003)
+    patches = paint.grown(0.060, 0.003, octaves=4, gain=0.42)
     patch = smoothstep(patches, *np.quantile(patches, [1.0 - look.patch_share - 0.12, 1.0 - look.patch_share + 0.10]))
-    crests = np.exp(-((_warped(_noise(0.040, rng), warp, 0.005) / 0.5) ** 2))  # along the zero crossings
-    folds = crests * smoothstep(_noise(0.080, rng), -0.6, 1.0)
-    lobules = np.minimum(np.abs(_warped(_noise(0.011, rng), warp, 0.002)), 1.2)
-    vessels = _draw_vessels(look.vessels, rng)
-    glossy = smoothstep(_noise(0.030, rng), -0.8, 1.2)
+    crests = np.exp(-((paint.grown(0.040, 0.005) / 0.5) ** 2))  # along the zero crossings
+    folds = crests * smoothstep(paint.noise(0.080), -0.6, 1.0)
+    lobules = np.minimum(np.abs(paint.grown(0.011, 0.002)), 1.2)
+    vessels = paint.vessels(look.vessels)
+    glossy = smoothstep(paint.noise(0.030), -0.8, 1.2)
 
-    relief = 0.0042 * _noise(0.090, rng, octaves=2, gain=0.3) + look.folds * folds
+    relief = 0.0042 * paint.noise(0.090, octaves=2, gain=0.3) + look.folds * folds
     relief += look.lobules * patch * lobules + 0.0003 * vessels
-    relief += 0.00005 * _noise(0.0032, rng, octaves=2) * (0.35 + 0.65 * glossy)
+    relief += 0.00005 * paint.noise(0.0032, octaves=2) * (0.35 + 0.65 * glossy)
 
-    hollows = smoothstep(cv2.GaussianBlur(relief, (0, 0), 0.004 * _TEXELS_PER_METRE) - relief, -0.0002, 0.0016)
-    blush = 0.5 + 0.5 * np.tanh(0.8 * _noise(0.030, rng, octaves=4, gain=0.5))
+    hollows = smoothstep(cv2.GaussianBlur(relief, (0, 0), 0.004 * paint.scale) - relief, -0.0002, 0.0016)
+    blush = 0.5 + 0.5 * np.tanh(0.8 * paint.noise(0.030, octaves=4))
     color = _mix(np.array(look.base) * _jitter(rng), np.array(look.dark), np.clip(0.65 * blush + 0.35 * hollows, 0, 1))
     color = _mix(color, np.array(look.patch) * _jitter(rng), 0.85 * patch * (1.0 - 0.5 * hollows))
-    capillaries = np.exp(-((_warped(_noise(0.008, rng), warp, 0.004) / 0.07) ** 2))
-    capillaries *= smoothstep(_noise(0.020, rng), 0.0, 1.2)
+    capillaries = np.exp(-((paint.grown(0.008, 0.004) / 0.07) ** 2)) * smoothstep(paint.noise(0.020), 0.0, 1.2)
     color = _mix(color, np.array([0.42, 0.035, 0.035]), 0.45 * capillaries)
-    color = _mix(color, np.array([0.20, 0.018, 0.030]), 0.75 * vessels)
-    color *= 1.0 + 0.05 * _noise(0.0012, rng, octaves=2)[..., None]
+    color = _mix(color, np.array([0.23, 0.030, 0.036]), 0.6 * vessels)
+    color *= 1.0 + 0.05 * paint.noise(0.0012, octaves=2)[..., None]
 
-    roughness = look.roughness + 0.05 * _noise(0.012, rng, octaves=2) + 0.10 * patch
+    roughness = look.roughness + 0.05 * paint.noise(0.012, octaves=2) + 0.10 * patch
     return Tissue(
         heights=_cavity(resolution) + cv2.resize(relief, (resolution, resolution), interpolation=cv2.INTER_AREA),
         albedo=np.clip(color, 0.01, 0.9).astype(np.float32),
@@ -115,25 +116,56 @@ def grow_tissue(kind: str, resolution: int, rng: np.random.Generator) -> Tissue:
     )
 
 
-def _noise(wavelength: float, rng: np.random.Generator, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
-    return smooth_noise((TEXTURE, TEXTURE), wavelength * _TEXELS_PER_METRE, rng, octaves=octaves, gain=gain)
+class _Canvas:
+    """Random patterns over the patch of tissue; lengths in metres."""
+
+    def __init__(self, texels: int, rng: np.random.Generator) -> None:
+        self._texels, self._rng = texels, rng
+        self.scale = texels / EXTENT
+        """Texels per metre."""
+        self._warp = self.noise(0.035, octaves=2), self.noise(0.035, octaves=2)
+
+    def noise(self, wavelength: float, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
+        return smooth_noise((self._texels,) * 2, wavelength * self.scale, self._rng, octaves=octaves, gain=gain)
+
+    def grown(self, wavelength: float, amount: float, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
+        """Noise looked up at displaced places, which turns round blobs into things that look grown."""
+        rows, columns = np.indices((self._texels,) * 2, dtype=np.float32)
+        shift = np.float32(amount * self.scale)
+        columns, rows = columns + shift * self._warp[0], rows + shift * self._warp[1]
+        field = self.noise(wavelength, octaves, gain)
+        return cv2.remap(field, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+
+    def vessels(self, count: int) -> np.ndarray:
+        """Branching lines that get thinner, 1 in their middle and 0 away from them."""
+        rng = self._rng
+        canvas = np.zeros((self._texels,) * 2, np.float32)
+        stack = [
+            (rng.uniform(0.1, 0.9, 2) * self._texels, rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.5) * 1e-3)
+            for _ in range(count)
+        ]
+        step = 0.0012 * self.scale
+        while stack:
+            point, heading, width = stack.pop()
+            bend = 0.0
+            for _ in range(rng.integers(25, 90)):
+                bend = 0.85 * bend + rng.normal(0.0, 0.06)
+                heading += bend
+                target = point + step * np.array([np.cos(heading), np.sin(heading)])
+                thickness = max(1, round(width * self.scale))
+                cv2.line(canvas, _pixel(point), _pixel(target), 1.0, thickness, cv2.LINE_AA, shift=4)
+                point, width = target, width * 0.99
+                if width > 0.0003 and rng.random() < 0.05:
+                    stack.append((point, heading + rng.choice([-1, 1]) * rng.uniform(0.4, 1.0), width * 0.65))
+        return cv2.GaussianBlur(canvas, (0, 0), 0.00040625 * self.scale)
 
 
 def _jitter(rng: np.random.Generator) -> np.ndarray:
-    return np.exp(rng.normal(0.0, 0.08, 3))
+    return np.exp(rng.normal(0.0, 0.05, 3))
 
 
 def _mix(color: np.ndarray, other: np.ndarray, share: np.ndarray) -> np.ndarray:
     return color + (other - color) * share[..., None]
-
-
-def _warped(field: np.ndarray, warp: tuple[np.ndarray, np.ndarray], amount: float) -> np.ndarray:
-    """The field looked up at displaced places, which turns round blobs into things that look grown."""
-    rows, columns = np.indices(field.shape, dtype=np.float32)
-    shift = np.float32(amount * _TEXELS_PER_METRE)
-    return cv2.remap(
-        field, columns + shift * warp[0], rows + shift * warp[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-    )
 
 
 def _cavity(resolution: int) -> np.ndarray:
@@ -141,29 +173,6 @@ def _cavity(resolution: int) -> np.ndarray:
     unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
     radius = np.hypot(*np.meshgrid(unit, unit))
     return (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
-
-
-def _draw_vessels(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Branching lines that get thinner, 1 in their middle and 0 away from them."""
-    canvas = np.zeros((TEXTURE, TEXTURE), np.float32)
-    stack = [
-        (rng.uniform(0.1, 0.9, 2) * TEXTURE, rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.5) * 1e-3)
-        for _ in range(count)
-    ]
-    step = 0.0012 * _TEXELS_PER_METRE
-    while stack:
-        point, heading, width = stack.pop()
-        bend = 0.0
-        for _ in range(rng.integers(25, 90)):
-            bend = 0.85 * bend + rng.normal(0.0, 0.06)
-            heading += bend
-            target = point + step * np.array([np.cos(heading), np.sin(heading)])
-            thickness = max(1, round(width * _TEXELS_PER_METRE))
-            cv2.line(canvas, _pixel(point), _pixel(target), 1.0, thickness, cv2.LINE_AA, shift=4)
-            point, width = target, width * 0.99
-            if width > 0.0003 and rng.random() < 0.05:
-                stack.append((point, heading + rng.choice([-1, 1]) * rng.uniform(0.4, 1.0), width * 0.65))
-    return cv2.GaussianBlur(canvas, (0, 0), 1.8)
 
 
 def _pixel(point: np.ndarray) -> tuple[int, int]:

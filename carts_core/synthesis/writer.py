@@ -34,7 +34,7 @@ def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
 def write_table(
     path: Path,
     arms: Sequence[Arm],
-    times: Float[np.ndarray, "frames"],
+    times: Float[np.ndarray, " frames"],
     joints: Sequence[Float[np.ndarray, "frames dofs"]],
 ) -> None:
     """A CSV file with a row per frame: its id, its time [s], and the joint positions of every arm [rad, m]."""
