@@ -8,8 +8,6 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-import viser
-
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.optimization import FreeParameters, OptimizerSettings
@@ -17,8 +15,8 @@ from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
 from carts_viewer.guard import check_loopback
-from carts_viewer.intents import Mailbox
 from carts_viewer.layers import Layer
+from carts_viewer.mailbox import Mailbox
 from carts_viewer.page import Page
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.curves import CurvesPanel
@@ -30,6 +28,7 @@ from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
+from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.picture import Painter
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
@@ -185,16 +184,18 @@ class ViewerApp:
         with gui.add_folder("Joints"):
             self.joints = JointsPanel(page, session, state, emit, self.mailbox.waits)
         right = gui.add_panel()
-        with right.add_tab("Optimize", viser.Icon.TARGET_ARROW):
+        with right.add_tab("Optimize"):
             panels += [
                 OptimizePanel(page, session, state, emit),
                 CurvesPanel(gui),
                 SettingsPanel(page, state, emit),
                 FreePanel(page, session, state, emit),
             ]
-        with right.add_tab("Export", viser.Icon.DOWNLOAD):
+        with right.add_tab("Values"):
+            panels.append(ValuesPanel(gui, session))
+        with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, emit))
-        with right.add_tab("Help", viser.Icon.HELP):
+        with right.add_tab("Help"):
             HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
         right.dock_right()
         right.set_width(_PANEL_WIDTH)

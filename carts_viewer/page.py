@@ -85,13 +85,22 @@ class Page:
         shares = [1.0] * len(handles) if weights is None else list(weights)
         self._side_by_side([handle._impl.uuid for handle in handles], shares, "div:has(> [id='{}'])")
 
-    def columns(self, handles: Sequence[viser.GuiCheckboxHandle], count: int = 2) -> None:
-        """Lay out consecutive checkboxes of the current container in columns, in reading order."""
+    def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:
+        """Lay out consecutive checkboxes or number fields of the current container in columns, in reading order.
+
+        Args:
+            handles: The widgets, in order.
+            count: How many to a line.
+            narrow_labels: Give labels no more room than they need, and the fields the rest.
+        """
         for first in range(0, len(handles), count):
             group = [handle._impl.uuid for handle in handles[first : first + count]]
             # A short last line keeps the width of the others.
-            box = "div:has(> .mantine-Flex-root > div > .mantine-Checkbox-root [id='{}'])"
+            box = "div:has(> .mantine-Flex-root > div [id='{}'])"
             self._side_by_side(group, [1.0] * len(group), box, total=float(count))
+            if narrow_labels:
+                labels = ", ".join(f"{box.format(name)} > .mantine-Flex-root > div:first-child" for name in group)
+                self.server.gui.add_html(f"<style>{labels} {{ width: auto !important; white-space: nowrap }}</style>")
 
     def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
         """Turn the boxes around these elements into parts of a line, by a style sheet that names their ids."""

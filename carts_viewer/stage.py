@@ -132,7 +132,8 @@ class Stage:
 
     def _add_cameras(self) -> None:
         for camera in self._scene.cameras:
-            self._outlines[camera.name] = self._outline(f"{WORLD}/camera {camera.name}", camera, _OTHER_COLOR)
+            node = f"{WORLD}/camera {camera.name}"
+            self._outlines[camera.name] = self._outline(node, camera, _OTHER_COLOR)
 
 
 def _place(node: viser.SceneNodeHandle, T_parent_node: Float[np.ndarray, "4 4"]) -> None:

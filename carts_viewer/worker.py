@@ -8,7 +8,7 @@ from typing import Protocol
 
 from carts_core.errors import CartsError
 from carts_viewer.controller import Controller
-from carts_viewer.intents import Mailbox
+from carts_viewer.mailbox import Mailbox
 from carts_viewer.state import ViewState
 
 _log = logging.getLogger(__name__)

@@ -160,10 +160,10 @@
     refresh();
   }
 
-  function listen(canvas) {
-    const inPicture = (event) => view.endoscope && event.target === canvas;
+  function listen() {
+    const inPicture = (event) => view.endoscope && viser()?.canvas && event.target === viser().canvas;
     const share = (event) => {
-      const box = canvas.getBoundingClientRect();
+      const box = viser().canvas.getBoundingClientRect();
       return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     };
     let last = null;
@@ -174,9 +174,7 @@
       zoomAt(Math.exp(-event.deltaY * (event.deltaMode === 1 ? 0.05 : 0.0015)), ...share(event));
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
-      if (!inPicture(event)) return;
-      viser().cameraControl.enabled = false;
-      last = share(event);
+      if (inPicture(event)) last = share(event);
     }, { capture: true });
     window.addEventListener("pointermove", (event) => {
       const image = imageRectangle();
@@ -224,7 +222,7 @@
       const original = Object.getPrototypeOf(held).updateProjectionMatrix;
       held.updateProjectionMatrix = function () { aim(this); original.call(this); };
     }
-    if (!bar?.isConnected) { buildBar(mutable.canvas); listen(mutable.canvas); }
+    if (!bar?.isConnected) buildBar(mutable.canvas);
     if (view.endoscope && mutable.cameraControl.enabled) mutable.cameraControl.enabled = false;
     // viser sets `visible` itself in every frame, so what belongs to the 3D view alone is kept on a layer of its own.
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
@@ -236,6 +234,7 @@
     reportDrawn();
   }
 
+  listen();
   (function everyFrame() {
     watch();
     requestAnimationFrame(everyFrame);

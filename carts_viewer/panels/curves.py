@@ -9,6 +9,7 @@ from carts_viewer.state import Curves, ViewState
 _TEAL, _BLUE, _ORANGE = "#2dd4a7", "#60a5fa", "#fb923c"
 _HEIGHT = 118
 _WHOLE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+_LOSS = "Loss"
 _TICKS = uplot.Axis_Ticks(size=4, width=1)
 _TITLE = '<p class="carts-curve"><span style="color: {}">■</span> {} {}</p>'
 
@@ -37,7 +38,7 @@ class CurvesPanel:
             chart.show(series, best)
 
 
-_QUANTITIES = (("Loss", _TEAL), ("Dice", _BLUE), ("Joint error [°]", _ORANGE))
+_QUANTITIES = ((_LOSS, _TEAL), ("Dice", _BLUE), ("Joint error [°]", _ORANGE))
 
 
 class _Chart:
@@ -66,8 +67,11 @@ class _Chart:
         values = np.array([np.nan if value is None else value for value in series], float)
         self._plot.data = (np.arange(len(values), dtype=float), values)
 
-    @staticmethod
-    def _newest_and_best(series: tuple[float | None, ...], best: int) -> str:
+    def _newest_and_best(self, series: tuple[float | None, ...], best: int) -> str:
         newest, kept = series[-1], series[best]
-        text = "" if newest is None else f"<b>{newest:.4g}</b>"
-        return text if kept is None else f"{text} · <b>{kept:.4g}</b> at the best, iteration {best}"
+        text = "" if newest is None else f"<b>{newest:.3g}</b>"
+        if kept is None:
+            return text
+        if self._name == _LOSS:
+            return f"{text} · lowest <b>{kept:.3g}</b> at iteration {best}"
+        return f"{text} · there <b>{kept:.3g}</b>"

@@ -43,8 +43,9 @@ class JointsPanel:
             with tabs.add_tab(arm.name, viser.Icon.GRAIN):
                 self._add_arm(page, arm.name, state, emit)
         window = gui.add_dropdown("Slider range", list(_WINDOWS), initial_value="± 20")
-        self._degrees = gui.add_number("Perturb by °/mm", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
+        self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
+        page.columns([self._degrees, self._seed], narrow_labels=True)
         perturb = gui.add_button("Perturb all joints", color="gray")
         self._undo = gui.add_button("Undo", color="gray")
         page.row(perturb, self._undo, weights=(5, 3))

@@ -53,4 +53,4 @@ def offered_layers(session: Session) -> list[Layer]:
 
 
 def _swatch(color: tuple[int, int, int], name: str) -> str:
-    return f'<span class="carts-swatch" style="background: rgb{color}"></span>{name}'
+    return f'<span class="carts-key"><span class="carts-swatch" style="background: rgb{color}"></span>{name}</span>'

@@ -3,7 +3,8 @@
 import threading
 import time
 
-from carts_viewer.intents import Mailbox, MoveFrame, SetJoint, SetOpacity, ShowFrame
+from carts_viewer.intents import MoveFrame, SetJoint, SetOpacity, ShowFrame
+from carts_viewer.mailbox import Mailbox
 
 
 def test_of_a_burst_for_one_joint_only_the_last_value_is_left() -> None:

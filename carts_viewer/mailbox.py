@@ -1,0 +1,53 @@
+"""Where intents wait for the one worker; of those with the same key only the newest."""
+
+import threading
+from collections.abc import Hashable
+
+from carts_viewer.intents import Intent
+
+
+class Mailbox:
+    """Where intents wait, in the order of their newest version. Any thread may put, the worker takes."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[Hashable, Intent] = {}
+        self._changed = threading.Condition()
+        self._woken = False
+
+    def put(self, intent: Intent) -> None:
+        """Add an intent, in place of a waiting one of the same key."""
+        with self._changed:
+            key = object() if intent.key is None else intent.key
+            # Removed first, so that the newest version queues up behind what was asked for before it.
+            self._waiting.pop(key, None)
+            self._waiting[key] = intent
+            self._changed.notify()
+
+    def take(self, timeout: float | None = None) -> list[Intent]:
+        """Everything that waits, emptying the mailbox.
+
+        Args:
+            timeout: How long to wait for a first intent [s]; None waits for ever, 0 not at all.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._woken, timeout)
+            self._woken = False
+            intents = list(self._waiting.values())
+            self._waiting.clear()
+            return intents
+
+    def wake(self) -> None:
+        """End a `take` that waits, with nothing."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        with self._changed:
+            return not self._waiting
+
+    def waits(self, key: Hashable) -> bool:
+        """Whether an intent of this key has arrived and was not yet taken."""
+        with self._changed:
+            return key in self._waiting

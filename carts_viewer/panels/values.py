@@ -1,0 +1,37 @@
+"""A table of all joints: measured, shown, how far apart, and how far from the truth."""
+
+import viser
+
+from carts_viewer.panels.inputs import escaped, humanized
+from carts_viewer.panels.joints import to_shown
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+
+
+class ValuesPanel:
+    """By how much every joint of the shown frame was corrected."""
+
+    def __init__(self, gui: viser.GuiApi, session: Session) -> None:
+        self._session = session
+        self._table = gui.add_html("")
+
+    def show(self, state: ViewState) -> None:
+        """Bring the table up to date."""
+        shown = self._session.joints(state.pose.scene)
+        truth = state.frame.truth or {}
+        columns = ["", "Measured", "Now", "Change", *(["Error"] if truth else [])]
+        rows = ["".join(f"<th>{name}</th>" for name in columns)]
+        for arm in self._session.scene.arms:
+            rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
+            ranges = [limits for limits in self._session.ranges if limits.arm == arm.name]
+            for joint, limits in enumerate(ranges):
+                measured = to_shown(limits, float(state.frame.measured[arm.name][joint]))
+                now = to_shown(limits, float(shown[arm.name][joint]))
+                cells = [f"{measured:.2f}", f"{now:.2f}", f"{now - measured:+.2f}"]
+                if arm.name in truth:
+                    cells.append(f"{now - to_shown(limits, float(truth[arm.name][joint])):+.2f}")
+                unit = "°" if limits.revolute else "mm"
+                name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
+                rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        self._table.content = f'<table class="carts-values">{body}</table>'
