@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
@@ -14,6 +14,7 @@ from ..robot import Robot
 from ..scene import Arm
 from .config import SynthesisConfig
 from .layout import WORK_POINTS
+from .path_tracer import NEAR
 from .tissue import Tissue
 
 WRIST_LENGTH = 0.0193
@@ -21,10 +22,20 @@ WRIST_LENGTH = 0.0193
 _ATTEMPTS = 400
 _LIMIT_MARGIN = 0.05
 """Part of each joint's range kept free at both ends."""
+_NUDGE = 1e-6
+_NEWTON_STEPS = 12
+_CONVERGED = 1e-9
+"""Step [rad, m] after which the next one, a square of it, would be below the precision of the numbers."""
 _BORDER = 0.08
 """The tips keep away from the picture's border by this part of its size."""
+_MARGIN = 0.1
+"""Collisions are looked for in the picture and in a margin around it, a part of its size."""
 _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
 """Where the jaws point in the middle of their range, in the world: to the other arm and down."""
+
+
+class _Rejected(Exception):
+    """Why a random motion cannot be used."""
 
 
 def plan_motion(
@@ -41,11 +52,13 @@ def plan_motion(
     reasons: dict[str, int] = {}
     for attempt in range(_ATTEMPTS):
         rng = config.rng("motion", attempt)
-        joints = tuple(_draw(arm, number, config, rng) for number, arm in enumerate(arms))
-        reason = _objection(arms, joints, bodies, tissues, camera, config)
-        if reason is None:
+        try:
+            joints = tuple(_draw(arm, number, camera, config, rng) for number, arm in enumerate(arms))
+            clouds = [_clouds(arm, positions, body) for arm, positions, body in zip(arms, joints, bodies, strict=True)]
+            _check_clearance(clouds, tissues, camera, config.motion.clearance)
             return joints
-        reasons[reason] = reasons.get(reason, 0) + 1
+        except _Rejected as rejected:
+            reasons[str(rejected)] = reasons.get(str(rejected), 0) + 1
     why = ", ".join(f"{reason} ({count})" for reason, count in sorted(reasons.items(), key=lambda item: -item[1]))
     raise SettingsError(
         f"none of {_ATTEMPTS} random motions fits the settings: {why}. "
@@ -68,16 +81,15 @@ def reach_tip(
     """
     solution = torch.from_numpy(joints.copy())
     goals = torch.from_numpy((targets_world - arm.T_world_base[:3, 3]) @ arm.T_world_base[:3, :3])
-    for _ in range(12):
-        tips = _tips(arm.robot, tip_link, solution)
-        columns = []
-        for joint in range(3):
-            moved = solution.clone()
-            moved[:, joint] += 1e-6
-            columns.append((_tips(arm.robot, tip_link, moved) - tips) / 1e-6)
-        jacobian = torch.stack(columns, dim=-1)
-        step = torch.linalg.solve(jacobian, (goals - tips)[..., None])[..., 0]
+    nudges = torch.zeros(4, 1, joints.shape[-1], dtype=torch.float64)
+    nudges[range(1, 4), 0, range(3)] = _NUDGE
+    for _ in range(_NEWTON_STEPS):
+        tips = _tips(arm.robot, tip_link, solution + nudges)
+        jacobian = ((tips[1:] - tips[0]) / _NUDGE).movedim(0, -1)
+        step = torch.linalg.solve(jacobian, (goals - tips[0])[..., None])[..., 0]
         solution[:, :3] += torch.clamp(step, -0.3, 0.3)
+        if step.abs().max() < _CONVERGED:
+            break
     return solution.numpy()
 
 
@@ -85,8 +97,10 @@ def _tips(robot: Robot, tip_link: str, joints: torch.Tensor) -> torch.Tensor:
     return robot.link_transform(joints, tip_link)[..., :3, 3]
 
 
-def _draw(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames 7"]:
-    """One random motion of one arm."""
+def _draw(
+    arm: Arm, number: int, camera: Camera, config: SynthesisConfig, rng: np.random.Generator
+) -> Float[np.ndarray, "frames 7"]:
+    """One random motion of one arm, within its limits and in view."""
     motion = config.motion
     times = sample_times(config)
     controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
@@ -96,12 +110,19 @@ def _draw(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generat
         return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
 
     targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
+    if not _in_view(targets, camera):
+        raise _Rejected("a tip leaves the picture")
     joints = np.zeros((len(times), 7))
     joints[:, 2] = 0.14
     joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
     low, high = motion.jaw_range
     joints[:, 6] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)]))[:, 0], low, high)
-    return reach_tip(arm, config.tip_link, targets, joints)
+    joints = reach_tip(arm, config.tip_link, targets, joints)
+    lowest, highest = arm.robot.joint_limits.numpy()[:6].T
+    margin = _LIMIT_MARGIN * (highest - lowest)
+    if (joints[:, :6] < lowest + margin).any() or (joints[:, :6] > highest - margin).any():
+        raise _Rejected("a joint comes too near to its limit")
+    return joints
 
 
 def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
@@ -121,45 +142,32 @@ def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random
     return joints[np.argmax(jaws @ wanted), 3:6]
 
 
-def _objection(
-    arms: Sequence[Arm],
-    joints: Sequence[np.ndarray],
-    bodies: Sequence[list[np.ndarray]],
-    tissues: Sequence[Tissue],
-    camera: Camera,
-    config: SynthesisConfig,
-) -> str | None:
-    """Why a motion cannot be used, or None."""
-    for arm, positions in zip(arms, joints, strict=True):
-        low, high = arm.robot.joint_limits.numpy()[:6].T
-        margin = _LIMIT_MARGIN * (high - low)
-        if (positions[:, :6] < low + margin).any() or (positions[:, :6] > high - margin).any():
-            return "a joint comes too near to its limit"
-        tips = _tips(arm.robot, config.tip_link, torch.from_numpy(positions)).numpy()
-        if not _in_view(tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3], camera):
-            return "a tip leaves the picture"
-    clouds = [_clouds(arm, positions, body) for arm, positions, body in zip(arms, joints, bodies, strict=True)]
-    T = camera.T_camera_world
-    for frame in range(len(joints[0])):
-        inside = []
-        for cloud in clouds:
-            points = cloud[frame]
-            points = points[points @ T[2, :3] + T[2, 3] > 0.01]
-            inside.append(points)
+def _check_clearance(
+    clouds: Sequence[list[np.ndarray]], tissues: Sequence[Tissue], camera: Camera, clearance: float
+) -> None:
+    """Raise when, in some frame and in view, the instruments come too near to each other or to the tissue."""
+    for frame in zip(*clouds, strict=True):
+        seen = [points[_seen(points, camera, _MARGIN)] for points in frame]
+        for points in seen:
             for tissue in tissues:
-                if (points[:, 2] - tissue.height(points[:, 0], points[:, 1])).min() < config.motion.clearance:
-                    return "an instrument touches the tissue"
-        if KDTree(inside[0]).query(inside[1])[0].min() < config.motion.clearance:
-            return "the instruments touch"
-    return None
+                if (points[:, 2] - tissue.height(points[:, 0], points[:, 1])).min() < clearance:
+                    raise _Rejected("an instrument touches the tissue")
+        if KDTree(seen[0]).query(seen[1])[0].min() < clearance:
+            raise _Rejected("the instruments touch")
 
 
 def _in_view(tips_world: np.ndarray, camera: Camera) -> bool:
+    depth = tips_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    return bool((_seen(tips_world, camera, -_BORDER) & (depth > 0.055) & (depth < 0.135)).all())
+
+
+def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float) -> Bool[np.ndarray, " n"]:
+    """Which points are in the picture, or in a margin around it that is given as a part of its size."""
     T, (fx, fy, cx, cy) = camera.T_camera_world, camera.intrinsics
-    x, y, z = (tips_world @ T[:3, :3].T + T[:3, 3]).T
-    u, v = (fx * x / z + cx) / camera.width, (fy * y / z + cy) / camera.height
-    inside = (u > _BORDER) & (u < 1 - _BORDER) & (v > _BORDER) & (v < 1 - _BORDER)
-    return bool((inside & (z > 0.055) & (z < 0.135)).all())
+    x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
+    z_or_near = np.maximum(z, NEAR)
+    u, v = (fx * x / z_or_near + cx) / camera.width, (fy * y / z_or_near + cy) / camera.height
+    return (np.abs(u - 0.5) < 0.5 + margin) & (np.abs(v - 0.5) < 0.5 + margin) & (z > NEAR)
 
 
 def _surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0018) -> list[np.ndarray]:

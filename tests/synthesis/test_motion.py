@@ -1,0 +1,101 @@
+"""Motion of the instruments."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import KDTree
+
+from carts_core.camera import Camera
+from carts_core.errors import SettingsError
+from carts_core.rendering import Renderer
+from carts_core.robot import Robot
+from carts_core.scene import Arm, Scene
+from carts_core.synthesis import EndoscopeConfig, MotionConfig, SynthesisConfig
+from carts_core.synthesis.layout import place_arms, place_cameras
+from carts_core.synthesis.motion import plan_motion, reach_tip
+from carts_core.synthesis.tissue import Tissue
+
+CONFIG = SynthesisConfig(seed=11, motion=MotionConfig(frames=8, frame_rate=4.0))
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    return place_cameras(EndoscopeConfig())[0]
+
+
+@pytest.fixture(scope="module")
+def arms(shipped_psm: Robot, camera: Camera) -> tuple[Arm, ...]:
+    return place_arms(shipped_psm, CONFIG.tip_link, camera)
+
+
+@pytest.fixture(scope="module")
+def joints(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> tuple[np.ndarray, ...]:
+    return plan_motion(arms, [flat_tissue], camera, CONFIG)
+
+
+def _vertices(arm: Arm, positions: np.ndarray) -> np.ndarray:
+    Ts = arm.T_world_base @ arm.robot.forward_kinematics(torch.from_numpy(positions)).numpy()
+    return np.concatenate([m.vertices @ Ts[m.link][:3, :3].T + Ts[m.link][:3, 3] for m in arm.robot.meshes])
+
+
+def test_inverse_kinematics_brings_the_tip_to_its_target(arms: Sequence[Arm]) -> None:
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-0.02, 0.02, (20, 3)) + np.array([0.0, 0.0, 0.02])
+    start = np.zeros((20, 7))
+    start[:, 2] = 0.14
+    start[:, 3:] = rng.uniform(-0.7, 0.7, (20, 4))
+    for arm in arms:
+        found = reach_tip(arm, CONFIG.tip_link, targets, start)
+        tips = (arm.T_world_base @ arm.robot.link_transform(torch.from_numpy(found), CONFIG.tip_link).numpy())[:, :3, 3]
+        np.testing.assert_allclose(tips, targets, atol=1e-9)
+        np.testing.assert_array_equal(found[:, 3:], start[:, 3:])
+
+
+def test_joints_stay_well_inside_their_limits(arms: Sequence[Arm], joints: Sequence[np.ndarray]) -> None:
+    for arm, positions in zip(arms, joints, strict=True):
+        low, high = arm.robot.joint_limits.numpy().T
+        assert (positions > low + 0.02).all()
+        assert (positions < high - 0.02).all()
+
+
+def test_every_joint_moves_and_moves_smoothly(joints: Sequence[np.ndarray]) -> None:
+    for positions in joints:
+        assert (np.ptp(positions, axis=0) > 0.001).all()
+        assert np.abs(np.diff(positions, n=2, axis=0)).max() < 0.5
+
+
+def test_instruments_touch_neither_each_other_nor_the_tissue(
+    arms: Sequence[Arm], joints: Sequence[np.ndarray], flat_tissue: Tissue
+) -> None:
+    for frame in range(len(joints[0])):
+        left, right = (_vertices(arm, positions[frame]) for arm, positions in zip(arms, joints, strict=True))
+        assert KDTree(left).query(right)[0].min() > 0.0005
+        assert min(left[:, 2].min(), right[:, 2].min()) > 0.0005
+
+
+def test_both_instruments_are_seen_in_every_frame(
+    arms: tuple[Arm, ...], joints: Sequence[np.ndarray], camera: Camera
+) -> None:
+    renderer = Renderer(Scene(arms, (camera,)), width=160, height=120)
+    for frame in range(len(joints[0])):
+        state = renderer.scene.state({arm.name: positions[frame] for arm, positions in zip(arms, joints, strict=True)})
+        ids = renderer.segment(state)[0]
+        for arm in range(2):
+            assert (ids == arm).mean() > 0.01
+
+
+def test_the_same_seed_gives_the_same_motion_and_another_seed_another(
+    arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue, joints: Sequence[np.ndarray]
+) -> None:
+    again = plan_motion(arms, [flat_tissue], camera, CONFIG)
+    other = plan_motion(arms, [flat_tissue], camera, SynthesisConfig(seed=12, motion=CONFIG.motion))
+    assert all(np.array_equal(a, b) for a, b in zip(joints, again, strict=True))
+    assert not np.allclose(joints[0], other[0])
+
+
+def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> None:
+    config = SynthesisConfig(motion=MotionConfig(frames=8, reach=(0.1, 0.1, 0.001)))
+    with pytest.raises(SettingsError, match=r"none of \d+ random motions fits.*a tip leaves the picture.*motion.reach"):
+        plan_motion(arms, [flat_tissue], camera, config)

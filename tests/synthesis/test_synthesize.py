@@ -1,0 +1,133 @@
+"""A whole small sequence on disk, and the shipped one."""
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.data.sequence import Sequence
+from carts_core.errors import SettingsError
+from carts_core.rendering import Renderer
+from carts_core.synthesis import DOMAINS, SynthesisConfig, progress_bar, synthesize
+
+
+def _files(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def _dice(a: np.ndarray, b: np.ndarray) -> float:
+    return float(2 * (a & b).sum() / (a.sum() + b.sum()))
+
+
+def _overlap(sequence: Sequence, frame: int, camera: str, positions: dict[str, np.ndarray]) -> float:
+    width, height = next((c.width, c.height) for c in sequence.scene.cameras if c.name == camera)
+    renderer = Renderer(sequence.scene, width=width, height=height, cameras=[camera])
+    masks = sequence.frame(frame).masks
+    assert masks is not None
+    return _dice(renderer.segment(sequence.scene.state(positions))[0] >= 0, masks[camera])
+
+
+def test_the_sequence_opens_with_all_domains_both_cameras_and_truth(small_sequence: Path) -> None:
+    sequence = Sequence.open(small_sequence)
+    assert sequence.domains == DOMAINS
+    assert [camera.name for camera in sequence.scene.cameras] == ["left", "right"]
+    assert len(sequence) == 2
+    assert sequence.measured_joints == dict.fromkeys(("psm1", "psm2"), sequence.scene.arms[0].robot.joint_names)
+    frame = sequence.frame(1)
+    assert frame.timestamp == pytest.approx(0.5)
+    assert frame.truth is not None
+
+
+def test_truth_masks_are_those_of_the_true_kinematics_and_measured_ones_are_off(small_sequence: Path) -> None:
+    sequence = Sequence.open(small_sequence)
+    for index in range(len(sequence)):
+        frame = sequence.frame(index)
+        assert frame.truth is not None
+        for camera in ("left", "right"):
+            true, measured = (_overlap(sequence, index, camera, each) for each in (frame.truth, frame.measured))
+            assert true > 0.97
+            assert measured < true - 0.02
+
+
+def test_each_domain_is_what_its_name_says(small_sequence: Path) -> None:
+    sequence = Sequence.open(small_sequence)
+    images = {domain: sequence.frame(0, domain).images["left"].astype(float) for domain in DOMAINS}
+    regular = images["regular"]
+    for domain in DOMAINS[1:]:
+        assert np.abs(images[domain] - regular).mean() > 5.0, domain
+    assert images["low_brightness"].mean() < 0.7 * regular.mean()
+    redness = {domain: image[..., 0].mean() / image[..., 1].mean() for domain, image in images.items()}
+    assert redness["bleeding"] > 1.15 * redness["regular"]
+    for hazy in ("smoke", "simulated_smoke"):
+        assert redness[hazy] < 0.9 * redness["regular"]
+
+
+def test_a_stopped_run_goes_on_where_it_was_and_gives_the_same_files_byte_by_byte(
+    small_config: SynthesisConfig, small_sequence: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "sequence"
+    calls: list[tuple[str, int]] = []
+
+    def stop_after_one(what: str, done: int, total: int) -> None:
+        calls.append((what, done))
+        if what == "frames" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        synthesize(small_config, output, stop_after_one)
+    assert not output.exists()
+    (partial,) = tmp_path.glob(".sequence.*.partial")
+    first = partial / "images" / "smoke" / "left" / "001.jpg"
+    written = first.stat().st_mtime_ns
+    synthesize(small_config, output)
+    assert (output / "images" / "smoke" / "left" / "001.jpg").stat().st_mtime_ns == written
+    assert [path.name for path in tmp_path.iterdir()] == ["sequence"]
+    assert _files(output) == _files(small_sequence.parent)
+    assert calls == [("tissue, robots and motion", 0), ("frames", 1)]
+
+
+def test_a_folder_with_something_in_it_is_never_touched(small_config: SynthesisConfig, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(SettingsError, match="exists already"):
+        synthesize(small_config, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_one_domain_alone_is_rendered_with_the_same_pictures(
+    small_config: SynthesisConfig, small_sequence: Path, tmp_path: Path
+) -> None:
+    config = dataclasses.replace(small_config, domains=("smoke",))
+    output = synthesize(config, tmp_path / "smoky").parent
+    assert [path.name for path in (output / "images").iterdir()] == ["smoke"]
+    picture = Path("images", "smoke", "left", "001.jpg")
+    assert (output / picture).read_bytes() == (small_sequence.parent / picture).read_bytes()
+
+
+def test_the_progress_bar_reaches_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar() as progress:
+        progress("frames", 3, 3)
+    assert "3/3" in capsys.readouterr().err
+
+
+def test_the_shipped_sequence_is_complete_and_small_enough(sample_sequence_path: Path) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    assert sequence.domains == DOMAINS
+    assert len(sequence) >= 24
+    folder = sample_sequence_path.parent
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 9_000_000
+    assert not list(folder.rglob("*.part"))
+
+
+def test_the_shipped_sequence_shows_the_shipped_robot_at_its_true_joints(sample_sequence_path: Path) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    for index in range(0, len(sequence), 6):
+        frame = sequence.frame(index)
+        assert frame.truth is not None
+        assert _overlap(sequence, index, "left", frame.truth) > 0.985
+        assert _overlap(sequence, index, "left", frame.measured) < 0.95
