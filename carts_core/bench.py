@@ -1,0 +1,111 @@
+"""`python -m carts_core.bench`: times and ratios of the core on the shipped sequence, measured on this machine.
+
+Every figure is the median of repeated runs in one process; speed is a matter of the machine, the ratios less so.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from .data import Sequence
+from .features import FeatureExtractor
+from .optimization import FrameOptimizer, OptimizerSettings
+from .rendering import Renderer, visibility_torch
+from .rendering.geometry import link_transforms, vertices_in_camera
+from .rendering.visibility_numba import rasterize
+from .resources import sample_sequence
+from .scene import SceneState
+
+
+def milliseconds(work: Callable[[], object], runs: int) -> float:
+    """Median duration of `work` [ms], after two calls that do not count."""
+    for _ in range(2):
+        work()
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        work()
+        times.append(1e3 * (time.perf_counter() - began))
+    return statistics.median(times)
+
+
+def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
+    """Times of the renderer at the camera's full size [ms]."""
+    camera = sequence.scene.cameras[0].name
+    renderer = Renderer(sequence.scene, cameras=[camera])
+    state = sequence.scene.with_cameras([camera]).state(sequence.frame(0, cameras=[camera]).measured)
+
+    def forward() -> object:
+        with torch.no_grad():
+            return renderer(state)
+
+    def both() -> None:
+        free: SceneState = state.map(lambda value: value.detach().clone().requires_grad_())
+        rendering = renderer(free)
+        (rendering.image.sum() + rendering.silhouette.sum()).backward()
+
+    with torch.no_grad():
+        vertices = vertices_in_camera(renderer.geometry, link_transforms(renderer.scene, state)[0])
+    faces, K = renderer.geometry.faces, state.intrinsics[0]
+    size = (renderer.width, renderer.height)
+    return {
+        "visibility, compiled kernel": milliseconds(
+            lambda: rasterize(vertices.T.numpy(), faces.numpy(), K.tolist(), *size), runs
+        ),
+        "visibility, torch (as on a GPU)": milliseconds(lambda: visibility_torch(vertices.T, faces, K, *size), 5),
+        "segmentation": milliseconds(lambda: renderer.segment(state), runs),
+        "render forward": milliseconds(forward, runs),
+        "render forward and backward": milliseconds(both, runs),
+    }
+
+
+def iteration_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
+    """Times of the optimizer on the first frame [ms]."""
+    camera = sequence.scene.cameras[0].name
+    frame = sequence.frame(0, cameras=[camera])
+    backgrounds = {camera: sequence.background(camera)}
+    settings = OptimizerSettings(iterations=iterations)
+    began = time.perf_counter()
+    optimizer = FrameOptimizer(
+        sequence.scene, frame, backgrounds, FeatureExtractor.load(), settings=settings, cameras=[camera]
+    )
+    preparation = 1e3 * (time.perf_counter() - began)
+    seconds = [iterate.seconds for iterate in optimizer][:-1]
+    return {
+        "preparation of a frame (features of the observed image)": preparation,
+        "ACS iteration, median": 1e3 * statistics.median(seconds),
+        "ACS iteration, 95th percentile": 1e3 * float(np.percentile(seconds, 95)),
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
+    parser.add_argument("--runs", type=int, default=30)
+    arguments = parser.parse_args()
+    sequence = Sequence.open(arguments.sequence)
+    camera = sequence.scene.cameras[0]
+    faces = sum(len(mesh.faces) for arm in sequence.scene.arms for mesh in arm.robot.meshes)
+    table = Table(
+        title=f"{sequence.name}: {len(sequence.scene.arms)} arms, {faces} triangles, {camera.width}x{camera.height}"
+    )
+    table.add_column("what")
+    table.add_column("ms", justify="right")
+    for name, value in {
+        **render_figures(sequence, arguments.runs),
+        **iteration_figures(sequence, arguments.runs),
+    }.items():
+        table.add_row(name, f"{value:.1f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
