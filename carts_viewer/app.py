@@ -87,6 +87,7 @@ class ViewerApp:
         self.stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
         self.display = PageDisplay(self.page, self._session, self._painter, self.stage, panels)
         self.page.on_drawn(self._on_drawn)
+        self.page.on_released(lambda: self.mailbox.put(ask.Released()))
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
 
@@ -170,7 +171,7 @@ class ViewerApp:
 
     def _build(self, state: ViewState) -> list[Panel]:
         """Lay out the page: browsing, overlay and joints on the left, optimizing, export and help on the right."""
-        page, session, emit = self.page, self._session, self.mailbox.put
+        page, session, emit, waits = self.page, self._session, self.mailbox.put, self.mailbox.waits
         gui = page.server.gui
         gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
         gui.set_panel_label("CaRTS")
@@ -178,11 +179,11 @@ class ViewerApp:
         gui.main_panel.set_width(_PANEL_WIDTH)
         panels: list[Panel] = [
             MessagePanel(page, emit),
-            BrowsePanel(page, session, emit),
-            OverlayPanel(page, session, state, emit),
+            BrowsePanel(page, session, emit, waits),
+            OverlayPanel(page, session, state, emit, waits),
         ]
         with gui.add_folder("Joints"):
-            self.joints = JointsPanel(page, session, state, emit, self.mailbox.waits)
+            self.joints = JointsPanel(page, session, state, emit, waits)
         right = gui.add_panel()
         with right.add_tab("Optimize"):
             panels += [
@@ -254,10 +255,12 @@ def serve(
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
     with app:
-        print(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.", flush=True)
-        if open_browser:
-            webbrowser.open(app.url)
         try:
+            print(
+                f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.", flush=True
+            )
+            if open_browser:
+                webbrowser.open(app.url)
             threading.Event().wait()
         except KeyboardInterrupt:
             print("\nClosing.", flush=True)

@@ -166,8 +166,8 @@ def _record_pictures(app: ViewerApp, arm: str) -> list[tuple[float, float]]:
     row = [own.name for own in app.scene.arms].index(arm)
 
     def recorded(state: Any) -> None:
-        show(state)
         shown.append((time.perf_counter(), float(state.pose.scene.joint_positions[row][0])))
+        show(state)
 
     app.display.show_picture = recorded
     return shown
@@ -178,8 +178,8 @@ def _wait_for(moved: float, value: float, pictures: list[tuple[float, float]], a
     made = next((at for at, shown in pictures if shown >= value - 1e-3), None)
     if made is None:
         return float("inf")
-    # A picture has arrived at the first arrival not much before its making was noted: both clocks are this process's.
-    return next((at - moved for at in arrivals if at >= made - 0.02), float("inf"))
+    # One picture is under way at a time, so the first arrival after its making began is its own.
+    return next((at - moved for at in arrivals if at >= made), float("inf"))
 
 
 def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> list[tuple[int, float]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from carts_core.errors import CartsError, SettingsError
 from carts_viewer import intents as ask
-from carts_viewer.exporting import ZipExport, frame_mask
+from carts_viewer.exporting import ZipExport, file_name, frame_mask
 from carts_viewer.layers import Layer
 from carts_viewer.picture import Painter
 from carts_viewer.running import ActiveRun, OptimizerFactory
@@ -22,8 +22,6 @@ SPEEDS = (0.5, 60.0)
 """Slowest and fastest playing [frames/s]."""
 LARGEST_PERTURBATION = 30.0
 """[deg and mm]."""
-DRAG_PAUSE = 0.8
-"""A slider that rests longer than this begins a new step of undo [s]."""
 _REASONS = {
     "iterations": "Done, best iterate kept",
     "not optimized": "Evaluated only, as the solver says",
@@ -49,15 +47,22 @@ class Controller:
         self._run: ActiveRun | None = None
         self._export: tuple[ZipExport, int] | None = None
         self._next_frame_at = 0.0
-        self._last_drag: tuple[tuple[str, int] | None, float, object] = (None, 0.0, object())
+        self._drag: tuple[object, tuple[str, int] | None] = (object(), None)
         self._started_at: Pose | None = None
 
-    def fail(self, error: Exception) -> None:
-        """Show an error to the user; whatever was going on stops."""
+    def fail(self, error: Exception, *, stop: bool) -> None:
+        """Show an error to the user.
+
+        Args:
+            error: What happened.
+            stop: Stop whatever is going on; for errors of what is going on itself.
+        """
         text = str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"
-        self._end_run(None)
-        self._export = None
-        self._set(error=text, playing=False, export=None, busy=None)
+        self._set(error=text, busy=None)
+        if stop:
+            self._end_run("Stopped by an error")
+            self._export = None
+            self._set(playing=False, export=None)
 
     def say(self, text: str | None) -> None:
         """Tell the user what is being prepared; None when nothing is."""
@@ -94,8 +99,13 @@ class Controller:
             return
         if state.maps is not None and state.camera in state.maps.cameras:
             return
-        run = self._make_run((state.camera,))
-        iterate = run.step()
+        try:
+            run = self._make_run((state.camera,))
+            iterate = run.step()
+        except CartsError:
+            # Without weights, say, there is nothing to show, and trying again with every picture would not help.
+            self._set(layer=Layer.MASK)
+            raise
         self._set(maps=None if iterate is None else Maps(iterate, run.cameras), busy=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
@@ -156,7 +166,13 @@ class Controller:
     @handle.register
     def _(self, intent: ask.SetJoint) -> None:
         scene = self._session.with_joint(self.state.pose.scene, intent.arm, intent.joint, _finite(intent.value))
-        self._edit(Pose(scene, Source.EDITED), merges=self._drag((intent.arm, intent.joint)))
+        # All events of one joint until it is let go of are one step of undo.
+        self._drag = (self._drag[0], (intent.arm, intent.joint))
+        self._edit(Pose(scene, Source.EDITED), merges=self._drag)
+
+    @handle.register
+    def _(self, intent: ask.Released) -> None:
+        self._drag = (object(), None)
 
     @handle.register
     def _(self, intent: ask.BackToMeasured) -> None:
@@ -242,7 +258,7 @@ class Controller:
     @handle.register
     def _(self, intent: ask.ExportMask) -> None:
         state = self.state
-        name = f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}.png"
+        name = file_name(f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
         self._deliver(intent.client_id, name, frame_mask(self._painter, state.pose, state.camera))
 
     @handle.register
@@ -298,14 +314,6 @@ class Controller:
         optimizer = self._optimizers.make(state.index, state.domain, cameras, state.pose, state.settings, state.free)
         return ActiveRun(optimizer, scene, state.pose, cameras)
 
-    def _drag(self, joint: tuple[str, int]) -> object:
-        """The mark of the drag that this event of a slider belongs to: the same joint, and soon after the last one."""
-        now = time.monotonic()
-        before, then, mark = self._last_drag
-        mark = mark if before == joint and now - then < DRAG_PAUSE else object()
-        self._last_drag = (joint, now, mark)
-        return mark
-
     def _start_run(self) -> None:
         if self.state.settings_error is not None:
             raise SettingsError(self.state.settings_error)
@@ -355,7 +363,7 @@ class Controller:
             self._set(export=ExportState(export.done, export.total))
             return
         self._export = None
-        self._deliver(client_id, f"{self._session.sequence.name}.zip", export.finish())
+        self._deliver(client_id, file_name(self._session.sequence.name) + ".zip", export.finish())
         self._set(export=None)
 
     def _set_free(self, **changes: Any) -> None:

@@ -43,10 +43,11 @@ class PageDisplay:
                 if new_frame:
                     self._stage.show_frame(state.frame.images[state.camera], camera)
                 self._stage.show_overlay(overlay, camera)
-                if new_pose:
-                    self._stage.show_pose(state.pose.scene, state.camera)
             self._page.server.flush()
             self._pace.sent()
+            # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
+            if new_pose:
+                self._stage.show_pose(state.pose.scene, state.camera)
         self._shown = state
 
     def show_panels(self, state: ViewState) -> None:

@@ -1,6 +1,7 @@
 """Files that people take away: a mask as PNG, or all masks and the kinematics table as one zip."""
 
 import io
+import re
 import zipfile
 
 from carts_core.export import KinematicsRow, kinematics_csv, mask_png
@@ -12,6 +13,11 @@ from carts_viewer.state import Pose
 def frame_mask(painter: Painter, pose: Pose, camera: str) -> bytes:
     """The rendered mask of a pose in one camera, as a PNG file of the camera's own size."""
     return mask_png(painter.arm_ids(pose.scene, camera) >= 0)
+
+
+def file_name(text: str) -> str:
+    """A name from a sequence file as part of a path that leads nowhere else."""
+    return re.sub(r"[^\w.-]+", "_", text).lstrip(".") or "_"
 
 
 class ZipExport:
@@ -38,7 +44,7 @@ class ZipExport:
         frame = sequence.frame(self.done, cameras=[])
         pose = self._corrected.get(self.done) or self._session.measured(frame)
         for camera in sequence.scene.cameras:
-            name = f"masks/{camera.name}/{frame.frame_id}.png"
+            name = f"masks/{file_name(camera.name)}/{file_name(frame.frame_id)}.png"
             self._zip.writestr(name, frame_mask(self._painter, pose, camera.name), zipfile.ZIP_STORED)
         self._rows.append(KinematicsRow(frame.frame_id, str(pose.source), self._session.joints(pose.scene)))
         self.done += 1

@@ -102,6 +102,11 @@ class SetJoint(Intent):
 
 
 @dataclass(frozen=True)
+class Released(Latest):
+    """The slider or field was let go of; what comes next is another step of undo."""
+
+
+@dataclass(frozen=True)
 class BackToMeasured(Intent):
     """Forget this frame's corrections of one arm, or of all of them."""
 

@@ -1,4 +1,4 @@
-"""When the next picture may be sent: one at a time, as fast as the slowest tab draws, and never slower than 10 Hz.
+"""When the next picture may be sent: one at a time, as fast as the slowest tab draws, and never slower than 12 Hz.
 
 A browser drops a WebGL picture that a newer one overtakes while it is being decoded, so sending faster than a tab can
 draw shows less, not more. Each tab says when it has drawn; one that is hidden says nothing, hence the limit in time.
@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-LONGEST_WAIT = 0.1
+LONGEST_WAIT = 0.08
 """After this long the next picture is sent whether the last one was drawn or not [s]."""
 _REMEMBERED = 3.0
 

@@ -9,6 +9,7 @@ viser is pinned to one minor version, and the browser tests drive all of this en
 
 import contextlib
 import functools
+import html
 import http
 import io
 import json
@@ -54,6 +55,8 @@ class Page:
         self.url = f"http://{host}:{self.server.get_port()}"
         # The page writes into this invisible field when it has drawn a new overlay.
         self._drawn = self.server.gui.add_text("drawn", "", visible=False)
+        # And into this one when somebody lets go of a slider or leaves a field.
+        self._released = self.server.gui.add_text("released", "", visible=False)
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -67,6 +70,14 @@ class Page:
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 callback(event.client_id)
+
+    def on_released(self, callback: Callable[[], None]) -> None:
+        """Call `callback` on the event loop whenever somebody lets go of a slider or leaves a field."""
+
+        @self._released.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client_id is not None:
+                callback()
 
     def tell(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
         """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
@@ -151,12 +162,12 @@ class Page:
         return _response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
-        configuration = json.dumps({"drawn": self.drawn_id})
+        configuration = json.dumps({"drawn": self.drawn_id, "released": self._released._impl.uuid})
         return (
             _index_of_viser()
             .replace(
                 _TITLE,
-                f"<title>{self._title}</title>"
+                f"<title>{html.escape(self._title)}</title>"
                 '<link rel="icon" href="/static/icon.svg" />'
                 '<link rel="stylesheet" href="/static/page.css" />'
                 f"<script>window.cartsConfiguration = {configuration};</script>"

@@ -23,6 +23,7 @@ _LENS_COLOR = (45, 212, 167)
 _OTHER_COLOR = (150, 160, 165)
 _JPEG_QUALITY = 88
 _DEPTH_SHARE = 0.25
+_LEAST_DEPTH = 0.005
 _OVERLAY_SHARE = 0.99
 
 
@@ -39,7 +40,7 @@ class Stage:
         """
         self._server = server
         self._scene = scene
-        self._depth = _DEPTH_SHARE * _distance_of_arms(scene, state, camera)
+        self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
         self._links: list[list[viser.FrameHandle]] = []
         self._outlines: dict[str, viser.LineSegmentsHandle] = {}
         self._planes: dict[str, tuple[Camera, viser.ImageHandle]] = {}

@@ -82,7 +82,7 @@ class Worker:
         self._set_resting(False)
         for intent in intents:
             self._attempt(lambda intent=intent: self._controller.handle(intent))
-        self._attempt(self._controller.advance)
+        self._attempt(self._controller.advance, stop=True)
         self._publish()
 
     def _set_resting(self, resting: bool) -> None:
@@ -100,22 +100,23 @@ class Worker:
 
     def _publish(self) -> None:
         if self._pictured is not self._controller.state and self._display.ready_in() <= 0.0:
-            self._controller.map()
-            self._display.show_picture(self._controller.state)
+            self._attempt(self._controller.map)
+            self._attempt(lambda: self._display.show_picture(self._controller.state))
             # Numbers come after the picture: somebody may be dragging.
-            self._controller.score()
+            self._attempt(self._controller.score)
+            # Also after an error, which would otherwise be met again at once, and for ever.
             self._pictured = self._controller.state
         if self._shown is not self._controller.state:
             self._display.show_panels(self._controller.state)
             self._shown = self._controller.state
 
-    def _attempt(self, work: Callable[[], None]) -> None:
+    def _attempt(self, work: Callable[[], None], *, stop: bool = False) -> None:
         """Do something; an error is shown in the page and the worker goes on."""
         try:
             work()
         except CartsError as error:
-            self._controller.fail(error)
+            self._controller.fail(error, stop=stop)
         except Exception as error:
             # The traceback helps whoever reads the terminal; the page shows what happened.
             _log.exception("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"))
-            self._controller.fail(error)
+            self._controller.fail(error, stop=stop)

@@ -190,11 +190,29 @@
     window.addEventListener("dblclick", (event) => { if (inPicture(event)) showEndoscope(); }, { capture: true });
   }
 
-  // ---- Tell the server what has been drawn -------------------------------------------------------------------------
+  // ---- Tell the server what has been drawn, and when a drag is over ------------------------------------------------
 
   const tab = Math.random().toString(36).slice(2);
+  let reports = 0;
+
+  /** Put a new text into one of the invisible fields that the server listens to. */
+  function report(field) {
+    reports += 1;
+    viser()?.sendMessage({
+      type: "GuiUpdateMessage", uuid: window.cartsConfiguration[field], updates: { value: `${tab} ${reports}` },
+    });
+  }
+
+  const HELD_BACK = 150; // viser holds the last value of a slider back by up to 50 ms; the report must come after it
+  const isControl = (event) => event.target instanceof Element && event.target.closest("[role=slider], input");
+  let grabbed = false;
+  const letGo = () => { if (grabbed) { grabbed = false; setTimeout(() => report("released"), HELD_BACK); } };
+  window.addEventListener("pointerdown", (event) => {
+    grabbed ||= event.target instanceof Element && event.target.closest(".mantine-Slider-root") !== null;
+  }, { capture: true });
+  window.addEventListener("pointerup", letGo, { capture: true });
+  window.addEventListener("focusout", (event) => { if (isControl(event)) { grabbed = true; letGo(); } });
   let drawnTexture = null;
-  let drawnCount = 0;
 
   /** WebGL drops a picture that a newer one overtakes while it is being decoded, so the server waits for this word. */
   function reportDrawn() {
@@ -202,10 +220,7 @@
     viser()?.nodeRefFromName[OVERLAY]?.traverse((child) => { texture ??= child.material?.map ?? null; });
     if (texture && texture.uuid !== drawnTexture) {
       drawnTexture = texture.uuid;
-      drawnCount += 1;
-      viser().sendMessage({
-        type: "GuiUpdateMessage", uuid: window.cartsConfiguration.drawn, updates: { value: `${tab} ${drawnCount}` },
-      });
+      report("drawn");
     }
   }
 

@@ -5,7 +5,7 @@ import viser
 from carts_viewer import intents as ask
 from carts_viewer.controller import SPEEDS
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Scores, Source, ViewState
 
@@ -19,9 +19,10 @@ _SOURCES = {
 class BrowsePanel:
     """Frame slider, transport buttons, domain and camera."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
+    def __init__(self, page: Page, session: Session, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         sequence = session.sequence
+        self._waits = waits
         self._count = len(sequence)
         # Shown on while those of a newer pose are being computed, or the line would jump.
         self._scores = Scores()
@@ -48,7 +49,10 @@ class BrowsePanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
-        write(self._frame, state.index + 1)
+        if not self._waits(ask.ShowFrame):
+            write(self._frame, state.index + 1)
+        if not self._waits(ask.SetSpeed):
+            write(self._speed, state.fps)
         write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
         write(self._camera, state.camera)
         self._play.label = "Stop" if state.playing else "Play"

@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
 import viser
@@ -12,6 +12,10 @@ from carts_viewer.state import ViewState
 
 Emit = Callable[[Intent], None]
 """Hands an intent to the worker; never blocks."""
+
+
+Waits = Callable[[Hashable], bool]
+"""Whether an intent of this key waits for the worker; then its widget is ahead of the state and must not be set."""
 
 
 class Panel(Protocol):

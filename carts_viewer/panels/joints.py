@@ -1,14 +1,14 @@
 """Joint positions by hand: a slider with a number field per joint, in degrees and millimetres, and what undoes them."""
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 import viser
 
 from carts_viewer import intents as ask
 from carts_viewer.controller import LARGEST_PERTURBATION
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, humanized, on_click, on_input
+from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid
 from carts_viewer.session import JointRange, Session
 from carts_viewer.state import ViewState
 
@@ -20,16 +20,14 @@ _STEP = 0.05
 class JointsPanel:
     """One tab per arm with its joints, and the buttons that concern all arms."""
 
-    def __init__(
-        self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Callable[[Hashable], bool]
-    ) -> None:
+    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         """
         Args:
             page: Where to build the widgets, in the current container.
             session: The open sequence.
             state: The state to begin with.
             emit: Takes the intents.
-            waits: Whether an intent of this key waits for the worker, in which case its widget is ahead of the state.
+            waits: Whether a slider is ahead of the state.
         """
         gui = page.server.gui
         self._session = session
@@ -63,7 +61,8 @@ class JointsPanel:
 
     def perturb(self) -> ask.Perturb:
         """The perturbation that the fields describe."""
-        return ask.Perturb(float(self._degrees.value), int(self._seed.value))
+        seed = int(self._seed.value) if valid(self._seed) else 0
+        return ask.Perturb(float(self._degrees.value), max(0, seed))
 
     def slider(self, arm: str, joint: int) -> viser.GuiSliderHandle[float]:
         """The slider of one joint."""

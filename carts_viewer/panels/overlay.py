@@ -3,7 +3,7 @@
 from carts_viewer import intents as ask
 from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, on_input, write
+from carts_viewer.panels.inputs import Emit, Waits, escaped, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
@@ -11,9 +11,10 @@ from carts_viewer.state import ViewState
 class OverlayPanel:
     """Layer and opacity, with a legend and the fit to the truth."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
+    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         sequence = session.sequence
+        self._waits = waits
         self._arms = [arm.name for arm in sequence.scene.arms]
         options = offered_layers(session)
         with gui.add_folder("Overlay"):
@@ -26,6 +27,8 @@ class OverlayPanel:
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
         write(self._layer, str(state.layer))
+        if not self._waits(ask.SetOpacity):
+            write(self._opacity, round(100 * state.opacity))
         self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
 
     def _explain(self, state: ViewState) -> str:
@@ -53,4 +56,5 @@ def offered_layers(session: Session) -> list[Layer]:
 
 
 def _swatch(color: tuple[int, int, int], name: str) -> str:
-    return f'<span class="carts-key"><span class="carts-swatch" style="background: rgb{color}"></span>{name}</span>'
+    square = f'<span class="carts-swatch" style="background: rgb{color}"></span>'
+    return f'<span class="carts-key">{square}{escaped(name)}</span>'

@@ -115,6 +115,17 @@ def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callab
         assert app.wait_until_shown().index == 1
 
 
+def test_a_layer_that_cannot_be_computed_is_an_error_once_and_not_for_ever(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    with ViewerApp.open(tiny_sequence(), port=0, weights=tmp_path / "none.safetensors") as app:
+        app.mailbox.put(ask.ShowLayer(Layer.ATTENTION))
+        state = app.wait_until_shown(60)
+        assert "none.safetensors" in (state.error or "") and state.layer is Layer.MASK
+        app.mailbox.put(ask.DismissError())
+        assert app.wait_until_shown().error is None
+
+
 def test_the_page_carries_our_script_style_and_title(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
     response = _get(app, "/")

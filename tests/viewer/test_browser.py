@@ -158,6 +158,40 @@ def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
     assert np.abs(tab.canvas.look().astype(int) - before).max() > 100
 
 
+def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_marked()
+    tab = open_tab(app)
+    tab.canvas.eventually_registered()
+    slider = app.joints.slider("PSM1", 0)
+    thumb = tab.page.locator(f"[id='{app.page.element_id(slider)}'] [role=slider]").bounding_box()
+    assert thumb is not None
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    for step in range(30):
+        tab.page.mouse.move(x + 12 * math.sin(step / 5), y)
+    tab.page.mouse.move(x - 10, y)
+    tab.page.mouse.up()
+    final = eventually(
+        lambda: float(app.state.pose.scene.joint_positions[0][0]),
+        lambda at: abs(at - math.radians(slider.value)) < 1e-3,
+    )
+    app.wait_until_shown()
+    assert tab.canvas.eventually_registered() <= 1.5
+    assert math.degrees(final) < slider.max - 20.5
+    assert app.state.undoable == 1
+    # The whole drag is one step of undo, and the next drag is another.
+    tab.page.wait_for_timeout(300)
+    tab.page.mouse.move(x - 10, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + 5, y)
+    tab.page.mouse.move(x + 8, y)
+    tab.page.mouse.up()
+    eventually(lambda: app.state.undoable, lambda count: count == 2)
+
+
 def test_run_lets_the_loss_fall_and_the_overlay_follow(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:

@@ -107,6 +107,15 @@ def test_back_to_measured_forgets_the_correction(desk: Desk) -> None:
     assert desk.joint() == pytest.approx(before) and not desk.session.corrected()
 
 
+def test_moving_a_joint_until_it_is_let_go_of_is_one_step_of_undo(desk: Desk) -> None:
+    desk.do(ask.SetJoint("PSM1", 0, 0.1), ask.SetJoint("PSM1", 0, 0.2))
+    assert desk.state.undoable == 1
+    desk.do(ask.SetJoint("PSM1", 1, 0.2))
+    assert desk.state.undoable == 2
+    desk.do(ask.Released(), ask.SetJoint("PSM1", 1, 0.1))
+    assert desk.state.undoable == 3
+
+
 def test_undo_returns_to_the_frame_of_the_change(desk: Desk) -> None:
     before = desk.joint()
     desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.MoveFrame(2), ask.Undo())
@@ -266,10 +275,16 @@ def test_playing_goes_round(desk: Desk) -> None:
     assert not desk.do(ask.Play()).playing
 
 
-def test_an_error_stops_everything_and_is_part_of_the_state(desk: Desk) -> None:
+def test_an_error_of_what_is_going_on_stops_it_and_is_part_of_the_state(desk: Desk) -> None:
     desk.do(ask.Run(), ask.Play(True), ask.ExportAll(1))
-    desk.controller.fail(CartsError("the disk is on fire"))
+    desk.controller.fail(CartsError("the disk is on fire"), stop=True)
     state = desk.state
     assert state.error == "the disk is on fire" and not state.playing and state.export is None
     assert state.run.phase is Phase.IDLE and desk.controller.patience() is None
     assert desk.do(ask.DismissError()).error is None
+
+
+def test_an_error_of_something_else_leaves_the_run_alone(desk: Desk) -> None:
+    desk.do(ask.Run())
+    desk.controller.fail(CartsError("no such frame"), stop=False)
+    assert desk.state.run.phase is Phase.RUNNING and desk.state.error == "no such frame"

@@ -21,7 +21,7 @@ def test_the_first_picture_may_go_at_once(clock: Clock) -> None:
     assert Pace(clock).ready_in() == 0.0
 
 
-def test_with_nobody_watching_pictures_go_at_ten_hertz(clock: Clock) -> None:
+def test_with_nobody_watching_pictures_go_at_a_steady_rate(clock: Clock) -> None:
     pace = Pace(clock)
     pace.sent()
     assert pace.ready_in() == pytest.approx(LONGEST_WAIT)
