@@ -26,7 +26,7 @@ class ObjectiveWeights:
     """Binary cross-entropy of the instrument's probability, as in the paper."""
     dice: float = 0.5
     """One minus soft Dice per image, so that small instruments count as much as large ones."""
-    consistency: float = 0.5
+    consistency: float = 1.0
     """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
     parts: float = 0.2
     """Cross-entropy of a second head that tells shaft, wrist and jaws apart; it is dropped after training."""
@@ -89,17 +89,19 @@ def consistency_loss(
     """How far cosine similarities are from what alignment needs, near the instruments (where ACS attends).
 
     Where both images show the same class the cosine should be 1; where one shows background and the other an
-    instrument, not above 0; where one shows the shaft and the other the head, not above 0.6.
+    instrument, not above 0; where one shows the shaft and the other the head, not above 0.6. Each of these counts by
+    its own mean, since background would outweigh instruments otherwise.
     """
     overlap = (features_a * features_b).sum(1)
     similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
     instrument = ((classes_a > 0) | (classes_b > 0)).to(similarity.dtype)
     near = _dilated(instrument)
-    same = near * (classes_a == classes_b)
+    same = (classes_a == classes_b).to(similarity.dtype)
     moved = ((classes_a > 0) != (classes_b > 0)).to(similarity.dtype)
     other_part = instrument * (classes_a != classes_b) * (1 - moved)
     return (
-        _weighted_mean(1 - similarity, same)
+        _weighted_mean(1 - similarity, same * instrument)
+        + _weighted_mean(1 - similarity, same * near * (1 - instrument))
         + _weighted_mean(similarity.clamp(min=0), moved)
         + _weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
     )

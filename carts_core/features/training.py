@@ -18,7 +18,7 @@ from .objective import Objective
 from .report import write_report
 from .training_config import TrainingConfig
 from .validation import Validation, validate
-from .weights import save_weights
+from .weights import read_weights, save_weights
 
 WEIGHTS_FILE = "features.safetensors"
 _LOG_EVERY = 10
@@ -65,7 +65,7 @@ def train(
 
     Raises:
         SettingsError: `output` holds a run with other settings.
-        WeightsError: its checkpoint cannot be read.
+        WeightsError: its checkpoint, or the weights to start from, cannot be read.
         RobotError: a robot cannot be loaded.
     """
     output.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ class _Run:
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         self.config, self.output = config, output
         torch.manual_seed(config.seed)
-        self.network = channels_last(FeatureNetwork(config.architecture).to(config.device))
+        self.network = channels_last(_first_network(config).to(config.device))
         self.objective = Objective(config.architecture.widths[0], config.objective).to(config.device)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
         parameters = [*self.network.parameters(), *self.objective.parameters()]
@@ -171,6 +171,18 @@ class _Run:
         save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
 
 
+def _first_network(config: TrainingConfig) -> FeatureNetwork:
+    if config.start is None:
+        return FeatureNetwork(config.architecture)
+    network = read_weights(config.start).network
+    if network.architecture != config.architecture:
+        raise SettingsError(
+            f"{config.start} holds a network of {network.architecture}, but {config.architecture} is asked for. Give "
+            "the architecture of the file, or start from random weights."
+        )
+    return network
+
+
 def schedule(step: int, warmup: int, steps: int) -> float:
     """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
     rise = min(1.0, (step + 1) / max(warmup, 1))
@@ -179,7 +191,8 @@ def schedule(step: int, warmup: int, steps: int) -> float:
 
 
 def config_json(config: TrainingConfig) -> str:
-    """The settings as JSON; robots by file name, so that a run can move with its folder."""
+    """The settings as JSON; files by name, so that a run can move with its folder."""
     settings = asdict(config)
+    settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
     return json.dumps(settings)

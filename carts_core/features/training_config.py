@@ -16,6 +16,8 @@ class TrainingConfig:
 
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots whose images are made."""
+    start: Path | None = None
+    """Weights file to start from, for fine-tuning; random weights without it."""
     steps: int = 4000
     """Optimizer steps."""
     batch_pairs: int = 8

@@ -10,6 +10,7 @@ from carts_core.features.domain_randomization import (
     PairGenerator,
     PairSettings,
     TrainingPair,
+    variants,
 )
 from carts_core.features.domain_randomization.backgrounds import random_background
 from carts_core.features.domain_randomization.gbuffer import render_gbuffer
@@ -62,7 +63,8 @@ def test_about_half_of_the_hybrids_show_the_observed_kinematics(pairs: list[Trai
     assert 5 <= same.sum() <= len(pairs) - 5
 
 
-def test_the_hybrid_shows_the_rendering_exactly_where_its_classes_say(shipped_psm: Robot):
+def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Robot, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(variants, "PERFECT_MODEL", 1.0)
     settings = PairSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
     pair = PairGenerator([shipped_psm], settings, seed=11)()
     overlap = (pair.observed_classes > 0) & (pair.hybrid_classes > 0)

@@ -104,12 +104,12 @@ class PairGenerator:
         background = add_clutter(rng, random_background(rng, *size)).astype(np.float32)
         camera_seed = int(rng.integers(2**63))
         observed = self._observe(variant, fine, background, coverage, camera_seed)
-        rendered, hybrid_view = placements, view
+        rendered = placements
         if rng.random() >= settings.same_kinematics:
             scale = float(rng.uniform(0.3, 2.0))
             pairs = zip(variant.geometries, placements, strict=True)
             rendered = [perturbed(rng, geometry, placement, scale) for geometry, placement in pairs]
-            hybrid_view = _look(variant.geometries, rendered, intrinsics, *size)
+        hybrid_view = _look(variant.rendered, rendered, intrinsics, *size)
         mean_background = self._mean_background(background, camera_seed)
         hybrid_image = self._render_hybrid(variant, rendered, intrinsics, mean_background)
         return TrainingPair(

@@ -15,25 +15,35 @@ from .geometry import RobotGeometry
 THICKNESS = (0.88, 1.15)
 """Factor on the thickness of links, so that the network is not tied to one instrument's exact shape."""
 
+PERFECT_MODEL = 0.5
+"""Share of scenes whose rendered arms have exactly the proportions of the observed ones."""
+
 
 @dataclass(frozen=True)
 class Variant:
     """One or two arms, ready to be posed, shaded and rendered."""
 
     geometries: tuple[RobotGeometry, ...]
+    """The arms that the camera observes."""
+    rendered: tuple[RobotGeometry, ...]
+    """The arms as the optimizer knows them: the same, or of slightly other proportions, as models are."""
     renderer: Renderer
-    """The optimizer's renderer of the same arms, for hybrid images."""
+    """The optimizer's renderer of `rendered`, for hybrid images."""
 
 
 def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
     """A scene of `arms` arms, each a robot of `robots` with random colours and thickness."""
-    chosen = [_vary(rng, robots[int(rng.integers(len(robots)))]) for _ in range(arms)]
+    chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
+    observed = [_vary(rng, robot) for robot in chosen]
+    rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]
     scene = Scene(
-        tuple(Arm(f"arm{index}", robot, np.eye(4)) for index, robot in enumerate(chosen)),
+        tuple(Arm(f"arm{index}", robot, np.eye(4)) for index, robot in enumerate(rendered)),
         (Camera("training", width, height, (float(width), float(width), width / 2, height / 2), np.eye(4)),),
         _random_light(rng),
     )
-    return Variant(tuple(RobotGeometry(robot) for robot in chosen), Renderer(scene, width=width, height=height))
+    geometries = tuple(RobotGeometry(robot) for robot in observed)
+    known = geometries if rendered is observed else tuple(RobotGeometry(robot) for robot in rendered)
+    return Variant(geometries, known, Renderer(scene, width=width, height=height))
 
 
 def _vary(rng: np.random.Generator, robot: Robot) -> Robot:
