@@ -74,4 +74,4 @@ class _Chart:
             return text
         if self._name == _LOSS:
             return f"{text} · lowest <b>{kept:.3g}</b> at iteration {best}"
-        return f"{text} · there <b>{kept:.3g}</b>"
+        return f"{text} · kept <b>{kept:.3g}</b>"
