@@ -17,6 +17,7 @@ from carts_core.features.loader import training_batches, validation_set
 from carts_core.features.network import Architecture
 from carts_core.features.training import TrainingProgress, schedule, train
 from carts_core.features.training_config import TrainingConfig
+from carts_core.features.weights import read_weights
 
 SMALL = {
     "batch_pairs": 2,
@@ -123,6 +124,21 @@ def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
     train(small_config(steps=5), tmp_path)
     with pytest.raises(SettingsError, match=r"learning_rate was 0\.01 and is 0\.5.*another output folder"):
         train(small_config(steps=10, learning_rate=0.5), tmp_path)
+
+
+def test_fine_tuning_starts_from_the_given_weights(tmp_path: Path, small_weights: Path):
+    result = train(small_config(start=small_weights, steps=1, learning_rate=1e-9, average=0.0), tmp_path)
+    given = dict(read_weights(small_weights).network.named_parameters())
+    for name, value in read_weights(result.weights).network.named_parameters():
+        torch.testing.assert_close(value, given[name], atol=1e-6, rtol=1e-4)
+
+
+def test_fine_tuning_weights_of_another_architecture_is_refused(tmp_path: Path, small_weights: Path):
+    other = Architecture(widths=(4, 6), encoder_convolutions=(1, 1), decoder_convolutions=(1,))
+    with pytest.raises(
+        SettingsError, match=r"small\.safetensors holds a network of .*Give the architecture of the file"
+    ):
+        train(small_config(start=small_weights, architecture=other), tmp_path)
 
 
 def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):

@@ -34,12 +34,13 @@ def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarr
     turn[:, 2] += reach * np.cos(heading), reach * np.sin(heading)
     moved = cv2.warpAffine(coverage, turn, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     soft = cv2.GaussianBlur(moved, (0, 0), np.clip(reach * rng.uniform(0.03, 0.2), 0.6, 8))
-    return _darken(rng, image, soft)
+    # Close to what casts it a shadow can be nearly black.
+    return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
 
 
-def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    strength = rng.uniform(0.12, 0.6) * np.clip(rng.normal(1, 0.06, 3), 0.8, 1.2)
-    return image * (1 - shape[..., None] * strength.astype(np.float32))
+def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, strongest: float = 0.6) -> np.ndarray:
+    strength = rng.uniform(0.12, strongest) * np.clip(rng.normal(1, 0.06, 3), 0.8, 1.2)
+    return image * np.clip(1 - shape[..., None] * strength.astype(np.float32), 0.05, 1)
 
 
 def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
