@@ -22,6 +22,7 @@ from .rendering.geometry import link_transforms, vertices_in_camera
 from .rendering.visibility_numba import rasterize
 from .resources import sample_sequence
 from .scene import SceneState
+from .threads import leave_a_core_free
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
@@ -87,6 +88,7 @@ def iteration_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
 
 def main() -> None:
     """Print the table."""
+    leave_a_core_free()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--runs", type=int, default=30)

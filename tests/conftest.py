@@ -16,6 +16,7 @@ from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
 from carts_core.robot import Robot
 from carts_core.scene import Arm, Scene
+from carts_core.threads import leave_a_core_free
 
 ROOT = Path(__file__).resolve().parents[1]
 FOCAL_PER_WIDTH = 1.2
@@ -30,6 +31,11 @@ def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CARTS_CACHE", str(pytestconfig.cache.mkdir("meshes")))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _as_many_threads_as_the_command_uses() -> None:
+    leave_a_core_free()
 
 
 @pytest.fixture(scope="session")

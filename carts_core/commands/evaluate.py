@@ -1,7 +1,6 @@
 """`carts evaluate`: optimize frames and compare them with the truth."""
 
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +12,7 @@ from rich.table import Table
 
 from ..data import Sequence
 from ..evaluation import FrameScore, evaluate, mean_score, to_json
+from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters, OptimizerSettings
 from .selection import Network, Selection, SequencePath
@@ -62,16 +62,24 @@ class Evaluate:
         )
         console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
         if self.json is not None:
-            write_text(self.json, json.dumps(to_json(scores), indent=1))
+            write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
             console.print(f"wrote {self.json}")
 
 
 def _table(scores: list[FrameScore], title: str) -> Table:
-    table = Table(title=title)
-    for column in ("domain", "camera", "Dice before", "after", "worst change", "joint MAE before [deg]", "after"):
+    table = Table(title=title, caption="MAE: of measured revolute joints. s: wall time per frame.")
+    for column in (
+        "domain",
+        "camera",
+        "Dice\nbefore",
+        "\nafter",
+        "worst\nchange",
+        "MAE [deg]\nbefore",
+        "\nafter",
+        "steps",
+        "s",
+    ):
         table.add_column(column, justify="left" if column in ("domain", "camera") else "right")
-    table.add_column("iterations", justify="right")
-    table.add_column("s per frame", justify="right")
     groups: dict[tuple[str, str], list[FrameScore]] = {}
     for score in scores:
         groups.setdefault((score.domain, score.camera), []).append(score)
@@ -94,11 +102,3 @@ def _table(scores: list[FrameScore], title: str) -> Table:
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)

@@ -1,5 +1,6 @@
 """The objective f_L of the paper for one frame: offsets in, loss and everything worth looking at out."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from ..errors import SettingsError
@@ -105,7 +107,9 @@ class FrameObjective:
         rendering = self.renderer(self.parameters.state(offsets))
         window = self._look_at(rendering.silhouette.detach(), wide)
         silhouette = window.of(rendering.silhouette)
-        represented = self._represent(hybrid(window.of(rendering.image), silhouette, window.of(self._background)))
+        layers = torch.cat([window.of(rendering.image), silhouette[:, None]], 1)
+        layers = blurred(layers, settings.wide_blur if wide else settings.blur)
+        represented = self._represent(hybrid(layers[:, :3], layers[:, 3], window.of(self._background)))
         fine = attention(silhouette, settings.attention_radius)
         if settings.loss == "l1":
             similarity = 1.0 - (represented - self._observed).abs()
@@ -145,6 +149,14 @@ class FrameObjective:
             with torch.no_grad():
                 self._observed = self._represent(wanted.of(self._images))
         return self._window
+
+
+def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[Tensor, "n channels h w"]:
+    """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
+    if deviation == 0:
+        return images
+    size = 2 * math.ceil(2.5 * deviation) + 1
+    return gaussian_blur2d(images, (size, size), (deviation, deviation), border_type="replicate")
 
 
 def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:

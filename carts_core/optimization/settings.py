@@ -40,7 +40,7 @@ class OptimizerSettings:
     """Number of steps [1]."""
     learning_rate: float = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `lever` times as many metres."""
-    decay: float = 0.9
+    decay: float = 0.75
     """Factor on the step size every `decay_every` steps [1]."""
     decay_every: int = 5
     """Steps between two decays [1]."""
@@ -52,6 +52,11 @@ class OptimizerSettings:
     """Dilation of the silhouette [px of the working image]."""
     wide_attention_radius: int = 20
     """The same during the first half of the steps, for a wide basin of convergence [px of the working image]."""
+    blur: float = 0.6
+    """Deviation of the lens blur of the rendering before it is compared [px of the working image]. A hard edge would
+    give the network a gradient that holds for the smallest of motions only."""
+    wide_blur: float = 1.6
+    """The same during the first half of the steps [px of the working image]."""
     working_width: int = 320
     """Width of the images that are compared [px]."""
     tolerance: float = 0.0
@@ -75,6 +80,8 @@ class OptimizerSettings:
             self.wide_attention_radius,
             "attention_radius to 400 px",
         )
+        _require(0 <= self.blur <= 10, "blur", self.blur, "0 to 10 px")
+        _require(self.blur <= self.wide_blur <= 20, "wide_blur", self.wide_blur, "blur to 20 px")
         _require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         _require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
@@ -86,9 +93,12 @@ class OptimizerSettings:
             loss="acs_paper",
             iterations=iterations,
             learning_rate=1e-3,
+            decay=0.9,
             prior_weight=0.0,
             lever=1.0,
             wide_attention_radius=10,
+            blur=0.0,
+            wide_blur=0.0,
         )
 
 
