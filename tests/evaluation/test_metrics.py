@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import tiny_scene
+from tiny import tiny_scene
 
 from carts_core.evaluation import dice, joint_mae_deg
 from carts_core.perturbation import perturb

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import tiny_scene
+from tiny import tiny_scene
 
 from carts_core.errors import RobotError, SettingsError
 from carts_core.optimization import FreeParameters, OptimizerSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from conftest import tiny_scene
+from tiny import tiny_scene
 
 from carts_core.rendering import Renderer
 from carts_core.robot import Robot

@@ -1,0 +1,60 @@
+"""One arm before one or two cameras: the smallest scene that shows everything."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+
+from carts_core.camera import Camera
+from carts_core.robot import Robot
+from carts_core.scene import Arm, Scene
+
+FOCAL_PER_WIDTH = 1.2
+BIAS = 0.01
+"""What the measured revolute joints are off by [rad]; prismatic ones are off by a tenth of the number [m]."""
+
+
+@dataclass(frozen=True)
+class TinyScene:
+    """What the tiny sequences show: one arm before one or two cameras, and its true joint positions."""
+
+    scene: Scene
+    truth: np.ndarray
+    measured: np.ndarray
+
+
+def _look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3], T_camera_world[:3, 3] = rotation, -rotation @ eye
+    return T_camera_world
+
+
+def _tip(robot: Robot, joint_positions: np.ndarray) -> np.ndarray:
+    """Middle of the robot's last link [m], which is a jaw of the instrument."""
+    T_base_link = robot.forward_kinematics(torch.tensor(joint_positions))[robot.meshes[-1].link].numpy()
+    return T_base_link[:3, :3] @ robot.meshes[-1].vertices.mean(0) + T_base_link[:3, 3]
+
+
+@cache
+def tiny_scene(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> TinyScene:
+    """One arm whose instrument's tip is in the middle of every camera's view."""
+    prismatic = np.array([kind == "prismatic" for kind in robot.joint_types])
+    rest = np.where(prismatic, 0.15, 0.0)
+    sway = np.linspace(-1.0, 1.0, frames)[:, None] if frames > 1 else np.zeros((1, 1))
+    truth = rest + sway * np.where(prismatic, 0.004, 0.06)
+    tip = _tip(robot, rest)
+    axis = tip / np.linalg.norm(tip)
+    side = np.cross(axis, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    views = []
+    for number, name in enumerate(cameras):
+        eye = tip - 0.06 * axis + 0.09 * side + 0.006 * number * np.cross(axis, side)
+        intrinsics = (FOCAL_PER_WIDTH * width, FOCAL_PER_WIDTH * width, width / 2, height / 2)
+        views.append(Camera(name, width, height, intrinsics, _look_at(eye, tip - 0.01 * axis, -axis)))
+    signs = np.where(np.arange(len(robot.joint_names)) % 2, -1.0, 1.0)
+    measured = truth + signs * np.where(prismatic, 0.1 * BIAS, BIAS)
+    return TinyScene(Scene((Arm("PSM1", robot, np.eye(4)),), tuple(views)), truth, measured)
