@@ -29,6 +29,8 @@ _SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 40
 _TRIES = 12
+_BLURRED = 0.7
+_BLUR = (0.4, 1.8)
 
 
 @dataclass(frozen=True)
@@ -178,8 +180,13 @@ class PairGenerator:
         )
         with torch.no_grad():
             rendering = variant.renderer(state)
-            mean = torch.from_numpy(np.ascontiguousarray(background)).permute(2, 0, 1)
-            return hybrid(rendering.image[0], rendering.silhouette[0], mean).permute(1, 2, 0).numpy()
+        layers = np.dstack([rendering.image[0].permute(1, 2, 0).numpy(), rendering.silhouette[0].numpy()])
+        if self._rng.random() < _BLURRED:  # as the optimizer does, to have a gradient that reaches further
+            layers = cv2.GaussianBlur(layers, (0, 0), self._rng.uniform(*_BLUR))
+        image, silhouette, mean = (
+            torch.from_numpy(np.ascontiguousarray(part)) for part in (layers[..., :3], layers[..., 3], background)
+        )
+        return hybrid(image.permute(2, 0, 1), silhouette, mean.permute(2, 0, 1)).permute(1, 2, 0).numpy()
 
 
 def _look(
