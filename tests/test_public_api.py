@@ -17,7 +17,7 @@ ROOTS = [Path(package.__path__[0]) for package in (carts_core, carts_viewer)]
 SOURCES = sorted(path for root in ROOTS for path in root.rglob("*.py"))
 CORE_SOURCES = [path for path in SOURCES if path.is_relative_to(ROOTS[0])]
 # The one place where the core reaches for the app: `carts view`, when it is called and not before.
-COMMAND_LINE = ROOTS[0] / "cli.py"
+COMMAND_LINE = ROOTS[0] / "commands" / "view.py"
 
 
 def _named(path: Path) -> str:
@@ -93,7 +93,8 @@ def test_the_core_does_not_know_the_viewer(path: Path) -> None:
     tree = _tree(path)
     if path == COMMAND_LINE:
         # Bodies of functions run when they are called; what remains runs on import.
-        tree.body = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
+        for scope in (tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))):
+            scope.body = [node for node in scope.body if not isinstance(node, ast.FunctionDef)]
     wrong = [
         f"{_named(path)}:{line} imports {name}"
         for name, line in _imports(tree)

@@ -104,7 +104,7 @@ def check_device(device: str) -> None:
     Raises:
         SettingsError: it does not.
     """
-    import torch  # noqa: PLC0415, torch takes a second to import, which `--help` need not wait for
+    import torch
 
     kind, _, number = device.partition(":")
     cards = torch.cuda.device_count()

@@ -20,7 +20,7 @@ class Synthesize:
 
     def run(self) -> None:
         """Write the sequence."""
-        from ..synthesis.synthesize import synthesize  # noqa: PLC0415, needs the extra `synthesis`
+        from ..synthesis.synthesize import synthesize
 
         with Progress() as bar:
             task = bar.add_task("synthesizing", total=None)

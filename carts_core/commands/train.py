@@ -22,7 +22,7 @@ class Train:
 
     def run(self) -> None:
         """Train to the end."""
-        from ..features.training import TrainingProgress, train  # noqa: PLC0415, slow to import
+        from ..features.training import TrainingProgress, train
 
         check_device(self.training.device)
         console = Console()

@@ -26,7 +26,7 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from carts_viewer.app import serve  # noqa: PLC0415, the core works without the viewer
+        from carts_viewer.app import serve
 
         serve(
             self.sequence or sample_sequence(),

@@ -36,11 +36,11 @@ class OptimizerSettings:
     """Which solver."""
     loss: Loss = "acs"
     """Which loss; see `carts_core.losses.Loss`."""
-    iterations: int = 40
+    iterations: int = 60
     """Number of steps [1]."""
     learning_rate: float = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `lever` times as many metres."""
-    decay: float = 0.75
+    decay: float = 0.82
     """Factor on the step size every `decay_every` steps [1]."""
     decay_every: int = 5
     """Steps between two decays [1]."""
@@ -52,7 +52,7 @@ class OptimizerSettings:
     """Dilation of the silhouette [px of the working image]."""
     wide_attention_radius: int = 20
     """The same during the first half of the steps, for a wide basin of convergence [px of the working image]."""
-    blur: float = 0.6
+    blur: float = 1.0
     """Deviation of the lens blur of the rendering before it is compared [px of the working image]. A hard edge would
     give the network a gradient that holds for the smallest of motions only."""
     wide_blur: float = 1.6

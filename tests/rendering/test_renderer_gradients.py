@@ -1,5 +1,7 @@
 """Gradients of image and silhouette against finite differences of a supersampled, hence antialiased, rendering."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import roma
@@ -134,7 +136,6 @@ def test_the_segmentation_is_the_silhouette_of_the_rendering(scene_and_state: tu
 
 
 def test_a_nearer_arm_hides_the_other(shipped_psm: Robot) -> None:
-    from dataclasses import replace  # noqa: PLC0415
 
     tiny = tiny_scene(shipped_psm, 1, ("left",), 160, 120)
     arm, camera = tiny.scene.arms[0], tiny.scene.cameras[0]

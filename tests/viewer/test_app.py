@@ -182,9 +182,12 @@ def test_serve_ends_with_code_2_and_a_message_when_the_sequence_is_missing(capsy
 
 
 def test_serve_prints_the_address_and_ends_cleanly_on_ctrl_c(tiny_sequence: Callable[..., Path]) -> None:
-    program = (
-        "import sys; from pathlib import Path; from carts_viewer.app import serve; serve(Path(sys.argv[1]), port=0)"
-    )
+    # A shell that runs the tests in the background makes its children ignore Ctrl-C, hence the second line.
+    program = """
+import signal, sys; from pathlib import Path; from carts_viewer.app import serve
+signal.signal(signal.SIGINT, signal.default_int_handler)
+serve(Path(sys.argv[1]), port=0)
+"""
     process = subprocess.Popen(
         [sys.executable, "-c", program, str(tiny_sequence())], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
