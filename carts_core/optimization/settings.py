@@ -52,7 +52,7 @@ class OptimizerSettings:
     """Dilation of the silhouette [px of the working image]."""
     wide_attention_radius: int = 20
     """The same during the first half of the steps, for a wide basin of convergence [px of the working image]."""
-    blur: float = 1.0
+    blur: float = 0.6
     """Deviation of the lens blur of the rendering before it is compared [px of the working image]. A hard edge would
     give the network a gradient that holds for the smallest of motions only."""
     wide_blur: float = 1.6
