@@ -24,6 +24,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from carts_core.resources import sample_sequence
+from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.stage import OVERLAY
@@ -209,6 +210,7 @@ def resident_megabytes() -> float:
 
 def main() -> None:
     """Print the figures."""
+    leave_a_core_free()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--weights", type=Path, default=None)
