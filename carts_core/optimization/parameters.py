@@ -48,6 +48,7 @@ class ParameterVector:
         self._lever = lever
         self.names: list[str] = []
         self._blocks: list[_Block] = []
+        self._joint_scales: dict[int, Tensor] = {}
         self._check_names(scene, free)
         chosen = [i for i, arm in enumerate(scene.arms) if not free.arms or arm.name in free.arms]
         lower, upper = [], []
@@ -103,7 +104,7 @@ class ParameterVector:
         self._add("joints", index, arm.name, tuple(arm.robot.joint_names[c] for c in columns), columns)
         block = self._blocks[-1]
         scales = torch.tensor([self._joint_scale(scene, index, c) for c in columns])
-        self._joint_scales = {**getattr(self, "_joint_scales", {}), block.start: scales}
+        self._joint_scales[block.start] = scales
 
     def _joint_scale(self, scene: Scene, index: int, column: int) -> float:
         return self._lever if scene.arms[index].robot.joint_types[column] == "prismatic" else 1.0

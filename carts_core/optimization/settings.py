@@ -30,7 +30,7 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """How one frame is optimized. The defaults are those that measured best; `paper()` gives the paper's."""
+    """How one frame is optimized. The defaults are a measured compromise; `paper()` gives the paper's."""
 
     solver: Solver = "adam"
     """Which solver."""
