@@ -12,7 +12,7 @@ import torch
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.features import FeatureExtractor
 from carts_core.features.checkpoint import CHECKPOINT_FILE, load_checkpoint
-from carts_core.features.domain_randomization import PairSettings
+from carts_core.features.domain_randomization import ImageSettings
 from carts_core.features.loader import training_batches, validation_set
 from carts_core.features.network import Architecture
 from carts_core.features.training import TrainingProgress, schedule, train
@@ -34,7 +34,7 @@ SMALL = {
 
 def small_config(**changes) -> TrainingConfig:
     architecture = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
-    images = PairSettings(width=64, height=48, field_width=80)
+    images = ImageSettings(width=64, height=48, field_width=80)
     return TrainingConfig(**({**SMALL, "steps": 30, "architecture": architecture, "images": images} | changes))
 
 
