@@ -1,5 +1,6 @@
 """The SQLite file: how it is made, opened, migrated and written to."""
 
+import errno
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -57,6 +58,9 @@ MIGRATIONS: tuple[str, ...] = (VERSION_1,)
 """Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
 
 
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+
+
 def create(path: Path, identity: SequenceIdentity) -> None:
     """Make an empty project; it appears under its name when it is complete.
 
@@ -82,17 +86,15 @@ def create(path: Path, identity: SequenceIdentity) -> None:
 
 
 def connect(path: Path) -> sqlite3.Connection:
-    """A connection that writes to an existing project, migrated to the present schema.
+    """A connection that writes to an existing project, which is migrated to the present schema.
 
     Raises:
-        ProjectError: it is not a project, of a newer version of this program, or cannot be written to.
+        ProjectError: it cannot be written to.
     """
     with errors_explained(path):
-        connection = sqlite3.connect(
-            f"{path.as_uri()}?mode=rw", uri=True, isolation_level=None, check_same_thread=False
-        )
+        uri = f"{path.as_uri()}?mode=rw"
+        connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
         try:
-            _check_schema(connection, path)
             connection.execute("PRAGMA trusted_schema = OFF")
             connection.execute("PRAGMA synchronous = FULL")
             _migrate(connection)
@@ -106,22 +108,16 @@ def snapshot(path: Path) -> sqlite3.Connection:
     """A copy of a project in memory, migrated there. The file stays as it is and is not held open.
 
     Raises:
-        ProjectError: it is not there, not a project, or of a newer version of this program.
+        ProjectError: it is not there, not a project, or of a newer version of carts.
     """
     if not path.is_file():
         raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
     memory = sqlite3.connect(":memory:", isolation_level=None)
     try:
         with errors_explained(path):
-            try:
-                _copy(f"{path.as_uri()}?mode=ro", path, memory)
-            except sqlite3.OperationalError:
-                # SQLite makes files beside a project that is read, which a full disk or a read-only folder refuses.
-                # Without a log of writes nobody is writing, and the file can be read as it lies.
-                if path.with_name(path.name + "-wal").exists():
-                    raise
-                _copy(f"{path.as_uri()}?mode=ro&immutable=1", path, memory)
+            _copy(path, memory)
             memory.execute("PRAGMA trusted_schema = OFF")
+            _check_schema(memory, path)
             _migrate(memory)
     except BaseException:
         memory.close()
@@ -129,9 +125,26 @@ def snapshot(path: Path) -> sqlite3.Connection:
     return memory
 
 
-def _copy(uri: str, path: Path, memory: sqlite3.Connection) -> None:
+def _copy(path: Path, memory: sqlite3.Connection) -> None:
+    if not _has_log(path):
+        # Nobody is writing. Reading it as it lies needs no further files, which a read-only folder would refuse.
+        changed = path.stat().st_mtime_ns
+        _backup(f"{path.as_uri()}?mode=ro&immutable=1", memory)
+        if not _has_log(path) and path.stat().st_mtime_ns == changed:
+            return
+    _backup(f"{path.as_uri()}?mode=ro", memory)
+
+
+def _has_log(path: Path) -> bool:
+    """Whether there are writes that did not reach the file itself yet, as there are while somebody is writing."""
+    try:
+        return path.with_name(path.name + "-wal").stat().st_size > 0
+    except FileNotFoundError:
+        return False
+
+
+def _backup(uri: str, memory: sqlite3.Connection) -> None:
     with closing(sqlite3.connect(uri, uri=True)) as connection:
-        _check_schema(connection, path)
         connection.backup(memory)
 
 
@@ -160,7 +173,8 @@ def errors_explained(path: Path) -> Iterator[None]:
     except sqlite3.Error as error:
         raise ProjectError(f"project {path}: {error}. {_advice(getattr(error, 'sqlite_errorname', ''))}") from error
     except OSError as error:
-        raise ProjectError(f"project {path}: {error.strerror}. {_advice('SQLITE_READONLY')}") from error
+        code = "SQLITE_FULL" if error.errno in _DISK_FULL else "SQLITE_CANTOPEN"
+        raise ProjectError(f"project {path}: {error.strerror}. {_advice(code)}") from error
 
 
 def _advice(code: str) -> str:

@@ -98,7 +98,7 @@ class Project:
         Args:
             name: for the history, say "Drag PSM1".
             edits: what changes; values that are equal to the present ones are left out.
-            figures: frame -> figures of the frame with these edits.
+            figures: frame -> figures of the frame with these edits; kept even if nothing else differs.
 
         Returns:
             What was saved; None if nothing differs.
@@ -112,6 +112,7 @@ class Project:
                 check_edit(state.identity, key, value)
             changed = {key: value for key, value in edits.items() if state.get(key) != value}
             if not changed:
+                self.record_figures(figures or {}, state)
                 return None
             step = Step(state.position + 1, _step_name(name), time.time())
             after = state.after(step, changed)
@@ -238,22 +239,19 @@ class Project:
             self.read_only_reason = f"It is open for writing elsewhere ({holder}). Close it there, then open it again."
 
     def _load(self, identity: SequenceIdentity) -> ProjectState:
-        if self._writer is None:
-            with closing(database.snapshot(self.path)) as copy, database.errors_explained(self.path):
-                return self._checked(journal.load(copy, self.path), identity)
-        if not self.path.exists():
+        if self._writer is not None and not self.path.exists():
             database.create(self.path, identity)
-        self._connection = database.connect(self.path)
-        with database.errors_explained(self.path):
-            return self._checked(journal.load(self._connection, self.path), identity)
-
-    def _checked(self, state: ProjectState, identity: SequenceIdentity) -> ProjectState:
+        # Everything is checked on a copy, so that a file that is refused stays as it is.
+        with closing(database.snapshot(self.path)) as copy, database.errors_explained(self.path):
+            state = journal.load(copy, self.path)
         difference = state.identity.difference(identity)
         if difference is not None:
             raise ProjectError(
                 f"project {self.path} belongs to another sequence ({state.identity.name!r}, not {identity.name!r}): "
                 f"{difference}. Nothing was changed. Open it with its own sequence, or name another project file."
             )
+        if self._writer is not None:
+            self._connection = database.connect(self.path)
         return state
 
     def _transaction(self) -> AbstractContextManager[sqlite3.Connection]:

@@ -85,6 +85,7 @@ class ProjectModel:
         before = self.snapshots[self.position]
         after = {key: value for key, value in {**before, **edits}.items() if value is not None}
         if after == before:
+            self.record_figures(figures or {})
             return
         self.snapshots[self.position + 1 :] = [after]
         self.names[self.position :] = [name]

@@ -31,8 +31,10 @@ class ProjectMachine(RuleBasedStateMachine):
 
     @rule(name=st.text(min_size=1, max_size=200).filter(str.strip), edits=EDITS, figures=st.none() | FIGURES)
     def apply(self, name: str, edits: dict, figures: dict | None) -> None:
-        if self.project.apply(name, edits, figures) is not None:
-            self.model.apply(" ".join(name.encode("utf-8", "replace").decode().split()), edits, figures)
+        change = self.project.apply(name, edits, figures)
+        before = self.model.snapshots[self.model.position]
+        self.model.apply(" ".join(name.encode("utf-8", "replace").decode().split()), edits, figures)
+        assert (change is None) == (self.model.snapshots[self.model.position] == before)
 
     @rule()
     def undo(self) -> None:
