@@ -25,15 +25,11 @@ def load(connection: sqlite3.Connection, path: Path) -> ProjectState:
         figures = connection.execute("SELECT frame, revision, loss, dice FROM figures")
         steps = tuple(Step(*row) for row in connection.execute("SELECT step, name, time FROM steps ORDER BY step"))
         exports = connection.execute("SELECT time, format, path, frames, settings FROM exports ORDER BY rowid")
-        state = ProjectState(
-            identity=identity,
-            steps=steps,
-            position=position,
-            entries={key: Entry(step, value) for key, step, value in (_entry(*row) for row in rows)},
-            all_figures={(frame, revision): Figures(loss, dice) for frame, revision, loss, dice in figures},
-            exports=tuple(ExportRecord(*row) for row in exports),
-        )
-        for key, entry in state.entries.items():
+        state = ProjectState(identity, steps, position, exports=tuple(ExportRecord(*row) for row in exports))
+        entries = {key: Entry(step, value) for key, step, value in (_entry(*row) for row in rows)}
+        state = state.with_entries(entries)
+        state = state.with_figures({(frame, revision): Figures(*values) for frame, revision, *values in figures})
+        for key, entry in entries.items():
             check_edit(identity, key, entry.value)
         if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
             raise ValueError("its history has gaps")

@@ -10,7 +10,7 @@ from jaxtyping import Bool, UInt8
 
 from ..errors import ProjectError
 
-_ADDED, _REMOVED, _IGNORED = 255, 127, 255
+_ADDED, _REMOVED, _IGNORED = np.uint8(255), np.uint8(127), np.uint8(255)
 _HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 
 
@@ -73,7 +73,7 @@ class MaskCorrection(Layer):
                 f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be two masks of one size "
                 "that share no pixel. A later stroke takes its pixels out of the other mask."
             )
-        return cls(_png(np.where(added, _ADDED, np.where(removed, _REMOVED, 0))))
+        return cls(_png(added * _ADDED + removed * _REMOVED))
 
     def added(self) -> Bool[np.ndarray, "height width"]:
         """Pixels that belong to an arm although none is rendered there."""
@@ -95,15 +95,15 @@ class IgnoreRegion(Layer):
     @classmethod
     def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
         """The region of these pixels."""
-        return cls(_png(np.where(region, _IGNORED, 0)))
+        return cls(_png(region * _IGNORED))
 
     def region(self) -> Bool[np.ndarray, "height width"]:
         """True where pixels are ignored."""
         return self.pixels() == _IGNORED
 
 
-def _png(pixels: np.ndarray) -> bytes:
-    ok, data = cv2.imencode(".png", pixels.astype(np.uint8))
+def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:
+    ok, data = cv2.imencode(".png", pixels)
     if not ok:
         raise ProjectError(f"a painted layer of shape {pixels.shape} could not be written as PNG.")
     return data.tobytes()

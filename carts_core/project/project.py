@@ -120,7 +120,7 @@ class Project:
             with self._transaction() as connection:
                 journal.append(connection, step, changed)
                 journal.write_figures(connection, known)
-            return self._saved(after.with_figures(known.items()), "apply", step, changed.keys())
+            return self._saved(after.with_figures(known), "apply", step, changed.keys())
 
     def undo(self) -> Change | None:
         """Take back the last step; None if there is none.
@@ -156,7 +156,8 @@ class Project:
                 entries = journal.move(connection, state.position, position)
             back = position < state.position
             step = state.steps[position if back else position - 1]
-            return self._saved(state.moved(position, entries), "undo" if back else "redo", step, entries.keys())
+            moved = replace(state.with_entries(entries), position=position)
+            return self._saved(moved, "undo" if back else "redo", step, entries.keys())
 
     def history(self) -> tuple[Step, ...]:
         """All steps, oldest first; those with a number above `state.position` are undone."""
@@ -179,7 +180,7 @@ class Project:
             if known:
                 with self._transaction() as connection:
                     journal.write_figures(connection, known)
-                self._saved(self.state.with_figures(known.items()), "figures", frames=[frame for frame, _ in known])
+                self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
         """Save that an export was finished. Not a step of undo.

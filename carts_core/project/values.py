@@ -11,7 +11,6 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from ..camera import rigid_transform
 from ..errors import ProjectError, SettingsError
@@ -230,14 +229,14 @@ def _choice(kind: type[_Choice], value: object, what: str) -> _Choice:
         raise ProjectError(f"{what} is {value!r}, but must be one of: {', '.join(kind)}.") from error
 
 
-def _finite(values: Iterable[float] | ArrayLike, what: str) -> tuple[float, ...]:
+def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
     try:
-        array = np.asarray(values, dtype=np.float64)
+        numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError) as error:
-        raise ProjectError(f"{what} must be numbers, not {values!r}.") from error
-    if array.ndim != 1 or not np.isfinite(array).all():
-        raise ProjectError(f"{what} are {array.tolist()}. Give a list of finite numbers.")
-    return tuple(array.tolist())
+        raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
+    if not all(map(math.isfinite, numbers)):
+        raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
+    return numbers
 
 
 def _deviation(value: float | None) -> float | None:

@@ -67,7 +67,7 @@ def test_a_gesture_over_many_frames_is_one_step_of_undo_even_after_a_restart(tmp
         change = project.undo()
         assert change is not None and change.step is not None
         assert change.step.name == "Solve between" and change.frames == tuple(range(1, 200))
-        assert {key.frame for key in project.state.entries} == {0}
+        assert [frame for frame in range(200) if project.state.joints(frame)] == [0]
     with Project(identity, tmp_path / "long.carts") as project:
         assert project.state.redoable is not None
         project.redo()

@@ -382,7 +382,7 @@ def test_a_project_that_the_first_version_wrote_still_opens(project_path: Path) 
     _version_1(project_path)
     model = ProjectModel()
     for number in range(40):
-        act(1, number, model)
+        act(216, number, model)
     for read_only in (True, False):
         with Project(IDENTITY, project_path, read_only=read_only) as project:
             assert visible(project.state) == model.visible()
