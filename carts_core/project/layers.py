@@ -68,6 +68,7 @@ class MaskCorrection(Layer):
         Raises:
             ProjectError: the shapes differ, or a pixel is both.
         """
+        added, removed = np.asarray(added, bool), np.asarray(removed, bool)
         if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
             raise ProjectError(
                 f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be two masks of one size "
@@ -94,7 +95,14 @@ class IgnoreRegion(Layer):
 
     @classmethod
     def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
-        """The region of these pixels."""
+        """The region of these pixels.
+
+        Raises:
+            ProjectError: it is not a mask.
+        """
+        region = np.asarray(region, bool)
+        if region.ndim != 2:
+            raise ProjectError(f"an ignore region has shape {region.shape}. Give a mask [height, width].")
         return cls(_png(region * _IGNORED))
 
     def region(self) -> Bool[np.ndarray, "height width"]:

@@ -117,6 +117,18 @@ def test_figures_hold_for_the_values_they_were_computed_for(project: Project) ->
     assert project.state.figures(0) == first
 
 
+def test_figures_of_a_dropped_step_are_not_taken_for_those_of_the_step_in_its_place(
+    project: Project, project_path: Path
+) -> None:
+    project.apply("Drag", {Key.joints(0, "PSM1"): JOINTS}, {0: Figures(loss=0.3)})
+    project.undo()
+    project.apply("Drag elsewhere", {Key.joints(0, "PSM1"): replace(JOINTS, joint_positions=(0, 0, 0))})
+    assert project.state.figures(0) is None
+    project.close()
+    with Project(IDENTITY, project_path) as again:
+        assert again.state.figures(0) is None
+
+
 def test_figures_that_come_too_late_are_not_given_to_another_state(project: Project) -> None:
     project.apply("Drag", {Key.joints(0, "PSM1"): JOINTS})
     old = project.state
@@ -223,6 +235,7 @@ def test_an_edit_that_does_not_fit_the_sequence_is_refused_whole(
         lambda: Review(note="x" * 10_001),
         lambda: Figures(loss=float("inf")),
         lambda: MaskCorrection.of(np.ones((2, 2), bool), np.ones((2, 2), bool)),
+        lambda: IgnoreRegion.of(np.ones((2, 2, 3), bool)),
         lambda: IgnoreRegion(b"GIF89a"),
     ],
 )
