@@ -46,6 +46,13 @@ class ProjectMachine(RuleBasedStateMachine):
         self.project.redo()
         self.model.go_to(self.model.position + 1)
 
+    @rule(edits=EDITS)
+    def do_it_differently(self, edits: dict) -> None:
+        """Take a step back and make another one in its place."""
+        self.apply("first try", edits, {frame: Figures(0.5) for frame in FRAMES})
+        self.undo()
+        self.apply("second try", dict(list(edits.items())[:1]), None)
+
     @rule(share=st.floats(0, 1))
     def go_to(self, share: float) -> None:
         position = round(share * len(self.model.names))
