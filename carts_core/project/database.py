@@ -1,6 +1,7 @@
 """The SQLite file: how it is made, opened, migrated and written to."""
 
 import errno
+import os
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -57,7 +58,6 @@ CREATE VIEW current AS            -- the last change of every value that is done
 MIGRATIONS: tuple[str, ...] = (VERSION_1,)
 """Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
 
-
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
@@ -72,17 +72,28 @@ def create(path: Path, identity: SequenceIdentity) -> None:
         with errors_explained(path):
             part.unlink(missing_ok=True)
             with closing(sqlite3.connect(part, isolation_level=None)) as connection:
-                connection.execute("PRAGMA journal_mode = WAL")
                 connection.execute("PRAGMA synchronous = FULL")
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 _migrate(connection)
                 insert = "INSERT INTO project (identity, position, created) VALUES (?, 0, ?)"
                 connection.execute(insert, (identity.to_json(), time.time()))
+                # The last thing: up to here, what is saved is in the file itself, so it can be renamed.
+                connection.execute("PRAGMA journal_mode = WAL")
             part.replace(path)
+            _sync_folder(path.parent)
     except ProjectError:
         for suffix in ("", "-wal", "-shm"):
             part.with_name(part.name + suffix).unlink(missing_ok=True)
         raise
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have a new name on disk before something is saved under it."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def connect(path: Path) -> sqlite3.Connection:
