@@ -213,10 +213,10 @@ def main() -> None:
     leave_a_core_free()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
-    parser.add_argument("--weights", type=Path, default=None)
+    parser.add_argument("--weights", type=Path, nargs="*", default=())
     parser.add_argument("--iterations", type=int, default=_ITERATIONS)
     arguments = parser.parse_args()
-    with ViewerApp.open(arguments.sequence, port=0, weights=arguments.weights) as app:
+    with ViewerApp.open(arguments.sequence, port=0, weights=tuple(arguments.weights)) as app:
         app.wait_until_shown(120)
         camera = app.scene.camera(app.state.camera)
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")
