@@ -18,6 +18,8 @@ from .monitor import Monitor
 from .polygons import polygons
 from .rle import bounding_box
 
+_LISTS = ("ImageSets/Main", "ImageSets/Segmentation")
+"""Where lists of the images stand; there is no split, so each is one list of all."""
 _QUALITY = 95
 _MOST_CATEGORIES = 254
 """0 is the background and 255 is VOC's void."""
@@ -31,7 +33,7 @@ def write_voc(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
     """
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
-    for name in ("Annotations", "SegmentationClass", "SegmentationObject", "ImageSets/Segmentation"):
+    for name in ("Annotations", "SegmentationClass", "SegmentationObject", *_LISTS):
         (folder / name).mkdir(parents=True)
     for view in dataset.views(monitor):
         _write_jpeg(dataset, view, folder / "JPEGImages")
@@ -45,7 +47,8 @@ def write_voc(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
         ElementTree.indent(root, " ")
         ElementTree.ElementTree(root).write(folder / "Annotations" / f"{view.name}.xml", encoding="utf-8")
     names = "".join(f"{name}\n" for name, _, _ in dataset.steps)
-    (folder / "ImageSets" / "Segmentation" / "trainval.txt").write_text(names, encoding="utf-8")
+    for name in _LISTS:
+        (folder / name / "trainval.txt").write_text(names, encoding="utf-8")
     _write_label_map(folder / "labelmap.txt", dataset)
 
 
