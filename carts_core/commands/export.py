@@ -29,7 +29,7 @@ class Export:
 
     sequence: SequencePath
     """Sequence file."""
-    output: Annotated[Path, tyro.conf.Positional]
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")]
     """Folder to make, or file for csv, npz, json and dvrk."""
     format: FormatName
     """What to write."""

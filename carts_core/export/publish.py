@@ -33,9 +33,9 @@ def published(target: Path, *, overwrite: bool = False) -> Iterator[Path]:
         CartsError: the target exists and may not be replaced, somebody else is exporting to it, or the disk refuses.
     """
     target = target.resolve()
-    _check_free(target, overwrite)
     part = target.with_name(f".{target.name}.part")
     try:
+        _check_free(target, overwrite)
         part.mkdir(parents=True, exist_ok=True)
         with _locked(part, target):
             try:

@@ -7,15 +7,15 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
-import cv2
 import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
 from carts_core.cli import BAD_INPUT, main
 from carts_core.data import Sequence
+from carts_core.data.images import read_image, read_mask
 from carts_core.export import FORMATS, FormatName, KinematicsRow, kinematics_csv
 
 _REPEATED = """
@@ -36,12 +36,12 @@ def sequence(tiny_sequence: Callable[..., Path]) -> str:
     return str(tiny_sequence(frames=3, domains=("regular", "smoke"), cameras=("left", "right"), width=160, height=128))
 
 
-def _coco(folder: Path) -> COCO:
+def _coco(folder: Path) -> Any:  # its own type hints know no further keys of an image
     return COCO(str(folder / "annotations" / "instances_default.json"))
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_is_written(sequence: str, tmp_path: Path, name: str) -> None:
+def test_every_format_is_written(sequence: str, tmp_path: Path, name: FormatName) -> None:
     (tmp_path / "exports").mkdir()
     main(["export", sequence, str(tmp_path / "exports" / "out"), "--format", name, "--frames", "1"])
     (written,) = (tmp_path / "exports").iterdir()
@@ -59,8 +59,8 @@ def test_frames_cameras_and_domain_are_chosen(sequence: str, tmp_path: Path) -> 
     images = list(_coco(tmp_path / "out").imgs.values())
     assert [(image["frame"], image["camera"]) for image in images] == [("001", "right"), ("003", "right")]
     assert {category["supercategory"] for category in _coco(tmp_path / "out").cats.values()} == {"PSM1"}
-    written = cv2.imread(str(tmp_path / "out" / "images" / images[0]["file_name"]))
-    np.testing.assert_array_equal(written, cv2.imread(str(Path(sequence).parent / "smoke" / "right" / "001.png")))
+    written = read_image(tmp_path / "out" / "images" / images[0]["file_name"])
+    np.testing.assert_array_equal(written, read_image(Path(sequence).parent / "smoke" / "right" / "001.png"))
 
 
 def test_corrected_kinematics_decide_frames_and_masks(sequence: str, tmp_path: Path) -> None:
@@ -78,8 +78,8 @@ def test_corrected_kinematics_decide_frames_and_masks(sequence: str, tmp_path: P
     ]
     for annotation in coco.anns.values():
         frame = coco.imgs[annotation["image_id"]]["frame"]
-        true = cv2.imread(str(Path(sequence).parent / "masks" / "left" / f"{frame}.png"), cv2.IMREAD_GRAYSCALE)
-        np.testing.assert_array_equal(coco.annToMask(annotation) > 0, true > 0)
+        true = read_mask(Path(sequence).parent / "masks" / "left" / f"{frame}.png")
+        np.testing.assert_array_equal(coco.annToMask(annotation) > 0, true)
     main([*command, "--format", "csv"])
     assert (tmp_path / "out.csv").read_bytes() == table.read_bytes()
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +17,8 @@ from carts_core.data.images import read_image
 from carts_core.export import Dataset, export
 
 
-def _read_coco(folder: Path) -> tuple[COCO, Masks]:
-    coco = COCO(str(folder / "annotations" / "instances_default.json"))
+def _read_coco(folder: Path) -> tuple[Any, Masks]:
+    coco: Any = COCO(str(folder / "annotations" / "instances_default.json"))
     masks: Masks = {}
     for annotation in coco.anns.values():
         name = Path(coco.imgs[annotation["image_id"]]["file_name"]).stem
