@@ -67,6 +67,12 @@ class Dataset:
     def __post_init__(self) -> None:
         if not self.frames:
             raise SettingsError("there is no frame to export. Choose other frames, or correct some first.")
+        known = {camera.name for camera in self.sequence.scene.cameras}
+        if unknown := {camera for frame in self.frames for camera in frame.masks} - known:
+            raise SettingsError(
+                f"there are masks for cameras {', '.join(sorted(unknown))}, which {self.sequence.path} does not have. "
+                f"Its cameras are: {', '.join(sorted(known))}."
+            )
         if self.frame_rate is not None and not 0.1 <= self.frame_rate <= 1000.0:
             raise SettingsError(f"the frame rate is {self.frame_rate}. It must be 0.1 to 1000 frames per second.")
 

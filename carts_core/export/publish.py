@@ -35,10 +35,11 @@ def published(target: Path, *, overwrite: bool = False) -> Iterator[Path]:
     target = target.resolve()
     part = target.with_name(f".{target.name}.part")
     try:
-        _check_free(target, overwrite)
         part.mkdir(parents=True, exist_ok=True)
         with _locked(part, target):
             try:
+                _restore(part, target)
+                _check_free(target, overwrite)
                 for leftover in part.iterdir():
                     _remove(leftover)
                 content = part / target.name
@@ -52,6 +53,13 @@ def published(target: Path, *, overwrite: bool = False) -> Iterator[Path]:
             f"{target} cannot be written ({error.strerror or error}). "
             "Nothing was changed there. Make room, or name a folder you may write to."
         ) from error
+
+
+def _restore(part: Path, target: Path) -> None:
+    """Put back what a process was about to replace when it was killed between the two renames of `_move`."""
+    old = part / f"{target.name}.old"
+    if old.exists() and not target.exists():
+        os.rename(old, target)
 
 
 def _check_free(target: Path, overwrite: bool) -> None:
@@ -84,7 +92,7 @@ def _locked(part: Path, target: Path) -> Iterator[None]:
 def _move(content: Path, target: Path) -> None:
     if target.is_dir() and any(target.iterdir()):
         if not _exchanged(content, target):
-            old = content.with_name("old")
+            old = content.with_name(f"{target.name}.old")
             os.rename(target, old)
             try:
                 os.rename(content, target)

@@ -73,6 +73,12 @@ def test_an_export_of_no_frames_is_refused(sequence: Sequence) -> None:
         Dataset(sequence, (), sequence.scene, "regular")
 
 
+def test_masks_of_an_unknown_camera_are_refused(dataset: Dataset) -> None:
+    frame = replace(dataset.frames[0], masks={"middle": np.zeros((127, 161), bool)})
+    with pytest.raises(SettingsError, match=r"masks for cameras middle, which .* does not have"):
+        replace(dataset, frames=(frame,))
+
+
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), 1e9])
 def test_an_impossible_frame_rate_is_refused(sequence: Sequence, rate: float) -> None:
     with pytest.raises(SettingsError, match="frame rate"):

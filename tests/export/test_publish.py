@@ -67,6 +67,14 @@ def test_a_folder_is_replaced_also_where_two_cannot_change_places(
     assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "new"
 
 
+def test_what_a_kill_between_two_renames_took_away_comes_back(tmp_path: Path) -> None:
+    (tmp_path / ".out.part").mkdir()
+    _make(tmp_path / ".out.part" / "out.old", "old")
+    with pytest.raises(CartsError, match="out exists"), published(tmp_path / "out"):
+        pass
+    assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "old"
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_of_other_files_is_never_replaced(tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "home").mkdir()
