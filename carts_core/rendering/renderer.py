@@ -107,13 +107,24 @@ class Renderer:
             self.geometry.face_arms,
         )
 
-    @torch.no_grad()
     def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
         """Index of the visible arm per pixel, -1 for background; visibility alone, so faster than a rendering."""
+        return self._visible(state, self.geometry.face_arms)
+
+    def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
+        """Index of the visible link per pixel, -1 for background.
+
+        Links are counted through all arms: `Robot.link_names` of the first arm, then those of the second.
+        """
+        return self._visible(state, self.geometry.face_links)
+
+    @torch.no_grad()
+    def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
+        """Label of the visible triangle per pixel, -1 for background."""
         Ts, intrinsics = self._views(state)
         face_ids, _ = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
-        arm_ids = torch.where(face_ids >= 0, self.geometry.face_arms[face_ids.long()], -1)
-        return arm_ids.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
+        labels = torch.where(face_ids >= 0, face_labels[face_ids.long()], -1)
+        return labels.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
 
     @torch.no_grad()
     def surface(self, state: SceneState, tangents: Tangents | None = None) -> SurfaceRendering:
