@@ -1,15 +1,13 @@
 """Video: the frame that is asked for is the frame that comes, in any order."""
 
-from fractions import Fraction
 from pathlib import Path
-from typing import cast
 
 import av
 import cv2
 import numpy as np
 import pytest
 from av.video.frame import PictureType
-from av.video.stream import VideoStream
+from videos import write_timed_video
 
 from carts_core.data import Sequence
 from carts_core.data.images import read_image
@@ -79,26 +77,14 @@ TIMED = {
 }
 
 
-def write_timed_video(path: Path, codec: str, options: dict[str, str], times: np.ndarray = TIMES) -> Path:
+def write_numbered(path: Path, codec: str, options: dict[str, str], times: np.ndarray = TIMES) -> Path:
     """Frame n shows its number from `times[n]` [ms] on."""
-    milliseconds = Fraction(1, 1000)
-    kind = "mpegts" if path.name.startswith("transport") else None
-    with av.open(str(path), "w", format=kind) as container:
-        rate = 25 if path.suffix == ".avi" else 1000
-        stream = cast(VideoStream, container.add_stream(codec, rate=rate, options=options))
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-        for number, time in enumerate(times):
-            frame = av.VideoFrame.from_ndarray(numbered(number), format="rgb24")
-            # AVI has no presentation times.
-            frame.pts, frame.time_base = (number, Fraction(1, 25)) if rate == 25 else (int(time), milliseconds)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+    return write_timed_video(path, map(numbered, range(len(times))), times, codec, options)
 
 
 @pytest.fixture(scope="module", params=list(TIMED))
 def timed_video(request, tmp_path_factory) -> Path:
-    return write_timed_video(tmp_path_factory.mktemp("video") / request.param, *TIMED[request.param])
+    return write_numbered(tmp_path_factory.mktemp("video") / request.param, *TIMED[request.param])
 
 
 def test_a_timed_video_is_what_its_name_says(timed_video):
@@ -133,7 +119,7 @@ def test_presentation_times_are_those_of_the_file(timed_video):
 
 
 def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
-    path = write_timed_video(tmp_path / "cut.mp4", "libx264", {"bf": "0", "g": "30"}, np.arange(-200, 1000, 40))
+    path = write_numbered(tmp_path / "cut.mp4", "libx264", {"bf": "0", "g": "30"}, np.arange(-200, 1000, 40))
     with av.open(str(path)) as container:
         expected = [number_of(frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
     assert index_video(path).count == len(expected)
@@ -142,7 +128,7 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
 
 
 def test_a_jump_decodes_from_the_last_key_frame_and_not_from_the_start(tmp_path, monkeypatch):
-    video = Video(write_timed_video(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"}), tuple(range(FRAMES)))
+    video = Video(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"}), tuple(range(FRAMES)))
     decoded = []
     keep = video._kept.add
     monkeypatch.setattr(video._kept, "add", lambda number, frame: (decoded.append(number), keep(number, frame)))
@@ -154,7 +140,7 @@ def test_a_jump_decodes_from_the_last_key_frame_and_not_from_the_start(tmp_path,
 
 
 def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_path, monkeypatch):
-    path = write_timed_video(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"})
+    path = write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"})
 
     class Inexact:
         """A container whose seeking arrives a group of frames late, as damaged indices make it."""
@@ -179,7 +165,7 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
 
 
 def test_a_damaged_frame_is_an_error_and_the_others_keep_their_numbers(tmp_path):
-    path = write_timed_video(tmp_path / "left.mkv", "libx264", {"g": "1"}, TIMES[:20])
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "1"}, TIMES[:20])
     with av.open(str(path)) as container:
         packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][9]
     assert path.read_bytes().count(packet) == 1
@@ -193,14 +179,9 @@ def test_a_damaged_frame_is_an_error_and_the_others_keep_their_numbers(tmp_path)
 
 
 def test_a_colour_survives_the_way_into_a_video_and_back(tmp_path):
-    path, color = tmp_path / "left.mp4", (200, 60, 40)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"crf": "5"})
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-        picture = np.full((SIZE[1], SIZE[0], 3), color, np.uint8)
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode(None))
-    assert np.abs(Video(path, (0,)).read(0).astype(int) - color).max() <= 4
+    picture = np.full((SIZE[1], SIZE[0], 3), (200, 60, 40), np.uint8)
+    path = write_timed_video(tmp_path / "left.mp4", [picture], [0], options={"crf": "5"})
+    assert np.abs(Video(path, (0,)).read(0).astype(int) - picture).max() <= 4
 
 
 def test_a_playlist_that_calls_itself_a_video_fetches_nothing(tmp_path):
