@@ -1,7 +1,6 @@
 """A recording: frames with images, measured joint positions, and where known masks and truth."""
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from ..errors import SequenceError
 from ..rendering import Renderer
 from ..scene import Scene
 from .background import estimate_background, spread, widen
+from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
 from .images import read_image, read_mask
@@ -74,7 +74,7 @@ class Sequence:
         } or None
         self._description = description
         self._cameras = description.cameras
-        self._cache = _ByteBudget(CACHE_BYTES)
+        self._cache = ByteCache(CACHE_BYTES)
         self._backgrounds: dict[tuple[str, str], np.ndarray] = {}
         self._background_lock = threading.Lock()
 
@@ -233,28 +233,3 @@ class Sequence:
                 f"Its cameras are: {', '.join(self._cameras)}."
             )
         return self._cameras[camera]
-
-
-class _ByteBudget:
-    """Least recently used arrays, as many as fit into a number of bytes."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._used = 0
-        self._arrays: OrderedDict[tuple, np.ndarray] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array under `key`, made when it is not there. Two threads may make it at once; that does no harm."""
-        with self._lock:
-            if key in self._arrays:
-                self._arrays.move_to_end(key)
-                return self._arrays[key]
-        array = make()
-        with self._lock:
-            if key not in self._arrays:
-                self._arrays[key] = array
-                self._used += array.nbytes
-            while self._used > self._limit and len(self._arrays) > 1:
-                self._used -= self._arrays.popitem(last=False)[1].nbytes
-        return array
