@@ -22,6 +22,7 @@ from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp, serve
 from carts_viewer.bench import RawTab
 from carts_viewer.layers import Layer, mask
+from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.picture import Painter
 from carts_viewer.stage import FRAME, OVERLAY
 
@@ -128,6 +129,21 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
     decoded.set()
     state = app.wait_until_shown()
     assert state.index == state.frame.index == 5 and app.stage.sent(FRAME) != sent
+
+
+def test_the_offset_between_the_clocks_is_shown(open_viewer: Callable[..., ViewerApp]) -> None:
+    def describe(text: str) -> str:
+        frames = '[frames]\ntable = "frames.csv"\nframe_id = "{frame:03d}"\ntime_offset = -0.035\n'
+        return text.replace('frame_id = "{frame:03d}"\n', "").replace("[[arms]]", frames + "[[arms]]", 1)
+
+    def add_times(folder: Path) -> None:
+        (folder / "frames.csv").write_text("frame,timestamp\n1,0.1\n2,0.15\n3,0.2\n")
+
+    app = open_viewer(edit=describe, prepare=add_times)
+    app.mailbox.put(ask.ShowFrame(1))
+    app.wait_until_shown()
+    captions = [panel._caption.content for panel in app.display._panels if isinstance(panel, BrowsePanel)]
+    assert ["0.150 s, time offset <b>-0.035 s</b>" in caption for caption in captions] == [True]
 
 
 def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[..., ViewerApp]) -> None:
