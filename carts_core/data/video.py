@@ -4,10 +4,12 @@ import threading
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from av.container import InputContainer
+from av.error import FFmpegError
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
@@ -26,8 +28,8 @@ class Video:
     """Frames of one video file by number; safe to use from several threads.
 
     Decoding begins at the last key frame that is shown no later than the frame asked for, and what comes out is told
-    apart by its presentation time. Where the container's times are not to be relied on, and where seeking is found not
-    to arrive where it should, frames are decoded in order from the first, which is slow and right.
+    apart by its presentation time. Where seeking does not arrive where it should, decoding begins at an earlier key
+    frame; where the container's times are not to be relied on, at the first frame, which is slow and right.
 
     Args:
         path: the video file.
@@ -73,18 +75,18 @@ class Video:
                     f"video {self.path} ends, or is damaged, at frame number {number} (counted from 0). "
                     "Copy it again, or leave the frame out of the sequence."
                 )
-            return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
+            # Without a number of threads swscale starts some for every frame, which takes 20 times as long.
+            return np.ascontiguousarray(frame.to_ndarray(format="rgb24", threads=1))
 
     def _decode(self, number: int) -> VideoFrame | None:
         """Decode up to frame `number`; None when it does not come out."""
         key, seek_to = self._key_frame_before(number)
         if self._last is None or not key - 1 <= self._last < number:
-            self._jump(seek_to)
+            while not self._jump(key, seek_to):
+                # The key frame is damaged, or seeking does not arrive where it should: begin at the one before.
+                self._key_frames = tuple(other for other in self._key_frames if other[0] != key)
+                key, seek_to = self._key_frame_before(number)
         for position, frame in self._frames:
-            if self._last is None and seek_to is not None and position > key:
-                # Seeking in this file does not arrive where it should.
-                self._key_frames = ()
-                return self._decode(number)
             self._last = position
             if position >= key:
                 # Those before a key frame may refer to frames that were not decoded.
@@ -99,16 +101,23 @@ class Video:
         row = bisect_right(self._key_frames, number, key=lambda entry: entry[0])
         return self._key_frames[row - 1] if row > 0 else (0, None)
 
-    def _jump(self, seek_to: int | None) -> None:
+    def _jump(self, key: int, seek_to: int | None) -> bool:
+        """Stand where frame `key` or an earlier one comes next; False when the file cannot be made to."""
+        self._last = None
         if self._open is None or seek_to is None:
             if self._open is not None:
                 self._open[0].close()
             self._open = open_video(self.path)
         container, stream = self._open
-        if seek_to is not None:
-            container.seek(seek_to, stream=stream)
-        self._frames = self._numbered(decoded_frames(container, stream))
-        self._last = None
+        try:
+            if seek_to is not None:
+                container.seek(seek_to, stream=stream)
+        except FFmpegError:
+            return False
+        frames = self._numbered(decoded_frames(container, stream))
+        first = next(frames, None)
+        self._frames = chain([] if first is None else [first], frames)
+        return seek_to is None or (first is not None and first[0] <= key)
 
     def _numbered(self, frames: Iterator[VideoFrame]) -> Iterator[tuple[int, VideoFrame]]:
         if not self._index.key_frames:

@@ -127,6 +127,24 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
     assert [number_of(video.read(index)) for index in range(len(expected))] == expected
 
 
+def test_frames_of_vp8_that_are_only_referred_to_are_not_counted(tmp_path):
+    path = write_numbered(tmp_path / "left.webm", "libvpx", {"g": "10", "auto-alt-ref": "0"})
+    with av.open(str(path)) as container:
+        packets = [(packet.pos or 0, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    for number in (3, 25, 88):
+        position, packet = packets[number]
+        start = content.index(packet, position)
+        assert content[start] & 0x10
+        content[start] &= ~0x10
+    path.write_bytes(content)
+    expected = [number for number in range(FRAMES) if number not in (3, 25, 88)]
+    assert index_video(path).count == len(expected)
+    video = Video(path, tuple(range(len(expected))))
+    for index in (146, 24, 2, 3, 86, 85):
+        assert number_of(video.read(index)) == expected[index]
+
+
 def test_a_jump_decodes_from_the_last_key_frame_and_not_from_the_start(tmp_path, monkeypatch):
     video = Video(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"}), tuple(range(FRAMES)))
     decoded = []
@@ -164,18 +182,34 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
     assert [number_of(video.read(index)) for index in order] == order
 
 
-def test_a_damaged_frame_is_an_error_and_the_others_keep_their_numbers(tmp_path):
-    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "1"}, TIMES[:20])
+def damage(path: Path, number: int) -> None:
+    """Overwrite the packet of a frame with zeros."""
     with av.open(str(path)) as container:
-        packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][9]
+        packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][number]
     assert path.read_bytes().count(packet) == 1
     path.write_bytes(path.read_bytes().replace(packet, bytes(len(packet))))
+
+
+def test_a_damaged_frame_is_an_error_and_the_others_keep_their_numbers(tmp_path):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "1"}, TIMES[:20])
+    damage(path, 9)
     video = Video(path, tuple(range(20)))
     for index in (0, 8, 10, 19, 3):
         assert number_of(video.read(index)) == index
     with pytest.raises(SequenceError, match=r"left.mkv ends, or is damaged, at frame number 9 \(counted from 0\)"):
         video.read(9)
     assert number_of(video.read(19)) == 19
+
+
+def test_a_damaged_key_frame_spoils_its_own_group_only(tmp_path):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "5", "bf": "0", "sc_threshold": "0"}, TIMES[:20])
+    damage(path, 10)
+    video = Video(path, tuple(range(20)))
+    for index in (0, 9, 15, 19, 4):
+        assert number_of(video.read(index)) == index
+    with pytest.raises(SequenceError, match=r"damaged, at frame number 10"):
+        video.read(10)
+    assert [number for number, _ in video._key_frames] == [0, 5, 15]
 
 
 def test_a_colour_survives_the_way_into_a_video_and_back(tmp_path):
