@@ -78,8 +78,10 @@ def take_frame_list(section: TomlTable) -> FrameList:
         raise section.error(
             "table", "is missing. Name a CSV file with a row per frame and its time, or a `video` whose times count."
         )
-    table = read_table(section.path(section.take("table", str)), take_delimiter(section))
+    table = read_table(section.path(section.take("table", str)), take_delimiter(section), "table of frames")
     timestamp = section.take("timestamp", str, "timestamp")
+    if not timestamp:
+        raise section.error("timestamp", "is empty. Name the column with the time of every frame [s].")
     return list_of_rows(table, take_frame_names(section), timestamp, section, f"{table.path} has {len(table)} rows")
 
 

@@ -64,8 +64,8 @@ class Table:
         return values
 
 
-def read_table(path: Path, delimiter: str = ",") -> Table:
-    """Read a CSV file; blank lines are skipped.
+def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
+    """Read a CSV file, which errors call `what`; blank lines are skipped.
 
     Raises:
         SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
@@ -75,11 +75,11 @@ def read_table(path: Path, delimiter: str = ",") -> Table:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
             filled = [(reader.line_num, tuple(row)) for row in reader if any(row)]
     except (FileNotFoundError, IsADirectoryError) as error:
-        raise SequenceError(f"kinematics table {path} is missing. Correct the path in the sequence file.") from error
+        raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SequenceError(f"kinematics table {path} is not a readable CSV file: {error}.") from error
+        raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
     if len(filled) < 2:
-        raise SequenceError(f"kinematics table {path} has no rows. It needs a header and one row per frame.")
+        raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
     header = tuple(name.strip() for name in filled[0][1])
     if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
         raise SequenceError(

@@ -141,7 +141,8 @@ def test_times_that_do_not_increase_are_named_by_line(timed):
     ("frames", "parts"),
     [
         ("", ["[frames]: table is missing", "`video`"]),
-        ('table = "none.csv"', ["none.csv is missing"]),
+        ('table = "none.csv"', ["table of frames", "none.csv is missing"]),
+        ('table = "frames.csv"\ntimestamp = ""', ["timestamp is empty", "time of every frame [s]"]),
         ('table = "frames.csv"\ntimestamp = "stamp"', ["no column 'stamp'", "timestamp names"]),
         ('table = "frames.csv"\ntime_ofset = 1.0', ["time_ofset is not a key", "Did you mean 'time_offset'"]),
         ('table = "frames.csv"\ntime_offset = nan', ["time_offset is nan, but must be a finite number"]),
