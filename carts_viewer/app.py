@@ -137,6 +137,7 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
+        self._session.close()
         self.page.close()
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:

@@ -8,7 +8,6 @@ The sliders are moved over a real websocket, as a browser moves them (at most 20
 import argparse
 import asyncio
 import dataclasses
-import os
 import threading
 import time
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from viser import _messages as messages
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from carts_core.data.bench import resident_megabytes
 from carts_core.resources import sample_sequence
 from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
@@ -200,12 +200,6 @@ def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> li
             samples.append((done, resident_megabytes()))
             break
     return samples
-
-
-def resident_megabytes() -> float:
-    """Memory of this process [MB], as Linux reports it."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def main() -> None:
