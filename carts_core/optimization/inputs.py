@@ -13,7 +13,6 @@ from torch import Tensor
 from ..errors import SettingsError
 from ..scene import Scene
 
-
 _CHANNELS = 96
 """Channels that OpenCV filters at a time; it allows 128."""
 

@@ -45,7 +45,7 @@ class OptimizerSettings:
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
-    noise: float = 0.5
+    noise: float = 0.7
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""

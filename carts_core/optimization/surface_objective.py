@@ -30,6 +30,9 @@ from .window import Window
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
+_FINE = 2
+"""Number of stages that every look but the first one goes through."""
+
 _COARSEST = 4
 """Working pixels per side of a pixel in the coarsest stages."""
 
@@ -43,8 +46,8 @@ _EPSILON = 1e-3
 class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
-    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. Each look
-    has the stages that `blurs` tell, a later one only its last two.
+    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
+    look serves the coarse stages, each later one the last two.
 
     Args:
         scene: with the cameras that take part.
@@ -68,9 +71,9 @@ class SurfaceObjective:
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
     ) -> None:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
-        later = settings.blurs[-2:]
-        self._plan = [(0, blur) for blur in settings.blurs]
-        self._plan += [(look, blur) for look in range(1, settings.looks) for blur in later]
+        coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
+        self._plan = [(0, blur) for blur in coarse]
+        self._plan += [(look, blur) for look in range(min(1, settings.looks - 1), settings.looks) for blur in fine]
         self.stages = len(self._plan)
         self._size = working_size(scene, settings.working_width, extractor.stride)
         device = extractor.device
@@ -105,6 +108,8 @@ class SurfaceObjective:
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
         blurs = [blur for number, blur in self._plan if number == look]
+        if blurs[-1] != self.settings.blurs[-1]:
+            blurs.append(self.settings.blurs[-1])
         self._stages = [_Stage(self.scene, self._size, window, observed, weight, blur, self.settings) for blur in blurs]
 
     def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:

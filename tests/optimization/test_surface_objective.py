@@ -102,7 +102,7 @@ def test_what_is_not_in_the_image_stays_and_is_said_to_be_unknown(sequence: Sequ
     assert std.shape == truth.shape and (std > 0).all()
     assert std[2] < 0.15 * np.deg2rad(3.0), "an insertion is in metres"
 
-    away = {"PSM1": truth + [np.deg2rad(60.0), 0, 0, 0, 0, 0, 0]}
+    away = {"PSM1": truth + np.deg2rad([60.0, 0, 0, 0, 0, 0, 0])}
     blind = FrameOptimizer(sequence.scene, frame, {}, sight, start=away, settings=OptimizerSettings())
     list(blind)
     assert blind.best is not None and blind.best.uncertainty is not None
