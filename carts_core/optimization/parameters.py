@@ -114,6 +114,11 @@ class ParameterVector:
         return len(self.names)
 
     @property
+    def groups(self) -> list[range]:
+        """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
+        return [range(block.start, block.start + block.size) for block in self._blocks]
+
+    @property
     def scales(self) -> Float[Tensor, " n"]:
         """What an offset of 1 is in units of its unknown: 1 for angles and intrinsics, `lever` metres for lengths."""
         scales = torch.ones_like(self.lower)

@@ -30,10 +30,13 @@ from .window import Window
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
+_SPREAD = 1.5
+"""Deviation of random starts, in expected errors."""
+
 _FINE = 2
 """Number of stages that every look but the first one goes through."""
 
-_COARSEST = 4
+_COARSEST = 8
 """Working pixels per side of a pixel in the coarsest stages."""
 
 _SMALLEST_BLUR = 1.2
@@ -98,6 +101,33 @@ class SurfaceObjective:
                 self._look_at(offsets, look)
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._stages[stage - first], gradient)
+
+    def better_start(self, offsets: Float[Tensor, " n"], candidates: int, seed: int = 0) -> Float[Tensor, " n"]:
+        """Offsets worth starting from again: the best of random ones, arm by arm, in the coarsest stage.
+
+        Args:
+            offsets: what has been found so far; it and the start are among the candidates.
+            candidates: number of random ones per arm, drawn from what the prior expects and half as much again.
+            seed: of the random numbers.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        spread = _SPREAD * self._prior.rsqrt().cpu()
+        best = offsets
+        with torch.no_grad():
+            best_cost = self._coarse_cost(best)
+            for group in self.parameters.groups:
+                for index in range(candidates + 1):
+                    drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
+                    trial = best.clone()
+                    trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
+                    cost = self._coarse_cost(self.parameters.clamp(trial))
+                    if cost < best_cost:
+                        best, best_cost = self.parameters.clamp(trial), cost
+        return best
+
+    def _coarse_cost(self, offsets: Tensor) -> float:
+        cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
+        return cost / self.settings.noise**2 + 0.5 * float((self._prior * offsets.square()).sum())
 
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
@@ -172,7 +202,7 @@ class _Stage:
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
-        self._factor = max(f for f in (1, 2, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
         self._blur, self._robust = blur / self._factor, settings.robust
         # A pixel of a coarse stage stands for many of the last one.
         self._precision = self._factor**2 / settings.noise**2
