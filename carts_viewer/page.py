@@ -57,6 +57,8 @@ class Page:
         self._drawn = self.server.gui.add_text("drawn", "", visible=False)
         # And into this one when somebody lets go of a slider or leaves a field.
         self._released = self.server.gui.add_text("released", "", visible=False)
+        # And into this one where somebody points in the picture.
+        self._pointed = self.server.gui.add_text("pointed", "", visible=False)
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -78,6 +80,20 @@ class Page:
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 callback()
+
+    def on_pointed(self, callback: Callable[[float, float], None]) -> None:
+        """Call `callback(u, v)` on the event loop whenever somebody points at a place of the image.
+
+        u and v are shares of its width and height, from its upper left corner; any numbers, if the tab is none of ours.
+        """
+
+        @self._pointed.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            parts = str(self._pointed.value).split()
+            if event.client_id is None or len(parts) != 4:
+                return
+            with contextlib.suppress(ValueError):
+                callback(float(parts[2]), float(parts[3]))
 
     def tell(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
         """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
@@ -162,7 +178,9 @@ class Page:
         return _response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
-        configuration = json.dumps({"drawn": self.drawn_id, "released": self._released._impl.uuid})
+        configuration = json.dumps(
+            {"drawn": self.drawn_id, "released": self._released._impl.uuid, "pointed": self._pointed._impl.uuid}
+        )
         return (
             _index_of_viser()
             .replace(

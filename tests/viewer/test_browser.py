@@ -241,7 +241,7 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
         again = cv2.imdecode(np.frombuffer(archive.read("masks/left/001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
         table = archive.read("kinematics.csv").decode().splitlines()
     assert np.array_equal(again, mask)
-    assert [line.split(",")[1] for line in table] == ["source", "edited", "measured", "measured"]
+    assert [line.split(",")[1] for line in table] == ["source", "hand", "measured", "measured"]
 
 
 def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
