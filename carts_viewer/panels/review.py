@@ -62,7 +62,9 @@ class ReviewPanel:
             write(self._note, review.note)
         frames = range(len(state.project.identity.frame_ids))
         counts = Counter(state.project.review(index).state for index in frames)
-        known = " ".join(f"{_dot(name)}{counts[name]} {name}" for name in ReviewState if counts[name])
+        known = " ".join(
+            f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>' for name in ReviewState if counts[name]
+        )
         self._counts.content = f'<p class="carts-caption">{known}</p>'
 
 
