@@ -31,6 +31,7 @@ from carts_viewer.panels.overlay import OverlayPanel, offered_layers
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
 from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
+from carts_viewer.panels.timeline import TimelinePanel
 from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.picture import Painter
 from carts_viewer.running import OptimizerFactory
@@ -99,6 +100,7 @@ class ViewerApp:
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.mailbox.put(ask.Released()))
         self.page.on_pointed(self._on_pointed)
+        self.page.on_picked(lambda share: self.mailbox.put(ask.ShowFrame(int(_unit(share) * len(sequence)))))
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
 
@@ -222,7 +224,12 @@ class ViewerApp:
                 FreePanel(page, session, state, emit),
             ]
         with right.add_tab("Review"):
-            panels += [ReviewPanel(page, emit, waits), KeypointsPanel(page, session, emit), HistoryPanel(page, emit)]
+            panels += [
+                TimelinePanel(gui),
+                ReviewPanel(page, emit, waits),
+                KeypointsPanel(page, session, emit),
+                HistoryPanel(page, emit),
+            ]
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
         with right.add_tab("Export"):
@@ -256,6 +263,10 @@ class ViewerApp:
         client = self.page.server.get_clients().get(client_id)
         if client is not None:
             client.send_file_download(name, content, save_immediately=True)
+
+
+def _unit(share: float) -> float:
+    return min(max(share, 0.0), 1.0)
 
 
 def serve(

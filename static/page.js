@@ -209,6 +209,12 @@
       last = null;
       pointing = false;
     }, { capture: true });
+    window.addEventListener("click", (event) => {
+      const timeline = event.target instanceof Element && event.target.closest(".carts-timeline");
+      if (!timeline) return;
+      const box = timeline.getBoundingClientRect();
+      report("picked", String((event.clientX - box.left) / box.width));
+    }, { capture: true });
     window.addEventListener("dblclick", (event) => { if (inPicture(event)) showEndoscope(); }, { capture: true });
   }
 

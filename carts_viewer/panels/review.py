@@ -4,7 +4,7 @@ from collections import Counter
 
 import viser
 
-from carts_core.project import ReviewState
+from carts_core.project import Kind, ProjectState, ReviewState
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
@@ -25,6 +25,7 @@ class ReviewPanel:
     def __init__(self, page: Page, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         self._waits = waits
+        self._counted: ProjectState | None = None
         with gui.add_folder("Review"):
             self._state = gui.add_html("")
             accept = gui.add_button("Accept + next", icon=viser.Icon.CHECK, color="teal")
@@ -60,8 +61,14 @@ class ReviewPanel:
         self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{review.state}</b>{keyframe}</p>'
         if not self._waits(ask.SetNote):
             write(self._note, review.note)
-        frames = range(len(state.project.identity.frame_ids))
-        counts = Counter(state.project.review(index).state for index in frames)
+        if self._counted is None or not (state.unsaved or state.project is self._counted):
+            self._counted = state.project
+            self._count(state.project)
+
+    def _count(self, project: ProjectState) -> None:
+        reviews = project.values(Kind.REVIEW).values()
+        counts = Counter(review.state for review in reviews)
+        counts[ReviewState.UNTOUCHED] += len(project.identity.frame_ids) - len(reviews)
         known = " ".join(
             f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>' for name in ReviewState if counts[name]
         )

@@ -338,6 +338,11 @@ def test_reviewing_is_saved_as_the_page_says_and_is_there_in_another_server(
     tab.button("Accept + next")
     eventually(lambda: app.state.index, lambda index: index == 2)
     expect(tab.page.get_by_text("1 accepted")).to_be_visible()
+    timeline = tab.page.locator("svg.carts-timeline")
+    box = timeline.bounding_box()
+    assert box is not None
+    timeline.click(position={"x": 0.1 * box["width"], "y": 20})
+    eventually(lambda: app.state.index, lambda index: index == 0)
     app.close()
     with ViewerApp.open(app.sequence.path, port=0) as again:
         project = again.wait_until_shown(60).project
