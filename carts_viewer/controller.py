@@ -267,7 +267,10 @@ class Controller:
     @handle.register
     def _(self, intent: ask.SetSetting) -> None:
         try:
-            settings = replace(self.state.settings, **{intent.name: intent.value})
+            if intent.name == "loss":
+                settings = self.state.settings.with_loss(intent.value)
+            else:
+                settings = replace(self.state.settings, **{intent.name: intent.value})
         except SettingsError as error:
             # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
             self.change(settings_error=str(error))

@@ -130,7 +130,9 @@ class ParameterVector:
                 part[3:] = self._lever
         return scales
 
-    def prior_precision(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Float[Tensor, " n"]:
+    def prior_precision(
+        self, joints_deg: float, frames_deg: float = 0.5, intrinsics: float = 0.01
+    ) -> Float[Tensor, " n"]:
         """Inverse variance of each unknown [1/rad^2].
 
         Args:

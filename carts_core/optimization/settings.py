@@ -1,6 +1,6 @@
 """What an optimization may change, and how it goes about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
 
@@ -128,6 +128,18 @@ class OptimizerSettings:
         _require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         _require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
+
+    def with_loss(self, loss: Loss) -> "OptimizerSettings":
+        """These settings for another loss, with a solver that can descend it.
+
+        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`.
+        """
+        solver = self.solver
+        if loss == "surface" and solver != "none":
+            solver = "gauss_newton"
+        elif solver == "gauss_newton":
+            solver = "adam"
+        return replace(self, loss=loss, solver=solver)
 
     @staticmethod
     def acs(iterations: int = 60) -> "OptimizerSettings":
