@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from .commands.bench import Bench
 from .commands.evaluate import Evaluate
 from .commands.optimize import Optimize
 from .commands.render import Render
@@ -25,6 +26,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 
