@@ -15,7 +15,7 @@ from ..synthesis.path_tracer import Surface
 from ..synthesis.sensor import expose, linear
 from ..synthesis.smoke import Smoke, SmokeOverlay
 from ..synthesis.tissue import grow_tissue
-from .real_surface import RealSurface
+from .real_surface import DISTANCE, RealSurface
 
 _FRAME_INTERVAL = 0.25
 """Between frames of a recording without timestamps [s]."""
@@ -54,7 +54,7 @@ class Counterfactual:
         self._overlay = SmokeOverlay(strengths.overlay_opacity, self._config.rng("overlay"))
         self._clean = sequence.background(camera)
         brightness = float(np.median(linear(self._clean)))
-        self._lamp = np.pi * self._surface.distance**2 * brightness / _REFLECTANCE
+        self._lamp = np.pi * DISTANCE**2 * brightness / _REFLECTANCE
         self._backgrounds: dict[str, np.ndarray] = {}
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:

@@ -10,7 +10,7 @@ from .frame import TOLERANCE
 from .methods import METHODS
 from .plan import Run, Scope
 
-_CODE = (
+_MEASURED = (
     "*.py",
     "data/*.py",
     "evaluation/*.py",
@@ -23,11 +23,11 @@ _NOT_CODE = {"bench.py", "cli.py"}
 
 
 @cache
-def code_fingerprint() -> str:
-    """SHA-256 over the modules that decide what a method returns for a frame, and how it is scored."""
+def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
+    """SHA-256 over modules of the package; by default those that decide what a method returns, and how it is scored."""
     package = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
-    for pattern in _CODE:
+    for pattern in patterns:
         for path in sorted(package.glob(pattern)):
             if path.name not in _NOT_CODE:
                 digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())

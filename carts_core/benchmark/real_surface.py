@@ -11,17 +11,21 @@ from ..rendering import Renderer
 from ..rendering.geometry import link_transforms
 from ..rendering.shading import visible_points
 from ..scene import Scene
+from ..synthesis.config import EndoscopeConfig
 from ..synthesis.path_tracer import Surface
 
 _CLEARANCE = 0.005
 """Between the deepest tip and the plane behind it [m]."""
+DISTANCE = EndoscopeConfig().distance
+"""From the camera to the plane in the scaled world [m]: that for which blood and smoke are made."""
 
 
 class RealSurface:
     """Instruments before a plane that is parallel to the image.
 
     Everything is in a world like the synthetic one: the plane is z = 0, and the camera looks straight down at its
-    origin.
+    origin. The world is scaled such that it does so from the synthetic camera's distance; otherwise a camera that
+    stands farther away would see more smoke and smaller drops.
 
     Args:
         scene: with one camera.
@@ -32,22 +36,22 @@ class RealSurface:
         self._scene = scene
         self._renderer = Renderer(scene)
         depths = [float(self._rendered(measured).depth.max()) for measured in recording]
-        self.distance = max(*depths, 0.02) + _CLEARANCE
-        """From the camera to the plane [m]."""
+        self._scale = DISTANCE / (max(*depths, 0.02) + _CLEARANCE)
         self._T_world_camera = np.diag([1.0, -1.0, -1.0, 1.0])
-        self._T_world_camera[2, 3] = self.distance
+        self._T_world_camera[2, 3] = DISTANCE
         self.eye: np.ndarray = self._T_world_camera[:3, 3]
-        """The lens, in the world [m]."""
+        """The lens, in the world."""
         camera = scene.cameras[0]
         fx, fy, cx, cy = camera.intrinsics
         rows, columns = np.indices((camera.height, camera.width)) + 0.5
         self._rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(rows)], -1)
 
     def Ts_world_link(self, measured: Mapping[str, np.ndarray] | None) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """The place of every link; none without joint positions."""
+        """The place of every link; none without joint positions. Links are scaled as the world is."""
         if measured is None:
             return {}
         Ts_camera_link = link_transforms(self._scene, self._scene.state(measured))[0].double().numpy()
+        Ts_camera_link[:, :3, 3] *= self._scale
         return dict(enumerate(self._T_world_camera @ Ts_camera_link))
 
     def of(self, mask: Bool[np.ndarray, "h w"], measured: Mapping[str, np.ndarray] | None) -> Surface:
@@ -57,7 +61,7 @@ class RealSurface:
             mask: the instruments' pixels.
             measured: arm -> joint positions [rad, m]; None where there are no arms.
         """
-        depth = np.full(mask.shape, self.distance)
+        depth = np.full(mask.shape, DISTANCE)
         normal = np.zeros((*mask.shape, 3))
         normal[..., 2] = 1.0
         link = np.full(mask.shape, -1, np.int32)
@@ -75,7 +79,7 @@ class RealSurface:
             return self._renderer(self._scene.state(measured))
 
     def _arms(self, measured: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth [m], normal in the world and link of the arms in the image; the link is -1 where there is none."""
+        """Scaled depth, normal in the world and link of the arms in the image; the link is -1 where there is none."""
         state, geometry = self._scene.state(measured), self._renderer.geometry
         rendering = self._rendered(measured)
         face = rendering.face_ids[0].long()
@@ -85,4 +89,4 @@ class RealSurface:
         normal = torch.zeros(link.numel(), 3)
         normal[points.pixel] = points.transformed(Ts)[1].T
         in_world = normal.view(*link.shape, 3).double().numpy() @ self._T_world_camera[:3, :3].T
-        return rendering.depth[0].double().numpy(), in_world, link.numpy().astype(np.int32)
+        return self._scale * rendering.depth[0].double().numpy(), in_world, link.numpy().astype(np.int32)

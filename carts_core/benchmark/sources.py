@@ -18,11 +18,13 @@ from ..synthesis.config import MotionConfig, RenderConfig, SynthesisConfig
 from ..synthesis.synthesize import Progress, synthesize
 from .backdrop import backdrop
 from .counterfactual import Counterfactual
+from .fingerprints import code_fingerprint
 from .plan import REAL, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
 _MOTION_SECONDS = 6.0
+_ALTERING_CODE = ("benchmark/backdrop.py", "benchmark/counterfactual.py", "benchmark/real_surface.py")
 
 
 class Recording(Protocol):
@@ -74,7 +76,8 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
         render=RenderConfig(samples=scope.samples),
     )
-    fingerprint = hashlib.sha256(repr(config).encode()).hexdigest()[:32]
+    code = code_fingerprint(("synthesis/*.py",))
+    fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
     folder = cache_dir() / "benchmark" / f"sequence_{seed}_{fingerprint[:8]}"
 
     def open_(progress: Progress) -> Sequence:
@@ -103,7 +106,8 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     if not masked:
         raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
-    fingerprint = hashlib.sha256(path.read_bytes() + f"{seed}".encode())
+    code = code_fingerprint(("synthesis/*.py", *_ALTERING_CODE))
+    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
     for index in frames:
         frame = sequence.frame(index, cameras=[camera.name])
         fingerprint.update(frame.images[camera.name].tobytes())

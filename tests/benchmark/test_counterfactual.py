@@ -9,7 +9,7 @@ import pytest
 from carts_core.benchmark import QUICK, real_source, sources
 from carts_core.benchmark.backdrop import backdrop
 from carts_core.benchmark.counterfactual import Counterfactual
-from carts_core.benchmark.real_surface import RealSurface
+from carts_core.benchmark.real_surface import DISTANCE, RealSurface
 from carts_core.data import Sequence
 from carts_core.errors import CartsError, SettingsError
 from carts_core.synthesis import DOMAINS, path_tracer
@@ -81,8 +81,8 @@ def test_the_surface_lies_on_the_arm_in_the_mask_and_on_the_plane_elsewhere(sequ
     surface = found.of(mask, frame.measured)
     assert (surface.link[mask] >= 0).all() and (surface.link[~mask] == -1).all()
     assert np.allclose(surface.position[~mask][:, 2], 0.0, atol=1e-9)
-    assert (surface.depth[mask] < found.distance).all()
-    assert np.allclose(surface.position[..., 2], found.distance - surface.depth)
+    assert (surface.depth[mask] < DISTANCE).all()
+    assert np.allclose(surface.position[..., 2], DISTANCE - surface.depth)
     assert np.allclose(np.linalg.norm(surface.normal, axis=-1), 1.0, atol=1e-4)
     on_link = np.linalg.inv(found.Ts_world_link(frame.measured)[int(surface.link[mask][0])])
     point = on_link @ np.append(surface.position[mask][0], 1.0)
