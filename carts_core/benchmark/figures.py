@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 
 from ..export import write_bytes
 from . import paper
+from .accuracy_tables import ROWS
 from .measurement import Measurement, Score
 from .plan import SYNTHETIC
 from .statistics import Measurements, Spread, scores
-from .tables import DOMAIN_LABELS, ROWS
+from .tables import DOMAIN_LABELS
 
 matplotlib.use("Agg")
 # Same measurements, same bytes.

@@ -10,21 +10,14 @@ from string import Template
 
 from ..export import write_bytes
 from . import paper
+from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
 from .frame import TOLERANCE
 from .measurement import Measurement
 from .page import PAGE
+from .speed_tables import speed_table, stage_table, worse_table
 from .statistics import Measurements
-from .tables import (
-    Cell,
-    Table,
-    error_tables,
-    iteration_tables,
-    main_tables,
-    speed_table,
-    stage_table,
-    worse_table,
-)
+from .tables import Cell, Table
 from .targets import Target, targets
 
 

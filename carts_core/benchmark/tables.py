@@ -1,14 +1,9 @@
-"""The report's tables, the paper's numbers beside ours."""
+"""What a table of the report is, and how numbers are written in it."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from . import paper
-from .frame import TOLERANCE
-from .measurement import Measurement, Score
-from .methods import METHODS
-from .plan import SYNTHETIC
-from .statistics import Measurements, Spread, scores
+from .statistics import Spread
 
 DOMAIN_LABELS = {
     "regular": "regular",
@@ -18,16 +13,8 @@ DOMAIN_LABELS = {
     "background_change": "background change",
     "simulated_smoke": "simulated smoke",
 }
-ROWS = (
-    ("U-Net alone", "unet", None),
-    ("CaRTS without optimization", "start", None),
-    ("CaRTS L1, best of 50", "l1", 50),
-    ("CaRTS ACS, paper's setting, best of 30", "paper", 30),
-    ("CaRTS ACS, paper's setting, best of 50", "paper", 50),
-    ("CaRTS ACS, ours", "ours", None),
-)
-"""Label, method and number of steps of the main table's rows."""
-_NOTHING = "–"
+NOTHING = "–"
+"""In place of a number that is not there."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +39,7 @@ class Table:
 def spread_text(spread: Spread | None, scale: float = 100.0, digits: int = 1) -> str:
     """Mean ± standard deviation, Dice and NSD in percent by default."""
     if spread is None:
-        return _NOTHING
+        return NOTHING
     return f"{scale * spread.mean:.{digits}f} ± {scale * spread.deviation:.{digits}f}"
 
 
@@ -61,204 +48,3 @@ def paper_note(value: paper.Value | None, column: str | None, digits: int = 1) -
     if value is None:
         return ""
     return f"{column} {value[0]:.{digits}f} ± {value[1]:.{digits}f}"
-
-
-def main_tables(data: Measurements) -> list[Table]:
-    """Dice and NSD of every method in every domain, from the measured joint positions."""
-    tables = []
-    for source in data.sources():
-        domains = data.domains(source)
-        for name, value in (("Dice", _dice), ("NSD", _nsd)):
-            rows = tuple(
-                (Cell(label), *(_main_cell(data, source, domain, method, steps, value) for domain in domains))
-                for label, method, steps in ROWS
-            )
-            caption = f"{name} in percent, mean ± standard deviation over frames, started at the measured kinematics."
-            if value is _nsd:
-                caption += f" Normalized surface distance within {TOLERANCE:g} px; the paper does not give it."
-            header = ("method", *(DOMAIN_LABELS[domain] for domain in domains))
-            tables.append(Table(f"{source.capitalize()} frames: {name}", caption, header, rows))
-    return tables
-
-
-def _main_cell(
-    data: Measurements, source: str, domain: str, method: str, steps: int | None, value: Callable[[Score], float]
-) -> Cell:
-    chosen = data.of(source=source, domain=domain, method=method, error_deg=None)
-    text = spread_text(Spread.of(value(score) for score in scores(chosen, steps)))
-    if value is _nsd or steps == 30:
-        return Cell(text)
-    column = paper.COLUMNS.get((source, domain))
-    return Cell(text, paper_note(paper.DICE.get(method, {}).get(column or ""), column))
-
-
-def iteration_tables(data: Measurements) -> list[Table]:
-    """Dice of the best iterate of the first so many steps."""
-    tables = []
-    for source in data.sources():
-        rows = []
-        for method in ("paper", "ours"):
-            for domain in data.domains(source):
-                chosen = data.of(source=source, domain=domain, method=method, error_deg=None)
-                column = paper.COLUMNS.get((source, domain)) if method == "paper" else None
-                theirs = paper.DICE_BY_ITERATIONS.get(column or "", (None,) * len(paper.ITERATIONS))
-                cells = (
-                    Cell(
-                        spread_text(Spread.of(map(_dice, scores(chosen, steps)))),
-                        paper_note(value, column),
-                    )
-                    for steps, value in zip(paper.ITERATIONS, theirs, strict=True)
-                )
-                rows.append((Cell(METHODS[method].label), Cell(DOMAIN_LABELS[domain]), *cells))
-        tables.append(
-            Table(
-                f"{source.capitalize()} frames: Dice by iterations",
-                "Best iterate (lowest loss) of the first so many steps of one run, in percent, started at the measured "
-                f"kinematics. {_NOTHING}: the setting ends before. A run that has converged keeps its value.",
-                ("method", "domain", *map(str, paper.ITERATIONS)),
-                tuple(rows),
-            )
-        )
-    return tables
-
-
-def error_tables(data: Measurements) -> list[Table]:
-    """Dice and joint MAE by the size of the error at the start."""
-    tables = []
-    for source in data.sources():
-        errors = sorted({run.run.error_deg for run in data.of(source=source) if run.run.error_deg is not None})
-        if not errors:
-            continue
-        for name, value, scale in (
-            ("Dice", _dice, 100.0),
-            ("joint MAE", lambda score: score.joint_mae_deg, 1.0),
-            ("joint MAE, visible joints", lambda score: score.visible_joint_mae_deg, 1.0),
-        ):
-            if rows := _error_rows(data, source, errors, name, value, scale):
-                tables.append(
-                    Table(
-                        f"{source.capitalize()} frames: {name} by the error at the start",
-                        _error_caption(source, name),
-                        ("method", "domain", *(f"{error:g}°" for error in errors)),
-                        tuple(rows),
-                    )
-                )
-    return tables
-
-
-def _error_rows(
-    data: Measurements,
-    source: str,
-    errors: list[float],
-    name: str,
-    value: Callable[[Score], float | None],
-    scale: float,
-) -> list[tuple[Cell, ...]]:
-    rows = []
-    for method in ("paper", "ours"):
-        for domain in data.domains(source):
-            spreads = [
-                Spread.of(map(value, scores(data.of(source=source, domain=domain, method=method, error_deg=error))))
-                for error in errors
-            ]
-            if not any(spreads):
-                continue
-            column = paper.COLUMNS.get((source, domain)) if method == "paper" else None
-            theirs = (paper.DICE_BY_ERROR if name == "Dice" else paper.MAE_BY_ERROR).get(column or "", {})
-            digits = 1 if name == "Dice" else 2
-            cells = (
-                Cell(spread_text(spread, scale, digits), paper_note(theirs.get(error), column))
-                for error, spread in zip(errors, spreads, strict=True)
-            )
-            rows.append((Cell(METHODS[method].label), Cell(DOMAIN_LABELS[domain]), *cells))
-    return rows
-
-
-def _error_caption(source: str, name: str) -> str:
-    origin = "the true" if source == SYNTHETIC else "the measured (the truth is not known)"
-    unit = "Dice in percent" if name == "Dice" else "Mean absolute error of measured revolute joints [deg]"
-    return (
-        f"{unit}, mean ± standard deviation. Every joint starts that many degrees (insertion: millimetres) off "
-        f"{origin} joint positions, each with a random sign."
-    )
-
-
-def speed_table(data: Measurements) -> Table:
-    """Seconds per frame and how many frames each method made worse."""
-    rows = []
-    for source in data.sources():
-        for method, entry in METHODS.items():
-            chosen = data.of(source=source, method=method)
-            if not chosen:
-                continue
-            steps = Spread.of(measurement.iterations for measurement in chosen)
-            seconds = Spread.of(measurement.final.seconds for measurement in chosen)
-            assert steps is not None and seconds is not None
-            each = seconds.mean / steps.mean if steps.mean else None
-            started = [measurement for measurement in chosen if measurement.start is not None]
-            worse = Spread.of(float(measurement.made_worse) for measurement in started)
-            rows.append(
-                (
-                    Cell(source),
-                    Cell(entry.label),
-                    Cell(str(len(chosen))),
-                    Cell(f"{steps.mean:.1f}"),
-                    Cell(f"{seconds.mean:.2f}"),
-                    Cell(_NOTHING if each is None else f"{1e3 * each:.0f}"),
-                    Cell(_NOTHING if worse is None or method == "start" else f"{100 * worse.mean:.1f} %"),
-                )
-            )
-    return Table(
-        "Seconds per frame, and frames made worse",
-        "Over all runs of a method, each frame alone, from the image's arrival to the result, without reading files. "
-        "Made worse: Dice more than 0.01 below that of the start. The paper says that 30 to 50 iterations are far from "
-        "video rate, and gives no seconds.",
-        ("frames", "method", "runs", "iterations", "s per frame", "ms per iteration", "made worse"),
-        tuple(rows),
-    )
-
-
-def worse_table(data: Measurements) -> Table | None:
-    """The runs of the default solver that ended below their start; None where there are none."""
-    worse = [measurement for measurement in data.of(method="ours") if measurement.made_worse]
-    if not worse:
-        return None
-    return Table(
-        "Frames made worse by the default solver",
-        "Every one of them: where to look first.",
-        ("frames", "domain", "frame", "error at the start", "Dice at the start", "Dice"),
-        tuple(_worse_row(measurement) for measurement in worse),
-    )
-
-
-def _worse_row(measurement: Measurement) -> tuple[Cell, ...]:
-    run, start = measurement.run, measurement.start
-    assert start is not None
-    error = "as measured" if run.error_deg is None else f"{run.error_deg:g}°"
-    texts: Iterable[str] = (
-        run.source,
-        DOMAIN_LABELS[run.domain],
-        str(run.frame),
-        error,
-        f"{100 * start.dice:.1f}",
-        f"{100 * measurement.final.dice:.1f}",
-    )
-    return tuple(map(Cell, texts))
-
-
-def stage_table(stages: dict[str, float]) -> Table:
-    """Milliseconds of each stage."""
-    return Table(
-        "Stages of one iteration",
-        "Medians on the first frame of the shipped sequence (two arms, 640x480).",
-        ("stage", "ms"),
-        tuple((Cell(name), Cell(f"{value:.1f}")) for name, value in stages.items()),
-    )
-
-
-def _dice(score: Score) -> float:
-    return score.dice
-
-
-def _nsd(score: Score) -> float:
-    return score.nsd

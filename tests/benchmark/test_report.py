@@ -9,8 +9,8 @@ import pytest
 from handmade import make_measurement
 
 from carts_core.benchmark import Facts, Measurement, Run, Score, write_report
+from carts_core.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
 from carts_core.benchmark.statistics import Measurements
-from carts_core.benchmark.tables import error_tables, iteration_tables, main_tables
 from carts_core.synthesis import DOMAINS
 
 FACTS = Facts("quick", 200, {"synthetic": "seed 5 <b>"}, "abc", "def", "0.1")
