@@ -5,10 +5,9 @@ from collections.abc import Callable
 from . import paper
 from .frame import TOLERANCE
 from .measurement import Score
-from .methods import METHODS
 from .plan import SYNTHETIC
 from .statistics import Measurements, Spread, scores
-from .tables import DOMAIN_LABELS, NOTHING, Cell, Table, paper_note, spread_text
+from .tables import DOMAIN_LABELS, NOTHING, SHORT_LABELS, Cell, Table, paper_note, spread_text
 
 ROWS = (
     ("U-Net alone", "unet", None),
@@ -55,7 +54,7 @@ def iteration_tables(data: Measurements) -> list[Table]:
     tables = []
     for source in data.sources():
         rows = []
-        for method in ("paper", "ours"):
+        for method in SHORT_LABELS:
             for domain in data.domains(source):
                 chosen = data.of(source=source, domain=domain, method=method, error_deg=None)
                 column = paper.COLUMNS.get((source, domain)) if method == "paper" else None
@@ -67,7 +66,7 @@ def iteration_tables(data: Measurements) -> list[Table]:
                     )
                     for steps, value in zip(paper.ITERATIONS, theirs, strict=True)
                 )
-                rows.append((Cell(METHODS[method].label), Cell(DOMAIN_LABELS[domain]), *cells))
+                rows.append((Cell(SHORT_LABELS[method]), Cell(DOMAIN_LABELS[domain]), *cells))
         tables.append(
             Table(
                 f"{source.capitalize()} frames: Dice by iterations",
@@ -113,7 +112,7 @@ def _error_rows(
     scale: float,
 ) -> list[tuple[Cell, ...]]:
     rows = []
-    for method in ("paper", "ours"):
+    for method in SHORT_LABELS:
         for domain in data.domains(source):
             spreads = [
                 Spread.of(map(value, scores(data.of(source=source, domain=domain, method=method, error_deg=error))))
@@ -128,7 +127,7 @@ def _error_rows(
                 Cell(spread_text(spread, scale, digits), paper_note(theirs.get(error), column))
                 for error, spread in zip(errors, spreads, strict=True)
             )
-            rows.append((Cell(METHODS[method].label), Cell(DOMAIN_LABELS[domain]), *cells))
+            rows.append((Cell(SHORT_LABELS[method]), Cell(DOMAIN_LABELS[domain]), *cells))
     return rows
 
 

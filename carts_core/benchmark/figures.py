@@ -15,14 +15,13 @@ from .accuracy_tables import ROWS
 from .measurement import Measurement, Score
 from .plan import SYNTHETIC
 from .statistics import Measurements, Spread, scores
-from .tables import DOMAIN_LABELS
+from .tables import DOMAIN_LABELS, SHORT_LABELS
 
 matplotlib.use("Agg")
 # Same measurements, same bytes.
 matplotlib.rcParams["svg.hashsalt"] = "carts"
 
 COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
-LABELS = {"paper": "paper's setting", "ours": "ours"}
 _BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
 
 
@@ -120,7 +119,7 @@ def _padded(measurements: list[Measurement], steps: int, values: Callable[[Measu
 
 
 def _band(axes: Axes, x: np.ndarray, values: np.ndarray, method: str) -> None:
-    axes.plot(x, values.mean(0), color=COLORS[method], label=LABELS[method])
+    axes.plot(x, values.mean(0), color=COLORS[method], label=SHORT_LABELS[method])
     axes.fill_between(x, *np.quantile(values, (0.25, 0.75), axis=0), color=COLORS[method], alpha=0.15, lw=0)
 
 
@@ -138,7 +137,7 @@ def _errors(data: Measurements) -> Figure | None:
             degrees = sorted({m.run.error_deg for m in runs if m.run.error_deg is not None})
             spreads = [Spread.of(value(m.final) for m in runs if m.run.error_deg == error) for error in degrees]
             known = [(error, spread) for error, spread in zip(degrees, spreads, strict=True) if spread]
-            _with_bars(axes, [(e, s.mean, s.deviation) for e, s in known], color, "o-", LABELS[method])
+            _with_bars(axes, [(e, s.mean, s.deviation) for e, s in known], color, "o-", SHORT_LABELS[method])
         points = [(error, scale * mean, scale * deviation) for error, (mean, deviation) in table["S-Reg"].items()]
         _with_bars(axes, points, "#777", "x--", "paper's own numbers (S-Reg)")
     dice_axes.set(title="Dice", xlabel="error of every joint at the start [deg]", ylabel="Dice")
@@ -173,9 +172,11 @@ def _scatter(data: Measurements) -> Figure | None:
         for method, color in COLORS.items():
             known = [m for m in data.of(source=source, method=method) if m.start and value(m.final) is not None]
             x, y = [m.start.dice for m in known if m.start], [value(m.final) for m in known]
-            axes.scatter(x, y, s=12, color=color, alpha=0.6, label=LABELS[method], lw=0)
+            axes.scatter(x, y, s=12, color=color, alpha=0.6, label=SHORT_LABELS[method], lw=0)
         if name == "Dice":
+            limits = axes.get_xlim(), axes.get_ylim()
             axes.axline((0.9, 0.89), slope=1, color="#999", lw=1, ls="--")
+            axes.set(xlim=limits[0], ylim=limits[1])
         axes.set(title=f"{source} frames", xlabel="Dice at the start", ylabel=f"{name} after")
     _finish(grid[: len(panels)])
     return figure

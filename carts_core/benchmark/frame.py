@@ -1,10 +1,8 @@
 """One run: a method on one frame, every iterate scored."""
 
-import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +16,7 @@ from ..optimization import FrameOptimizer, Iterate, OptimizerSettings
 from ..perturbation import perturb
 from ..rendering import Renderer
 from ..scene import Scene
+from .machine import machine
 from .measurement import Measurement, Score
 from .plan import Run
 
@@ -126,14 +125,3 @@ def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtra
     mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
     seconds = time.perf_counter() - began
     return Measurement(run, truth.score_mask(mask, seconds), (), "not iterative", machine())
-
-
-def machine() -> str:
-    """Processor, number of torch's threads and device, as seconds depend on them."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
-    device = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
-    return f"{model}, {torch.get_num_threads()} threads of torch{device}"

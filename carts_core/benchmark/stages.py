@@ -11,7 +11,7 @@ from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
 from ..resources import sample_sequence
 from .fingerprints import code_fingerprint
-from .frame import machine
+from .machine import machine
 
 _RUNS = 10
 

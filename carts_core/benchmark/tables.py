@@ -13,6 +13,8 @@ DOMAIN_LABELS = {
     "background_change": "background change",
     "simulated_smoke": "simulated smoke",
 }
+SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
+"""Of the methods that are followed through iterations and errors."""
 NOTHING = "–"
 """In place of a number that is not there."""
 
@@ -37,9 +39,11 @@ class Table:
 
 
 def spread_text(spread: Spread | None, scale: float = 100.0, digits: int = 1) -> str:
-    """Mean ± standard deviation, Dice and NSD in percent by default."""
+    """Mean ± standard deviation, Dice and NSD in percent by default; of a single frame there is no deviation."""
     if spread is None:
         return NOTHING
+    if spread.count == 1:
+        return f"{scale * spread.mean:.{digits}f}"
     return f"{scale * spread.mean:.{digits}f} ± {scale * spread.deviation:.{digits}f}"
 
 

@@ -36,8 +36,8 @@ def test_the_worst_domain_decides_on_dice() -> None:
     good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0) for domain in DOMAINS[1:]]
     fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
     bad = make_measurement((0.6, 0.97), domain="regular", error_deg=2.0)
-    assert _target("synthetic, 2 degrees off: mean Dice", fine, *good).met is True
-    missed = _target("synthetic, 2 degrees off: mean Dice", bad, *good)
+    assert _target("synthetic, 2° off: mean Dice", fine, *good).met is True
+    missed = _target("synthetic, 2° off: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
 
 
@@ -48,7 +48,7 @@ def test_iterations_count_until_near_the_final_dice() -> None:
 
 def test_recovery_and_made_worse_are_shares_of_runs() -> None:
     runs = [make_measurement((0.5, dice), frame=i, error_deg=5.0) for i, dice in enumerate((0.96, 0.97, 0.4, 0.99))]
-    recovered = _target("5 degrees off", *runs)
+    recovered = _target("synthetic, 5° off", *runs)
     assert recovered.reached == "75 %" and recovered.met is False
     worse = _target("frames made worse", *runs)
     assert worse.reached == "25.0 %" and worse.met is False
@@ -65,5 +65,5 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
 
 
 def test_visible_joints_have_no_verdict_as_long_as_nobody_says_which_they_are() -> None:
-    target = _target("synthetic, 1 degrees off: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
+    target = _target("synthetic, 1° off: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
     assert target.met is None and "all measured joints: 0.50°" in target.basis
