@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from ..synthesis.config import DOMAINS, DomainConfig, SensorConfig, SynthesisCon
 from ..synthesis.path_tracer import Surface
 from ..synthesis.sensor import expose, linear
 from ..synthesis.smoke import Smoke, SmokeOverlay
-from ..synthesis.tissue import grow_tissue
+from ..synthesis.tissue import Tissue, grow_tissue
 from .real_surface import DISTANCE, RealSurface
 
 _FRAME_INTERVAL = 0.25
@@ -48,8 +49,7 @@ class Counterfactual:
         self._config = SynthesisConfig(seed=seed)
         self._surface = RealSurface(self.scene, [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))])
         strengths: DomainConfig = self._config.domain
-        tissue = grow_tissue("muscle", 256, 1024, self._config.rng("tissue"))
-        self._bleeding = Bleeding(tissue, strengths, self._config.rng("bleeding"))
+        self._bleeding = Bleeding(_relief(seed), strengths, self._config.rng("bleeding"))
         self._smoke = Smoke(strengths, self._config.rng("smoke"))
         self._overlay = SmokeOverlay(strengths.overlay_opacity, self._config.rng("overlay"))
         self._clean = sequence.background(camera)
@@ -113,3 +113,9 @@ class Counterfactual:
             case "simulated_smoke":
                 return self._overlay.over(image, time)
         raise AssertionError(f"no such domain: {domain}")
+
+
+@cache
+def _relief(seed: int) -> Tissue:
+    """In whose hollows blood gathers; nothing else of it is seen."""
+    return grow_tissue("muscle", 256, 1024, SynthesisConfig(seed=seed).rng("tissue"))
