@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from carts_core.benchmark import QUICK, real_source, sources
+from carts_core.benchmark import backdrop as backdrop_module
 from carts_core.benchmark.backdrop import backdrop
 from carts_core.benchmark.counterfactual import Counterfactual
 from carts_core.benchmark.real_surface import DISTANCE, RealSurface
 from carts_core.data import Sequence
 from carts_core.errors import CartsError, SettingsError
 from carts_core.synthesis import DOMAINS, path_tracer
+from carts_core.synthesis.tissue import Tissue
 
 SIZE = {"width": 160, "height": 120}
 
@@ -108,8 +110,10 @@ def test_a_recording_opens_as_a_source_with_its_masked_frames(
 
 
 def test_without_mitsuba_the_error_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flat = Tissue(np.zeros((8, 8), np.float32), np.ones((8, 8, 3), np.float32), np.ones((8, 8), np.float32))
     monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
     monkeypatch.setitem(sys.modules, "mitsuba", None)
+    monkeypatch.setattr(backdrop_module, "grow_tissue", lambda kind, *size_and_rng: flat)
     path_tracer._mitsuba.cache_clear()
     try:
         with pytest.raises(CartsError, match=r"pip install 'carts\[synthesis\]'"):
