@@ -142,7 +142,7 @@ def _facts(facts: Facts, measurements: list[Measurement]) -> str:
 
 
 def _targets(verdicts: list[Target]) -> str:
-    words = {True: ("met", "met"), False: ("missed", "missed"), None: ("open", "not measured")}
+    words = {True: ("met", "met"), False: ("missed", "missed"), None: ("open", "open")}
     rows = "".join(
         f"<tr><td>{escape(target.what)}<small>{escape(target.basis)}</small></td>"
         f"<td>{escape(target.target)}</td><td>{escape(target.reached)}</td>"

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import mean, median
 
+from ..synthesis.config import DOMAINS
 from .measurement import Measurement
 from .plan import REAL, SYNTHETIC
 from .statistics import Measurements
@@ -22,7 +23,7 @@ class Target:
     target: str
     reached: str
     met: bool | None
-    """None where nothing was measured."""
+    """None where it is open: nothing was measured, or nothing that misses it, but not all that it asks for."""
     reference: str
     basis: str
     """What it was computed from."""
@@ -52,12 +53,13 @@ def _target(
     at_least: bool,
     text: Callable[[float], str],
     reference: str = "",
+    complete: bool = True,
 ) -> Target:
     bound = f"at {'least' if at_least else 'most'} {text(least_or_most)}"
     if value is None:
         return Target(what, bound, "not measured", None, reference, basis)
     met = value >= least_or_most if at_least else value <= least_or_most
-    return Target(what, bound, text(value), met, reference, basis)
+    return Target(what, bound, text(value), met if complete or not met else None, reference, basis)
 
 
 def _worst_of(means: dict[str, float], worst: str | None) -> str:
@@ -143,6 +145,7 @@ def _dice_after(data: Measurements, error: float, least: float) -> Target:
         at_least=True,
         text=lambda value: f"{value:.3f}",
         reference=f"paper, S-Reg: {paper}",
+        complete=set(means) == set(DOMAINS),
     )
 
 

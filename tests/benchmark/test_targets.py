@@ -37,6 +37,10 @@ def test_the_worst_domain_decides_on_dice() -> None:
     fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
     bad = make_measurement((0.6, 0.97), domain="regular", error_deg=2.0)
     assert _target("synthetic, 2° off: mean Dice", fine, *good).met is True
+    part = _target("synthetic, 2° off: mean Dice", fine)
+    assert part.met is None and part.reached == "0.981" and "domains measured: 1" in part.basis
+    missed = _target("synthetic, 2° off: mean Dice", bad)
+    assert missed.met is False
     missed = _target("synthetic, 2° off: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
 
