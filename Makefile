@@ -36,6 +36,7 @@ bench: setup-dev ## Run the slow tests and print the measurements
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
 	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m slow $(ARGS)
 	$(BIN)/python -m carts_core.bench
+	$(BIN)/python -m carts_core.data.bench
 	$(BIN)/python -m carts_viewer.bench
 	$(BIN)/carts bench --quick
 

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from .commands.bench import Bench
 from .commands.evaluate import Evaluate
+from .commands.export import Export
 from .commands.optimize import Optimize
 from .commands.render import Render
 from .commands.synthesize import Synthesize
@@ -24,6 +25,7 @@ Command = (
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

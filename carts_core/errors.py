@@ -22,3 +22,7 @@ class WeightsError(CartsError):
 
 class SettingsError(CartsError):
     """A setting is out of its range or contradicts another one."""
+
+
+class ProjectError(CartsError):
+    """A project file cannot be opened or written to, or an edit does not fit the sequence."""

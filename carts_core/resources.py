@@ -30,6 +30,7 @@ def shipped_robot() -> Path:
     return sample_data_dir() / "robots" / "psm_lnd" / "psm_lnd.urdf"
 
 
-def shipped_weights() -> Path:
-    """Weights of the shipped feature network."""
-    return sample_data_dir() / "weights" / "features.safetensors"
+def shipped_weights() -> tuple[Path, Path]:
+    """Weights of the shipped feature network and of the shipped surface network."""
+    folder = sample_data_dir() / "weights"
+    return folder / "features.safetensors", folder / "surface.safetensors"

@@ -63,7 +63,7 @@ class ViewerApp:
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
-        weights: Path | None = None,
+        weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
     ) -> None:
         """Start serving an open sequence; arguments as in `open`."""
@@ -99,7 +99,7 @@ class ViewerApp:
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
-        weights: Path | None = None,
+        weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
     ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
@@ -109,7 +109,7 @@ class ViewerApp:
             host: A loopback address or `localhost`.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: Where to render and optimize, say `cpu` or `cuda`.
-            weights: Of the feature network; None for the shipped ones.
+            weights: Weights files; a network that none is given of is the shipped one.
             report: Told what takes long.
 
         Raises:
@@ -137,6 +137,7 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
+        self._session.close()
         self.page.close()
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
@@ -229,7 +230,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     device: str = "cpu",
-    weights: Path | None = None,
+    weights: tuple[Path, ...] = (),
     open_browser: bool = False,
 ) -> None:
     """Serve the viewer of a sequence until Ctrl-C; prints where it is.
@@ -239,7 +240,7 @@ def serve(
         host: A loopback address or `localhost`.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
-        weights: Of the feature network; None for the shipped ones.
+        weights: Weights files; a network that none is given of is the shipped one.
         open_browser: Open the page in the default browser.
 
     Raises:

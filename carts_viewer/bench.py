@@ -8,7 +8,6 @@ The sliders are moved over a real websocket, as a browser moves them (at most 20
 import argparse
 import asyncio
 import dataclasses
-import os
 import threading
 import time
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from viser import _messages as messages
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from carts_core.data.bench import resident_megabytes
 from carts_core.resources import sample_sequence
 from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
@@ -202,21 +202,15 @@ def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> li
     return samples
 
 
-def resident_megabytes() -> float:
-    """Memory of this process [MB], as Linux reports it."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def main() -> None:
     """Print the figures."""
     leave_a_core_free()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
-    parser.add_argument("--weights", type=Path, default=None)
+    parser.add_argument("--weights", type=Path, nargs="*", default=())
     parser.add_argument("--iterations", type=int, default=_ITERATIONS)
     arguments = parser.parse_args()
-    with ViewerApp.open(arguments.sequence, port=0, weights=arguments.weights) as app:
+    with ViewerApp.open(arguments.sequence, port=0, weights=tuple(arguments.weights)) as app:
         app.wait_until_shown(120)
         camera = app.scene.camera(app.state.camera)
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from carts_core.errors import CartsError, SettingsError
+from carts_core.export import file_name
 from carts_viewer import intents as ask
-from carts_viewer.exporting import ZipExport, file_name, frame_mask
+from carts_viewer.exporting import ZipExport, frame_mask
 from carts_viewer.layers import Layer
 from carts_viewer.picture import Painter
 from carts_viewer.running import ActiveRun, OptimizerFactory

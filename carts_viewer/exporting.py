@@ -1,10 +1,9 @@
 """Files that people take away: a mask as PNG, or all masks and the kinematics table as one zip."""
 
 import io
-import re
 import zipfile
 
-from carts_core.export import KinematicsRow, kinematics_csv, mask_png
+from carts_core.export import KinematicsRow, file_name, kinematics_csv, mask_png
 from carts_viewer.picture import Painter
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
@@ -13,11 +12,6 @@ from carts_viewer.state import Pose
 def frame_mask(painter: Painter, pose: Pose, camera: str) -> bytes:
     """The rendered mask of a pose in one camera, as a PNG file of the camera's own size."""
     return mask_png(painter.arm_ids(pose.scene, camera) >= 0)
-
-
-def file_name(text: str) -> str:
-    """A name from a sequence file as part of a path that leads nowhere else."""
-    return re.sub(r"[^\w.-]+", "_", text).lstrip(".") or "_"
 
 
 class ZipExport:

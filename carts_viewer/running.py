@@ -30,15 +30,15 @@ class Optimizer(Protocol):
 
 
 class OptimizerFactory:
-    """Makes optimizers for frames of one sequence; loads the feature network once, when it is first needed."""
+    """Makes optimizers for frames of one sequence; loads the networks once, when it is first needed."""
 
     def __init__(
-        self, sequence: Recording, *, weights: Path | None = None, device: str = "cpu", report: Callable[[str], None]
+        self, sequence: Recording, *, weights: Sequence[Path] = (), device: str = "cpu", report: Callable[[str], None]
     ) -> None:
         """
         Args:
             sequence: The recording.
-            weights: Of the feature network; None for the shipped ones.
+            weights: Weights files; a network that none is given of is the shipped one.
             device: Where to compute.
             report: Told, for people, what takes long.
         """
@@ -49,14 +49,14 @@ class OptimizerFactory:
         self._extractor: FeatureExtractor | None = None
 
     def prepare(self) -> FeatureExtractor:
-        """The feature network.
+        """The networks.
 
         Raises:
             WeightsError: it cannot be loaded.
         """
         if self._extractor is None:
-            self._report("Loading the feature network")
-            self._extractor = FeatureExtractor.load(self._weights, device=self._device)
+            self._report("Loading the networks")
+            self._extractor = FeatureExtractor.load(*self._weights, device=self._device)
         return self._extractor
 
     def make(

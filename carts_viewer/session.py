@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from carts_core.data import Frame, Sequence
+from carts_core.data import Frame, FrameReader, Sequence
 from carts_core.perturbation import perturb
 from carts_core.scene import Arm, Scene, SceneState
 from carts_viewer.state import Pose, Source
@@ -47,6 +47,7 @@ class Session:
         self.ranges = tuple(
             _range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
         )
+        self._reader = FrameReader(sequence)
         self._corrected: dict[int, Pose] = {}
         self._changes: list[_Change] = []
 
@@ -56,12 +57,16 @@ class Session:
         return len(self._changes)
 
     def frame(self, index: int, domain: str, camera: str) -> Frame:
-        """The frame with the image of that camera; the sequence keeps what it has decoded.
+        """The frame with the image of that camera; those ahead of it are read in advance.
 
         Raises:
             SequenceError: the image is not usable.
         """
-        return self.sequence.frame(index, domain, [camera])
+        return self._reader.frame(index, domain, camera)
+
+    def close(self) -> None:
+        """Stop reading frames in advance."""
+        self._reader.close()
 
     def measured(self, frame: Frame) -> Pose:
         """The pose that the kinematics table gives."""

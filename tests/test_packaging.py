@@ -108,7 +108,7 @@ def test_what_is_shipped_stays_small() -> None:
 
 def test_the_installed_command_describes_itself(environment: Path, tmp_path: Path) -> None:
     printed = _run(environment / "bin" / "carts", "--help", cwd=tmp_path)
-    for command in ("view", "optimize", "evaluate", "render", "synthesize", "train"):
+    for command in ("view", "optimize", "evaluate", "render", "export", "synthesize", "train"):
         assert command in printed
 
 

@@ -15,7 +15,7 @@ ROWS = (
     ("CaRTS L1, best of 50", "l1", 50),
     ("CaRTS ACS, paper's setting, best of 30", "paper", 30),
     ("CaRTS ACS, paper's setting, best of 50", "paper", 50),
-    ("CaRTS ACS, ours", "ours", None),
+    ("CaRTS, ours", "ours", None),
 )
 """Label, method and number of steps of the main table's rows."""
 

@@ -12,11 +12,11 @@ from .plan import Run, Scope
 
 _MEASURED = (
     "*.py",
-    "data/*.py",
-    "evaluation/*.py",
-    "features/*.py",
-    "optimization/*.py",
-    "rendering/*.py",
+    "data/**/*.py",
+    "evaluation/**/*.py",
+    "features/**/*.py",
+    "optimization/**/*.py",
+    "rendering/**/*.py",
     "benchmark/frame.py",
 )
 _NOT_CODE = {"bench.py", "cli.py"}

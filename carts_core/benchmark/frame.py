@@ -101,17 +101,19 @@ def optimize(
     began = time.perf_counter()
     optimizer = FrameOptimizer(scene, frame, background, extractor, start=start, settings=settings)
     seconds = time.perf_counter() - began
-    trace = []
+    trace: list[Score] = []
+    best: list[int] = []
     while True:
         began = time.perf_counter()
         iterate = optimizer.step()
         seconds += time.perf_counter() - began
         if iterate is None:
             break
+        best.append(len(trace) if optimizer.best is iterate else best[-1])
         trace.append(truth.score(iterate, renderer, optimizer, seconds))
     assert optimizer.best is not None and optimizer.stop_reason is not None
     final = truth.score(optimizer.best, renderer, optimizer, seconds)
-    return Measurement(run, final, tuple(trace), optimizer.stop_reason, machine())
+    return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine())
 
 
 def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:
@@ -124,4 +126,4 @@ def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtra
     height, width = image.shape[:2]
     mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
     seconds = time.perf_counter() - began
-    return Measurement(run, truth.score_mask(mask, seconds), (), "not iterative", machine())
+    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine())

@@ -1,7 +1,7 @@
 """What a run measured, and its line in the results file."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from .plan import Run
@@ -33,6 +33,9 @@ class Measurement:
     """Of what the method returns."""
     trace: tuple[Score, ...]
     """Of every iterate, the start first; empty for a method without iterates."""
+    best: tuple[int, ...]
+    """For each iterate, the place of the one that the optimizer held for the best when it had come there. Losses of a
+    coarse and a fine stage need not compare, so only the optimizer knows."""
     stopped: str
     """Why the optimization ended."""
     machine: str
@@ -54,23 +57,18 @@ class Measurement:
         return self.start is not None and self.final.dice < self.start.dice - 0.01
 
     def best_of(self, iterations: int) -> Score | None:
-        """The iterate of the lowest loss among the first so many steps; None where the run was cut before them.
+        """What would have been returned after so many steps; None where the run was cut before them.
 
-        Its `seconds` are those of all these steps, since the lowest loss is only known after them.
+        Its `seconds` are those of all these steps.
         """
         if not self.trace or (iterations > self.iterations and self.stopped == "iterations"):
             return None
-        within = self.trace[: iterations + 1]
-        best = min(within, key=lambda score: float("inf") if score.loss is None else score.loss)
-        return Score(**{**asdict(best), "seconds": within[-1].seconds})
+        last = min(iterations, self.iterations)
+        return replace(self.trace[self.best[last]], seconds=self.trace[last].seconds)
 
     def best_so_far(self) -> list[Score]:
-        """For each iterate, the one of the lowest loss until then."""
-        best: list[Score] = []
-        for score in self.trace:
-            better = not best or (score.loss is not None and best[-1].loss is not None and score.loss < best[-1].loss)
-            best.append(score if better else best[-1])
-        return best
+        """For each iterate, the score of the best until then."""
+        return [self.trace[place] for place in self.best]
 
     def to_json(self) -> dict[str, Any]:
         """The measurement without what identifies its settings; lists by column keep the line short."""
@@ -79,6 +77,7 @@ class Measurement:
             "run": asdict(self.run),
             "final": _rounded(asdict(self.final)),
             "trace": {name: [_round(getattr(score, name)) for score in self.trace] for name in names},
+            "best": self.best,
             "stopped": self.stopped,
             "machine": self.machine,
         }
@@ -91,11 +90,15 @@ class Measurement:
             KeyError, TypeError, ValueError: it is not one.
         """
         names = [field.name for field in fields(Score)]
-        rows = zip(*(line["trace"][name] for name in names), strict=True)
+        rows = list(zip(*(line["trace"][name] for name in names), strict=True))
+        best = tuple(line["best"])
+        if len(best) != len(rows) or not all(0 <= place <= index for index, place in enumerate(best)):
+            raise ValueError(f"best is {best}, but there are {len(rows)} iterates")
         return Measurement(
             run=Run(**line["run"]),
             final=Score(**line["final"]),
             trace=tuple(Score(**dict(zip(names, row, strict=True))) for row in rows),
+            best=best,
             stopped=line["stopped"],
             machine=line["machine"],
         )

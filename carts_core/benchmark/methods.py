@@ -22,5 +22,5 @@ METHODS = {
     "start": Method("CaRTS without optimization", lambda _: OptimizerSettings(solver="none")),
     "l1": Method("CaRTS L1 (paper's setting)", lambda _: replace(OptimizerSettings.paper(50), loss="l1")),
     "paper": Method("CaRTS ACS (paper's setting)", OptimizerSettings.paper),
-    "ours": Method("CaRTS ACS, ours", lambda _: OptimizerSettings()),
+    "ours": Method("CaRTS, ours", lambda _: OptimizerSettings()),
 }

@@ -39,7 +39,7 @@ def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
 
 
 def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
-    """Times of the feature network on a whole working image [ms]; the optimizer passes only a window of it."""
+    """Times of the networks on a whole working image [ms]."""
     width, height = extractor.working_size
     image = torch.rand(1, 3, height, width, device=extractor.device)
 
@@ -50,9 +50,14 @@ def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
     def both() -> None:
         extractor.features(image.requires_grad_()).sum().backward()
 
+    believed = torch.rand(1, 6, height, width, device=extractor.device)
+
     return {
-        f"network forward, {width}x{height}": milliseconds(forward, _RUNS),
-        f"network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
+        f"surface network forward, {width}x{height}": milliseconds(
+            lambda: extractor.surface(image.detach(), believed), _RUNS
+        ),
+        f"feature network forward, {width}x{height}": milliseconds(forward, _RUNS),
+        f"feature network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
     }
 
 

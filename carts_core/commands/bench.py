@@ -49,7 +49,7 @@ class Bench:
         name = "quick" if self.quick else "full"
         folder = self.output or _DEFAULT_FOLDER / name
         seed = TEST_SEED if self.seed is None else self.seed
-        extractor = FeatureExtractor.load(self.network.weights, self.network.device)
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         sources = [synthetic_source(scope, seed)]
         if self.real is not None:
             sources.append(real_source(self.real, scope, seed))

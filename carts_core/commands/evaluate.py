@@ -46,7 +46,7 @@ class Evaluate:
             track(
                 evaluate(
                     sequence,
-                    FeatureExtractor.load(self.network.weights, self.network.device),
+                    FeatureExtractor.load(*self.network.weights, device=self.network.device),
                     frames=frames,
                     cameras=cameras,
                     domains=domains,

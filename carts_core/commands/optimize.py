@@ -42,7 +42,7 @@ class Optimize:
         """Optimize what is not there yet."""
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
-        extractor = FeatureExtractor.load(self.network.weights, self.network.device)
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         frames = self.select.frame_indices(sequence)
         for domain in self.select.domain_names(sequence):
             for camera in self.select.camera_names(sequence.scene):

@@ -4,16 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
-import numpy as np
-import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
 
 from ..data import Frame, Sequence
 from ..evaluation import start_positions
-from ..export import image_png, mask_png, write_bytes
+from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
 from ..rendering import Renderer
 from ..scene import SceneState
 from .selection import Selection, SequencePath
@@ -58,16 +55,3 @@ class Render:
             return mask_png(renderer.segment(state)[0] >= 0)
         image, mask = image_and_mask(renderer, state)
         return image_png(image if self.style == "image" else overlay(frame.images[camera], image, mask, self.opacity))
-
-
-def image_and_mask(renderer: Renderer, state: SceneState) -> tuple[np.ndarray, np.ndarray]:
-    """The first camera's rendering as RGB uint8, and its mask."""
-    with torch.no_grad():
-        rendering = renderer(state)
-    image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
-    return image, rendering.silhouette[0].numpy() > 0.5
-
-
-def overlay(frame: np.ndarray, image: np.ndarray, mask: np.ndarray, opacity: float) -> np.ndarray:
-    """The rendering blended over the frame where the mask is, RGB uint8."""
-    return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)

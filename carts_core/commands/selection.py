@@ -87,10 +87,10 @@ def parse_frames(text: str, count: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Network:
-    """The feature network and where it runs."""
+    """The networks and where they run."""
 
-    weights: Path | None = None
-    """Weights file; the shipped one by default."""
+    weights: tuple[Path, ...] = ()
+    """Weights files; a network that none is given of is the shipped one."""
     device: str = "cpu"
     """`cpu`, or a CUDA device such as `cuda` or `cuda:1`."""
 

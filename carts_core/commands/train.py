@@ -14,7 +14,7 @@ from .selection import check_device
 
 @dataclass(frozen=True)
 class Train:
-    """Train the feature network on synthetic images; run it again to go on after an interruption."""
+    """Train a network on synthetic images; run it again to go on after an interruption."""
 
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""

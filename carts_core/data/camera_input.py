@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..camera import Camera
-from ..errors import SequenceError
 from .calibration import take_camera
+from .frame_files import check_present, frame_files
+from .frame_list import FrameList
 from .images import ImageFiles, ImageSource
-from .patterns import expand, frame_files, is_glob, is_per_frame
-from .rows import Rows
+from .patterns import expand, is_glob, is_per_frame
 from .toml_table import TomlTable, closest
 from .video import SUFFIXES, Video
-
-_SHOWN_MISSING = 3
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class CameraInput:
     background: Mapping[str, Path]
 
 
-def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
+def take_camera_input(table: TomlTable, frames: FrameList, domains: tuple[str, ...]) -> CameraInput:
     """The camera that one `[[cameras]]` table describes, every file of it present.
 
     Raises:
@@ -35,12 +33,12 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
     """
     camera = take_camera(table)
     images = {
-        domain: _images(table, pattern, rows, domain, camera.name)
+        domain: _images(table, pattern, frames, domain, camera.name)
         for domain, pattern in _by_domain(table, "images", domains, required=True).items()
     }
     sparse = table.take("sparse_masks", bool, False)
     masks = {
-        domain: _masks(table, pattern, rows, domain=domain, camera=camera.name, sparse=sparse)
+        domain: _masks(table, pattern, frames, domain=domain, camera=camera.name, sparse=sparse)
         for domain, pattern in _by_domain(table, "masks", domains).items()
     }
     background: dict[str, Path] = {}
@@ -78,7 +76,7 @@ def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: b
     return dict(value)
 
 
-def _images(table: TomlTable, pattern: str, rows: Rows, domain: str, camera: str) -> ImageSource:
+def _images(table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str) -> ImageSource:
     key = table.name("images")
     if not is_per_frame(pattern) and not is_glob(pattern):
         path = table.path(expand(pattern, key, domain=domain, camera=camera))
@@ -88,32 +86,20 @@ def _images(table: TomlTable, pattern: str, rows: Rows, domain: str, camera: str
                 f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
                 f"or name a video ({', '.join(SUFFIXES)}).",
             )
-        return Video(path, rows.video_frames)
-    files = frame_files(table.file.parent, pattern, key, frame_ids=rows.frame_ids, domain=domain, camera=camera)
-    _check_present(key, files, rows.frame_ids)
+        return Video(path, frames.video_frames)
+    files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
+    check_present(key, files, frames)
     return ImageFiles(files)
 
 
 def _masks(
-    table: TomlTable, pattern: str, rows: Rows, *, domain: str, camera: str, sparse: bool
+    table: TomlTable, pattern: str, frames: FrameList, *, domain: str, camera: str, sparse: bool
 ) -> tuple[Path | None, ...]:
     key = table.name("masks")
     if not is_per_frame(pattern) and not is_glob(pattern):
         raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it.")
-    files = frame_files(table.file.parent, pattern, key, frame_ids=rows.frame_ids, domain=domain, camera=camera)
+    files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
     if sparse and any(file.is_file() for file in files):
         return tuple(file if file.is_file() else None for file in files)
-    _check_present(key, files, rows.frame_ids, " If only some frames have masks, set sparse_masks = true.")
+    check_present(key, files, frames, " If only some frames have masks, set sparse_masks = true.")
     return files
-
-
-def _check_present(key: str, files: tuple[Path, ...], frame_ids: tuple[str, ...], hint: str = "") -> None:
-    missing = [(file, frame_id) for file, frame_id in zip(files, frame_ids, strict=True) if not file.is_file()]
-    if missing:
-        shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
-        rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
-        raise SequenceError(
-            f"{key}: {len(missing)} of {len(files)} files are missing: {shown}{rest}. The kinematics table has "
-            f"{len(files)} rows and every row needs its file: put them back, correct the pattern, or remove the rows."
-            f"{hint}"
-        )

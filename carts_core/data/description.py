@@ -13,7 +13,9 @@ from ..robot import Robot
 from ..scene import Arm, Light, Scene
 from .calibration import resolve_robot, take_transform
 from .camera_input import CameraInput, take_camera_input
+from .frame_list import FrameList
 from .joints import take_joints
+from .matching import JointSamples, TimeMatching
 from .rows import Rows, take_rows
 from .toml_table import TomlTable, read_toml
 
@@ -23,12 +25,12 @@ FORMAT = "carts-sequence/1"
 
 @dataclass(frozen=True)
 class ArmInput:
-    """An arm and its joint positions in every frame."""
+    """An arm and its joint positions."""
 
     arm: Arm
     measured_joints: tuple[str, ...]
-    measured: Float[np.ndarray, "frames dofs"]
-    truth: Float[np.ndarray, "frames dofs"] | None
+    measured: JointSamples
+    truth: JointSamples | None
 
 
 @dataclass(frozen=True)
@@ -39,10 +41,19 @@ class Description:
     name: str
     scene: Scene
     domains: tuple[str, ...]
-    frame_ids: tuple[str, ...]
-    timestamps: Float[np.ndarray, " frames"] | None
+    frames: FrameList
+    matching: TimeMatching | None
+    """How joint positions are matched with frames by time; None where every row of the tables is a frame."""
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
+
+    def at_frames(self, samples: JointSamples) -> Float[np.ndarray, "frames dofs"]:
+        """The joint positions of every frame [rad, m].
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        return samples.positions if self.matching is None else samples.at_times(self.frames, self.matching)
 
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
@@ -61,11 +72,12 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     name = root.take("name", str, path.stem)
     root.take("description", str, "")
     domains = _take_domains(root)
-    rows = take_rows(root.take_table("kinematics"))
+    frames_section = root.take_table("frames") if "frames" in root else None
+    rows = take_rows(root.take_table("kinematics"), frames_section)
     light = _take_light(root.take_table("light"))
     robots: dict[tuple[Path, str | None], Robot] = {}
     arms = [_take_arm(table, rows, robots, progress) for table in root.take_tables("arms")]
-    cameras = [take_camera_input(table, rows, domains) for table in root.take_tables("cameras")]
+    cameras = [take_camera_input(table, rows.frames, domains) for table in root.take_tables("cameras")]
     root.finish()
     scene = Scene(tuple(entry.arm for entry in arms), tuple(entry.camera for entry in cameras), light)
     return Description(
@@ -73,8 +85,8 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
         name=name,
         scene=scene,
         domains=domains,
-        frame_ids=rows.frame_ids,
-        timestamps=rows.timestamps,
+        frames=rows.frames,
+        matching=rows.matching,
         cameras={entry.camera.name: entry for entry in cameras},
         arms={entry.arm.name: entry for entry in arms},
     )
@@ -118,8 +130,6 @@ def _take_arm(
     robot = robots[key]
     T_world_base = take_transform(table, "T_world_base", np.eye(4).tolist())
     columns = take_joints(table, robot)
-    measured = columns.read(rows.table_of(table))
-    truth_table = rows.truth_of(table)
-    truth = None if truth_table is None else columns.read(truth_table)
+    measured, truth = rows.measured_of(table, columns), rows.truth_of(table, columns)
     table.finish()
     return ArmInput(Arm(name, robot, T_world_base), columns.measured, measured, truth)

@@ -1,9 +1,8 @@
 """A recording: frames with images, measured joint positions, and where known masks and truth."""
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from ..errors import SequenceError
 from ..rendering import Renderer
 from ..scene import Scene
 from .background import estimate_background, spread, widen
+from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
 from .images import read_image, read_mask
@@ -52,7 +52,8 @@ class Sequence:
         scene: arms and cameras as calibrated, cameras without distortion.
         domains: the variants of every image; the first is the default.
         frame_ids: name of every frame.
-        timestamps: [frames] [s], or None.
+        timestamps: when each image was taken [frames] [s], or None.
+        matching: how joint positions are matched with frames by time, or None where each row of the table is a frame.
         measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
         truth: arm -> true joint positions of all frames, or None; only the arms that have one.
@@ -63,14 +64,17 @@ class Sequence:
         self.name = description.name
         self.scene: Scene = description.scene
         self.domains = description.domains
-        self.frame_ids = description.frame_ids
-        self.timestamps = description.timestamps
+        self.frame_ids = description.frames.frame_ids
+        self.timestamps = description.frames.timestamps
+        self.matching = description.matching
         self.measured_joints = {name: arm.measured_joints for name, arm in description.arms.items()}
-        self.measured = {name: arm.measured for name, arm in description.arms.items()}
-        truth = {name: arm.truth for name, arm in description.arms.items() if arm.truth is not None}
-        self.truth = truth or None
+        self.measured = {name: description.at_frames(arm.measured) for name, arm in description.arms.items()}
+        self.truth = {
+            name: description.at_frames(arm.truth) for name, arm in description.arms.items() if arm.truth is not None
+        } or None
+        self._description = description
         self._cameras = description.cameras
-        self._cache = _ByteBudget(CACHE_BYTES)
+        self._cache = ByteCache(CACHE_BYTES)
         self._backgrounds: dict[tuple[str, str], np.ndarray] = {}
         self._background_lock = threading.Lock()
 
@@ -87,6 +91,23 @@ class Sequence:
             RobotError: a robot or one of its meshes is missing or wrong.
         """
         return Sequence(read_description(Path(path), progress))
+
+    def with_time_offset(self, time_offset: float) -> "Sequence":
+        """The same images with the joint positions of another time; the sequence file stays as it is.
+
+        Args:
+            time_offset: what to add to an image's time for the time in the kinematics tables [s].
+
+        Raises:
+            SequenceError: rows are not matched by time, or a frame has no row near enough.
+        """
+        if self.matching is None:
+            raise SequenceError(
+                f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
+                "Describe the images' times under [frames] (docs/sequence_format.md)."
+            )
+        matching = replace(self.matching, time_offset=time_offset)
+        return Sequence(replace(self._description, matching=matching))
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -212,28 +233,3 @@ class Sequence:
                 f"Its cameras are: {', '.join(self._cameras)}."
             )
         return self._cameras[camera]
-
-
-class _ByteBudget:
-    """Least recently used arrays, as many as fit into a number of bytes."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._used = 0
-        self._arrays: OrderedDict[tuple, np.ndarray] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array under `key`, made when it is not there. Two threads may make it at once; that does no harm."""
-        with self._lock:
-            if key in self._arrays:
-                self._arrays.move_to_end(key)
-                return self._arrays[key]
-        array = make()
-        with self._lock:
-            if key not in self._arrays:
-                self._arrays[key] = array
-                self._used += array.nbytes
-            while self._used > self._limit and len(self._arrays) > 1:
-                self._used -= self._arrays.popitem(last=False)[1].nbytes
-        return array

@@ -14,7 +14,7 @@ from .toml_table import closest
 
 @dataclass(frozen=True)
 class Table:
-    """A CSV file as text; cells become numbers when a column is asked for."""
+    """A CSV file as text; only cells of a column that is asked for are looked at."""
 
     path: Path
     header: tuple[str, ...]
@@ -41,7 +41,7 @@ class Table:
                 f"Its columns are: {', '.join(self.header)}."
             )
         index = self.header.index(column)
-        return [row[index] for row in self.rows]
+        return [row[index].strip() for row in self.rows]
 
     def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
         """The values of a column.
@@ -49,22 +49,23 @@ class Table:
         Raises:
             SequenceError: there is no such column, or a cell is not a finite number.
         """
-        values = np.empty(len(self.rows))
-        for row, cell in enumerate(self.text(column, asked_by)):
-            try:
-                values[row] = float(cell)
-            except ValueError:
-                values[row] = math.nan
-            if not math.isfinite(values[row]):
-                raise SequenceError(
-                    f"{self.path}, line {self.lines[row]}, column {column!r}: {cell!r} is not a finite number. "
-                    "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
-                )
+        cells = self.text(column, asked_by)
+        try:
+            values = np.fromiter(map(float, cells), np.float64, len(cells))
+        except ValueError:
+            # Some cell is no number; this way, which is slower, says which.
+            values = np.fromiter(map(_number, cells), np.float64, len(cells))
+        if (wrong := np.flatnonzero(~np.isfinite(values))).size:
+            row = wrong[0]
+            raise SequenceError(
+                f"{self.path}, line {self.lines[row]}, column {column!r}: {cells[row]!r} is not a finite number. "
+                "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
+            )
         return values
 
 
-def read_table(path: Path, delimiter: str = ",") -> Table:
-    """Read a CSV file; blank lines are skipped.
+def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
+    """Read a CSV file, which errors call `what`; blank lines are skipped.
 
     Raises:
         SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
@@ -72,14 +73,14 @@ def read_table(path: Path, delimiter: str = ",") -> Table:
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
-            filled = [(reader.line_num, tuple(cell.strip() for cell in row)) for row in reader if any(row)]
+            filled = [(reader.line_num, tuple(row)) for row in reader if any(row)]
     except (FileNotFoundError, IsADirectoryError) as error:
-        raise SequenceError(f"kinematics table {path} is missing. Correct the path in the sequence file.") from error
+        raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SequenceError(f"kinematics table {path} is not a readable CSV file: {error}.") from error
+        raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
     if len(filled) < 2:
-        raise SequenceError(f"kinematics table {path} has no rows. It needs a header and one row per frame.")
-    header = filled[0][1]
+        raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
+    header = tuple(name.strip() for name in filled[0][1])
     if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
         raise SequenceError(
             f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
@@ -94,3 +95,10 @@ def read_table(path: Path, delimiter: str = ",") -> Table:
                 f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
             )
     return Table(path, header, tuple(row for _, row in filled[1:]), tuple(line for line, _ in filled[1:]))
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan

@@ -1,10 +1,22 @@
 """What people take away: one module per format."""
 
+from .dataset import Dataset as Dataset
+from .dataset import Parts as Parts
+from .files import file_name as file_name
 from .files import write_bytes as write_bytes
+from .formats import FORMATS as FORMATS
+from .formats import ExportFormat as ExportFormat
+from .formats import FormatName as FormatName
+from .formats import export as export
+from .frames import ExportFrame as ExportFrame
+from .frames import corrected_frames as corrected_frames
+from .frames import measured_frames as measured_frames
 from .kinematics import KinematicsRow as KinematicsRow
 from .kinematics import kinematics_csv as kinematics_csv
 from .kinematics import read_kinematics_csv as read_kinematics_csv
-from .masks import image_png as image_png
-from .masks import mask_png as mask_png
-
-__all__ = ["KinematicsRow", "image_png", "kinematics_csv", "mask_png", "read_kinematics_csv", "write_bytes"]
+from .monitor import ExportCancelled as ExportCancelled
+from .monitor import Monitor as Monitor
+from .overlay import image_and_mask as image_and_mask
+from .overlay import overlay as overlay
+from .png import image_png as image_png
+from .png import mask_png as mask_png

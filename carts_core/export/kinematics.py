@@ -1,7 +1,11 @@
-"""Corrected kinematics as CSV: a row per frame, a column `source`, and `ARM.JOINT` for every joint [rad, m]."""
+"""Corrected kinematics as CSV: a row per frame, a column `source`, and `ARM.JOINT` for every joint [rad, m].
+
+Where standard deviations are known, a column `ARM.JOINT.std` [rad, m] follows for every joint.
+"""
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,20 +25,42 @@ class KinematicsRow:
     """Who or what made the values: measured, edited, optimized."""
     joint_positions: Mapping[str, np.ndarray]
     """Arm name -> [dofs], [rad, m]."""
+    joint_std: Mapping[str, np.ndarray] | None = None
+    """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, where not known."""
 
 
-def _columns(scene: Scene) -> list[str]:
+def joint_columns(scene: Scene) -> list[str]:
+    """`ARM.JOINT` of every degree of freedom, in the scene's order."""
     return [f"{arm.name}.{joint}" for arm in scene.arms for joint in arm.robot.joint_names]
 
 
+def joint_units(scene: Scene) -> list[str]:
+    """`rad` or `m`, for each of `joint_columns`."""
+    return ["m" if kind == "prismatic" else "rad" for arm in scene.arms for kind in arm.robot.joint_types]
+
+
+def position_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
+    """Joint positions of a row in the order of `joint_columns`, [columns] [rad, m]."""
+    return np.concatenate([np.asarray(row.joint_positions[arm.name], dtype=np.float64) for arm in scene.arms])
+
+
+def std_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
+    """Standard deviations of a row in the order of `joint_columns`, [columns] [rad, m], NaN where not known."""
+    known = row.joint_std or {}
+    unknown = {arm.name: np.full(len(arm.robot.joint_names), math.nan) for arm in scene.arms}
+    return np.concatenate([np.asarray(known.get(name, nothing), dtype=np.float64) for name, nothing in unknown.items()])
+
+
 def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
-    """The table as text."""
+    """The table as text; the columns of standard deviations are there when a row has one."""
+    rows = list(rows)
+    with_std = any(row.joint_std is not None for row in rows)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "source", *_columns(scene)])
+    table.writerow(_header(scene, with_std))
     for row in rows:
-        values = [f"{value:.9g}" for arm in scene.arms for value in row.joint_positions[arm.name]]
-        table.writerow([row.frame_id, row.source, *values])
+        values = [position_values(scene, row), *([std_values(scene, row)] if with_std else [])]
+        table.writerow([row.frame_id, row.source, *(f"{value:.9g}" for value in np.concatenate(values))])
     return text.getvalue()
 
 
@@ -42,23 +68,42 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
     """Rows of a table that `kinematics_csv` wrote.
 
     Raises:
-        SequenceError: the file is of other arms or joints, or not readable.
+        SequenceError: the file is missing, of other arms or joints, or not readable.
     """
-    columns = ["frame", "source", *_columns(scene)]
+    try:
+        return _read(path, scene)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SequenceError(f"{path} is not a readable kinematics table: {error}.") from error
+
+
+def _header(scene: Scene, with_std: bool) -> list[str]:
+    columns = joint_columns(scene)
+    return ["frame", "source", *columns, *([f"{column}.std" for column in columns] if with_std else [])]
+
+
+def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
     with path.open(newline="", encoding="utf-8") as file:
         table = csv.reader(file)
         header = next(table, [])
-        if header != columns:
-            found, wanted = ", ".join(header), ", ".join(columns)
+        with_std = header == _header(scene, True)
+        if not with_std and header != _header(scene, False):
+            found, wanted = ", ".join(header), ", ".join(_header(scene, False))
             raise SequenceError(f"{path} has columns {found}; expected are {wanted}. Remove it.")
         rows = []
         for line, cells in enumerate(table, start=2):
             try:
                 values = np.array([float(cell) for cell in cells[2:]])
-                ends = np.cumsum([len(arm.robot.joint_names) for arm in scene.arms])[:-1]
-                parts = np.split(values, ends) if len(values) == len(columns) - 2 else []
-                positions = {arm.name: part for arm, part in zip(scene.arms, parts, strict=True)}
-            except ValueError as error:
-                raise SequenceError(f"{path}, line {line}: not {len(columns) - 2} numbers. Remove the line.") from error
-            rows.append(KinematicsRow(cells[0], cells[1], positions))
+            except ValueError:
+                values = np.empty(0)
+            if len(cells) != len(header) or len(values) != len(header) - 2:
+                raise SequenceError(f"{path}, line {line}: not {len(header) - 2} numbers. Remove the line.")
+            positions, std = np.split(values, [len(joint_columns(scene))])
+            rows.append(
+                KinematicsRow(cells[0], cells[1], _by_arm(scene, positions), _by_arm(scene, std) if with_std else None)
+            )
     return rows
+
+
+def _by_arm(scene: Scene, values: np.ndarray) -> dict[str, np.ndarray]:
+    ends = np.cumsum([len(arm.robot.joint_names) for arm in scene.arms])[:-1]
+    return {arm.name: part for arm, part in zip(scene.arms, np.split(values, ends), strict=True)}

@@ -1,25 +1,27 @@
-"""Masks and pictures as PNG."""
+"""PNG masks: binary, by arm and by link."""
 
-import cv2
-import numpy as np
-from jaxtyping import Bool, UInt8
+import json
+from pathlib import Path
 
-from ..errors import CartsError
+from .dataset import Dataset, Parts
+from .monitor import Monitor
+from .png import label_png, mask_png
 
-
-def mask_png(mask: Bool[np.ndarray, "height width"]) -> bytes:
-    """A mask as a PNG file: 255 where an arm is, 0 elsewhere."""
-    return _png(mask.astype(np.uint8) * 255)
+_KINDS: tuple[Parts, ...] = ("arms", "links")
 
 
-def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    """An RGB or RGBA picture as a PNG file."""
-    code = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
-    return _png(cv2.cvtColor(image, code))
-
-
-def _png(image: np.ndarray) -> bytes:
-    ok, data = cv2.imencode(".png", image)
-    if not ok:
-        raise CartsError(f"an image of shape {image.shape} could not be written as PNG: OpenCV's encoder failed.")
-    return data.tobytes()
+def write_masks(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+    """Folders `binary`, `arms` and `links` with a PNG per view, and `labels.json` with the meaning of the values."""
+    for kind in ("binary", *_KINDS):
+        (folder / kind).mkdir(parents=True)
+    for view in dataset.views(monitor):
+        dataset.write_image(view, folder / "images")
+        (folder / "binary" / f"{view.name}.png").write_bytes(mask_png(view.link_ids >= 0))
+        for kind in _KINDS:
+            (folder / kind / f"{view.name}.png").write_bytes(label_png(dataset.label_image(view, kind)))
+    meaning = {
+        "binary": {0: "background", 255: "arm"},
+        "arms": {0: "background"} | {category.id: category.name for category in dataset.arms},
+        "links": {0: "background"} | {category.id: category.name for category in dataset.links},
+    }
+    (folder / "labels.json").write_text(json.dumps(meaning, indent=1, ensure_ascii=False), encoding="utf-8")

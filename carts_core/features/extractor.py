@@ -1,62 +1,69 @@
-"""The frozen feature network that the optimizer uses."""
+"""The frozen networks that the optimizer uses."""
 
+import hashlib
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import WeightsError
 from ..resources import shipped_weights
-from .network import FeatureNetwork
-from .weights import read_weights
+from .network import FeatureNetwork, UNet
+from .surface_network import SurfaceNetwork
+from .weights import Weights, read_weights
 
 
 class FeatureExtractor:
-    """A trained feature network, frozen, folded and in channels-last order. Made by `FeatureExtractor.load`.
+    """The trained feature and surface networks, frozen and folded. Made by `FeatureExtractor.load`.
 
-    Gradients flow to the images, never to the weights.
+    Gradients flow to images, never to weights.
 
     Attributes:
-        path: the weights file.
-        sha256: its fingerprint.
-        working_size: width and height [px] of the images that the network was trained for.
+        weights: what was read, "feature" and "surface" network.
+        sha256: fingerprint of both.
+        working_size: width and height [px] of the images that the networks were trained for.
         stride: width and height of an input must be multiples of this [px].
         channels: number of feature channels.
-        training: settings and figures of the training run.
-        device: where the network lives.
+        device: where the networks live.
     """
 
-    def __init__(
-        self,
-        network: FeatureNetwork,
-        path: Path,
-        sha256: str,
-        working_size: tuple[int, int],
-        training: dict,
-        device: str,
-    ) -> None:
-        self._network = network.to(device).folded()
-        self.path = path
-        self.sha256 = sha256
-        self.working_size = working_size
-        self.stride = network.architecture.stride
-        self.channels = network.architecture.widths[0]
-        self.training = training
+    def __init__(self, features: Weights, surface: Weights, device: str | torch.device) -> None:
         self.device = torch.device(device)
+        self.weights = {"feature": features, "surface": surface}
+        feature_network, surface_network = features.network, surface.network
+        assert isinstance(feature_network, FeatureNetwork) and isinstance(surface_network, SurfaceNetwork)
+        self._features = feature_network.to(self.device).folded()
+        self._surface = surface_network.to(self.device).folded()
+        self.sha256 = hashlib.sha256((features.sha256 + surface.sha256).encode()).hexdigest()
+        self.working_size = features.working_size
+        self.stride = max(network.architecture.stride for network in (self._features, self._surface))
+        self.channels = self._features.architecture.widths[0]
 
     def __repr__(self) -> str:
-        return f"FeatureExtractor({self.path.name!r}, {self.channels} channels, {self.sha256[:8]})"
+        return f"FeatureExtractor({self.channels} channels, {self.sha256[:8]})"
 
     @staticmethod
-    def load(weights: Path | str | None = None, device: str | torch.device = "cpu") -> "FeatureExtractor":
-        """Read a weights file, the shipped one by default.
+    def load(*weights: Path | str, device: str | torch.device = "cpu") -> "FeatureExtractor":
+        """Read weights files; a network that none is given of is the shipped one.
 
         Raises:
-            WeightsError: the file is missing, is not safetensors, or holds another network.
+            WeightsError: a file is missing, is not safetensors, or holds no network, or two hold the same kind.
         """
-        path = Path(weights) if weights is not None else shipped_weights()
-        read = read_weights(path)
-        return FeatureExtractor(read.network, path, read.sha256, read.working_size, read.training, str(device))
+        read: dict[str, tuple[Path, Weights]] = {}
+        for path in map(Path, weights):
+            found = read_weights(path)
+            if found.network.kind in read:
+                raise WeightsError(
+                    f"weights files {read[found.network.kind][0]} and {path} both hold a {found.network.kind} network; "
+                    "give one of each kind at most."
+                )
+            read[found.network.kind] = (path, found)
+        kinds: tuple[type[UNet], ...] = (FeatureNetwork, SurfaceNetwork)
+        for network, path in zip(kinds, shipped_weights(), strict=True):
+            if network.kind not in read:
+                read[network.kind] = (path, read_weights(path))
+        return FeatureExtractor(read["feature"][1], read["surface"][1], device)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
         """Features of the last layer before the head (F_I and F_Î of the paper), not negative.
@@ -67,8 +74,18 @@ class FeatureExtractor:
         Raises:
             SettingsError: another number of channels or another size.
         """
-        return self._network.features(images.contiguous(memory_format=torch.channels_last))
+        return self._features.features(images.contiguous(memory_format=torch.channels_last))
 
     def probability(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
         """Probability that a pixel shows an instrument. Arguments and errors as `features`."""
-        return self._network.logits(images.contiguous(memory_format=torch.channels_last)).sigmoid()
+        return self._features.logits(images.contiguous(memory_format=torch.channels_last)).sigmoid()
+
+    @torch.no_grad()
+    def surface(
+        self, images: Float[Tensor, "batch 3 h w"], believed: Float[Tensor, "batch 6 h w"]
+    ) -> Float[Tensor, "batch 6 h w"]:
+        """Surface maps of what images show, given those of where the arms are believed to be.
+
+        Arguments and errors as `SurfaceNetwork.forward`.
+        """
+        return self._surface(images.contiguous(memory_format=torch.channels_last), believed).map()

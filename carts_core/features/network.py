@@ -1,8 +1,10 @@
 """The feature network: a small U-Net whose last layer before the 1x1 head is what ACS compares."""
 
+import copy
 import json
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import ClassVar, Self, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -16,6 +18,8 @@ CONTRAST_FLOOR = 0.02
 """Standard deviation [1] below which an image counts as empty and is not amplified any further."""
 
 _SMOOTHINGS = 2
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -68,25 +72,81 @@ class Architecture:
         )
 
 
-class FeatureNetwork(nn.Module):
-    """U-Net of convolution, batch norm and ReLU; skips are added, not concatenated, which halves the last level's cost.
+class UNet(nn.Module):
+    """Convolution, batch norm and ReLU, down and up; skips are added, not concatenated, which costs half as much.
+
+    Args:
+        architecture: channels and convolutions per level.
+        inputs: channels of the input.
+    """
+
+    kind: ClassVar[str]
+    """What a weights file calls the network."""
+
+    def __init__(self, architecture: Architecture, inputs: int) -> None:
+        super().__init__()
+        self.architecture = architecture
+        self.inputs = inputs
+        widths = architecture.widths
+        channels = (inputs, *widths[:-1])
+        counts = architecture.encoder_convolutions
+        self.encoder = nn.ModuleList(_block(i, o, n) for i, o, n in zip(channels, widths, counts, strict=True))
+        counts = architecture.decoder_convolutions
+        self.reduce = nn.ModuleList(nn.Conv2d(i, o, 1) for o, i in pairwise(widths))
+        self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
+
+    def decoded(self, x: Float[Tensor, "batch inputs h w"]) -> tuple[Tensor, Tensor]:
+        """The finest features, and those at half the resolution that they were made of.
+
+        Raises:
+            SettingsError: another number of channels, or a size that is no multiple of `architecture.stride`.
+        """
+        self._check(x, self.inputs)
+        skips: list[Tensor] = []
+        for level, encode in enumerate(self.encoder):
+            x = encode(functional.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        coarse = skips.pop()
+        for reduce, decode in zip(reversed(self.reduce), reversed(self.decoder), strict=True):
+            coarse = x
+            x = functional.interpolate(reduce(x), scale_factor=2, mode="bilinear", align_corners=False)
+            x = decode(x + skips.pop())
+        return x, coarse
+
+    def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
+        """Images as the first convolution gets them; see `standardize`."""
+        self._check(images, 3)
+        return standardize(images, self.architecture.stride if self.architecture.local_mean else None)
+
+    def _check(self, x: Tensor, channels: int) -> None:
+        stride = self.architecture.stride
+        if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
+            raise SettingsError(
+                f"the {self.kind} network got a tensor of shape {tuple(x.shape)}. Give [batch, {channels}, height, "
+                f"width] with height and width multiples of {stride}; pad or crop the image."
+            )
+
+    def folded(self) -> Self:
+        """A frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
+        folded = copy.deepcopy(self).eval()
+        for block in (*folded.encoder, *folded.decoder):
+            _fold(block)
+        return channels_last(folded).requires_grad_(False)
+
+
+class FeatureNetwork(UNet):
+    """The paper's network: a mask is a linear function of its features, and those are what ACS compares.
 
     Images are standardised first: their local mean is taken off and what is left gets unit deviation. Exposure, colour
     casts and anything that smoothly veils the image then change little before the first convolution, without the
     network ever having been shown such a thing.
     """
 
+    kind = "feature"
+
     def __init__(self, architecture: Architecture | None = None) -> None:
-        super().__init__()
-        self.architecture = architecture or Architecture()
-        widths = self.architecture.widths
-        inputs = (3, *widths[:-1])
-        counts = self.architecture.encoder_convolutions
-        self.encoder = nn.ModuleList(_block(i, o, n) for i, o, n in zip(inputs, widths, counts, strict=True))
-        counts = self.architecture.decoder_convolutions
-        self.reduce = nn.ModuleList(nn.Conv2d(i, o, 1) for o, i in pairwise(widths))
-        self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
-        self.head = nn.Conv2d(widths[0], 1, 1)
+        super().__init__(architecture or Architecture(), 3)
+        self.head = nn.Conv2d(self.architecture.widths[0], 1, 1)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
         """The last layer before the head, F_I of the paper.
@@ -97,17 +157,7 @@ class FeatureNetwork(nn.Module):
         Raises:
             SettingsError: another number of channels, or a size that is no such multiple.
         """
-        self._check(images)
-        x = standardize(images, self.architecture.stride if self.architecture.local_mean else None)
-        skips: list[Tensor] = []
-        for level, encode in enumerate(self.encoder):
-            x = encode(functional.max_pool2d(x, 2) if level else x)
-            skips.append(x)
-        skips.pop()
-        for reduce, decode in zip(reversed(self.reduce), reversed(self.decoder), strict=True):
-            x = functional.interpolate(reduce(x), scale_factor=2, mode="bilinear", align_corners=False)
-            x = decode(x + skips.pop())
-        return x
+        return self.decoded(self.standardized(images))[0]
 
     def logits(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
         """Log odds that a pixel shows an instrument. Arguments and errors as `features`."""
@@ -117,25 +167,8 @@ class FeatureNetwork(nn.Module):
         """The same as `logits`."""
         return self.logits(images)
 
-    def folded(self) -> "FeatureNetwork":
-        """A frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
-        copy = FeatureNetwork(self.architecture)
-        copy.load_state_dict(self.state_dict())
-        copy.eval()
-        for block in (*copy.encoder, *copy.decoder):
-            _fold(block)
-        return channels_last(copy.to(next(self.parameters()).device)).requires_grad_(False)
 
-    def _check(self, images: Tensor) -> None:
-        stride = self.architecture.stride
-        if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] % stride or images.shape[3] % stride:
-            raise SettingsError(
-                f"the feature network got a tensor of shape {tuple(images.shape)}. Give [batch, 3, height, width] "
-                f"with height and width multiples of {stride}; pad or crop the image."
-            )
-
-
-def channels_last(network: FeatureNetwork) -> FeatureNetwork:
+def channels_last(network: Network) -> Network:
     """The network with its weights in channels-last order, which is faster on CPUs and newer GPUs."""
     for parameter in network.parameters():
         if parameter.ndim == 4:

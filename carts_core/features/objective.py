@@ -4,14 +4,11 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from ..errors import SettingsError
 from .network import FeatureNetwork
-
-CLASSES = 3
-"""Background, shaft, head."""
 
 _NEIGHBOURHOOD = 21
 _TINY = 1e-8
@@ -28,8 +25,6 @@ class ObjectiveWeights:
     """One minus soft Dice per image, so that small instruments count as much as large ones."""
     consistency: float = 1.0
     """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
-    parts: float = 0.2
-    """Cross-entropy of a second head that tells shaft, wrist and jaws apart; it is dropped after training."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -37,41 +32,30 @@ class ObjectiveWeights:
                 raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
 
 
-class Objective(nn.Module):
-    """The training loss of a batch of pairs; owns the second head."""
+def feature_loss(
+    network: FeatureNetwork,
+    images: Float[Tensor, "batch pair 3 h w"],
+    classes: Int[Tensor, "batch pair h w"],
+    weights: ObjectiveWeights,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted loss of a batch of pairs, and each term before weighting.
 
-    def __init__(self, channels: int, weights: ObjectiveWeights) -> None:
-        super().__init__()
-        self.weights = weights
-        self.parts = nn.Conv2d(channels, CLASSES, 1)
-
-    def forward(
-        self,
-        network: FeatureNetwork,
-        images: Float[Tensor, "batch pair 3 h w"],
-        classes: Int[Tensor, "batch pair h w"],
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss, and each term before weighting.
-
-        Args:
-            network: the network that is trained.
-            images: observed image and hybrid image of each pair, RGB in [0, 1].
-            classes: 0 background, 1 shaft, 2 head.
-        """
-        features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-        logits = network.head(features)[:, 0]
-        target = (classes > 0).flatten(0, 1).to(logits.dtype)
-        features_of_pair = features.unflatten(0, images.shape[:2])
-        terms = {
-            "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
-            "dice": soft_dice_loss(logits.sigmoid(), target),
-            "consistency": consistency_loss(
-                features_of_pair[:, 0], features_of_pair[:, 1], classes[:, 0], classes[:, 1]
-            ),
-            "parts": functional.cross_entropy(self.parts(features), classes.flatten(0, 1).long()),
-        }
-        total = torch.stack([getattr(self.weights, name) * term for name, term in terms.items()]).sum()
-        return total, terms
+    Args:
+        network: the network that is trained.
+        images: observed image and hybrid image of each pair, RGB in [0, 1].
+        classes: 0 background, 1 shaft, 2 head.
+        weights: of the terms.
+    """
+    features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+    logits = network.head(features)[:, 0]
+    target = (classes > 0).flatten(0, 1).to(logits.dtype)
+    of_pair = features.unflatten(0, images.shape[:2])
+    terms = {
+        "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
+        "dice": soft_dice_loss(logits.sigmoid(), target),
+        "consistency": consistency_loss(of_pair[:, 0], of_pair[:, 1], classes[:, 0], classes[:, 1]),
+    }
+    return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
 
 
 def soft_dice_loss(probability: Float[Tensor, "batch h w"], target: Float[Tensor, "batch h w"]) -> Float[Tensor, ""]:
@@ -95,23 +79,25 @@ def consistency_loss(
     overlap = (features_a * features_b).sum(1)
     similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
     instrument = ((classes_a > 0) | (classes_b > 0)).to(similarity.dtype)
-    near = _dilated(instrument)
+    near = dilated(instrument)
     same = (classes_a == classes_b).to(similarity.dtype)
     moved = ((classes_a > 0) != (classes_b > 0)).to(similarity.dtype)
     other_part = instrument * (classes_a != classes_b) * (1 - moved)
     return (
-        _weighted_mean(1 - similarity, same * instrument)
-        + _weighted_mean(1 - similarity, same * near * (1 - instrument))
-        + _weighted_mean(similarity.clamp(min=0), moved)
-        + _weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
+        weighted_mean(1 - similarity, same * instrument)
+        + weighted_mean(1 - similarity, same * near * (1 - instrument))
+        + weighted_mean(similarity.clamp(min=0), moved)
+        + weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
     )
 
 
-def _dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
+def dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
+    """The mask and its neighbourhood."""
     # A square's maximum is the maximum along rows of the maxima along columns.
     rows = functional.max_pool2d(mask[:, None], (_NEIGHBOURHOOD, 1), 1, (_NEIGHBOURHOOD // 2, 0))
     return functional.max_pool2d(rows, (1, _NEIGHBOURHOOD), 1, (0, _NEIGHBOURHOOD // 2))[:, 0]
 
 
-def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Mean under weights; about zero where all weights are."""
     return (values * weights).sum() / (weights.sum() + 1)

@@ -5,116 +5,84 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import torch
-from jaxtyping import Float, Int
 from matplotlib.figure import Figure
-from torch import Tensor
-from torch.nn import functional
 
 from .checkpoint import History
-from .network import FeatureNetwork
 
 matplotlib.use("Agg")
 
-_EXAMPLES = 6
-_TERMS = ("cross_entropy", "dice", "consistency", "parts")
+Panels = list[list[tuple[str, np.ndarray]]]
+"""Per sample, titled pictures; one without colours runs from -1 to 1."""
 
 
-def write_report(
-    folder: Path,
-    config_json: str,
-    history: History,
-    network: FeatureNetwork,
-    images: Float[Tensor, "pairs 2 3 h w"],
-    classes: Int[Tensor, "pairs 2 h w"],
-) -> Path:
+def write_report(folder: Path, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
     """Write `curves.png`, `predictions.jpg` and `README.md`; returns the path of the page."""
     folder.mkdir(parents=True, exist_ok=True)
-    _curves(history).savefig(folder / "curves.png", dpi=110)
-    _predictions(network, images, classes).savefig(folder / "predictions.jpg", dpi=110, pil_kwargs={"quality": 85})
+    _curves(history, columns).savefig(folder / "curves.png", dpi=110)
+    _predictions(examples).savefig(folder / "predictions.jpg", dpi=110, pil_kwargs={"quality": 85})
     page = folder / "README.md"
-    page.write_text(_page(json.loads(config_json), history, network), encoding="utf-8")
+    page.write_text(_page(config, history, columns), encoding="utf-8")
     return page
 
 
-def _curves(history: History) -> Figure:
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    loss_axes, dice_axes, similarity_axes = figure.subplots(1, 3)
+def _curves(history: History, columns: dict[str, str]) -> Figure:
+    figure = Figure(figsize=(3.3 * (1 + len(columns)), 3.4), layout="constrained")
+    loss_axes, *others = figure.subplots(1, 1 + len(columns))
     steps = [entry["step"] for entry in history.losses]
-    for name in _TERMS:
-        loss_axes.plot(steps, [entry[name] for entry in history.losses], label=name.replace("_", " "), linewidth=0.9)
+    for name in history.losses[0] if history.losses else ():
+        if name not in ("step", "loss"):
+            values = [entry[name] for entry in history.losses]
+            loss_axes.plot(steps, values, label=name.replace("_", " "), linewidth=0.9)
     loss_axes.set(title="training loss, per term", xlabel="step", yscale="log")
+    if loss_axes.lines:
+        loss_axes.legend(fontsize=8)
     steps = [entry["step"] for entry in history.validations]
-    for name in ("dice_observed", "dice_hybrid"):
-        dice_axes.plot(steps, [entry[name] for entry in history.validations], ".-", label=name.removeprefix("dice_"))
-    dice_axes.set(title="validation: Dice of the network's mask", xlabel="step")
-    for name in ("similarity_aligned", "similarity_misaligned"):
-        values = [entry[name] for entry in history.validations]
-        similarity_axes.plot(steps, values, ".-", label=name.removeprefix("similarity_"))
-    similarity_axes.set(title="validation: cosine, observed to hybrid", xlabel="step")
-    for axes in (loss_axes, dice_axes, similarity_axes):
+    for axes, (name, title) in zip(others, columns.items(), strict=True):
+        axes.plot(steps, [entry[name] for entry in history.validations], ".-")
+        axes.set(title=f"validation: {title}", xlabel="step")
+    for axes in (loss_axes, *others):
         axes.grid(alpha=0.3)
-        if axes.lines:
-            axes.legend(fontsize=8)
+        axes.title.set_fontsize(9)
     return figure
 
 
-@torch.no_grad()
-def _predictions(network: FeatureNetwork, images: Tensor, classes: Tensor) -> Figure:
-    folded = network.folded()
-    count = min(_EXAMPLES, len(images))
-    titles = ("observed", "its prediction", "hybrid", "its prediction", "cosine of features")
-    figure = Figure(figsize=(11, 1.75 * count), layout="constrained")
-    rows = figure.subplots(count, len(titles), squeeze=False)
-    for row, pair, truth in zip(rows, images[:count], classes[:count], strict=True):
-        features = folded.features(pair.to(next(folded.parameters()).device))
-        predicted = (folded.head(features)[:, 0] > 0).cpu().numpy()
-        similarity = functional.cosine_similarity(features[:1], features[1:], dim=1)[0].cpu().numpy()
-        shown = pair.permute(0, 2, 3, 1).numpy()
-        mask = (truth > 0).numpy()
-        panels = (shown[0], _confusion(predicted[0], mask[0]), shown[1], _confusion(predicted[1], mask[1]), similarity)
-        for axes, panel in zip(row, panels, strict=True):
-            axes.imshow(panel, vmin=-1 if panel.ndim == 2 else None, vmax=1 if panel.ndim == 2 else None, cmap="RdYlGn")
+def _predictions(examples: Panels) -> Figure:
+    titles = [title for title, _ in examples[0]]
+    figure = Figure(figsize=(2.2 * len(titles), 1.75 * len(examples)), layout="constrained")
+    rows = figure.subplots(len(examples), len(titles), squeeze=False)
+    for row, panels in zip(rows, examples, strict=True):
+        for axes, (_, panel) in zip(row, panels, strict=True):
+            flat = panel.ndim == 2
+            axes.imshow(panel, vmin=-1 if flat else None, vmax=1 if flat else None, cmap="RdYlGn")
             axes.set_axis_off()
     for axes, title in zip(rows[0], titles, strict=True):
         axes.set_title(title, fontsize=9)
     return figure
 
 
-def _confusion(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """True positives white, true negatives black, false positives orange, false negatives red, as in the paper."""
-    image = np.zeros((*truth.shape, 3))
-    image[predicted & truth] = 1, 1, 1
-    image[predicted & ~truth] = 1, 0.6, 0.1
-    image[~predicted & truth] = 0.9, 0.1, 0.1
-    return image
-
-
-def _page(config: dict, history: History, network: FeatureNetwork) -> str:
-    parameters = sum(parameter.numel() for parameter in network.parameters())
+def _page(config: dict, history: History, columns: dict[str, str]) -> str:
     lines = [
-        "# Training report",
+        f"# Training of the {config['network']} network",
         "",
-        f"{config['steps']} steps of {config['batch_pairs']} pairs, {history.seconds / 60:.0f} minutes, "
-        f"{parameters:,} parameters, robots: {', '.join(config['robots'])}.",
+        f"{config['steps']} steps of {config['batch_size']} samples, {history.seconds / 60:.0f} minutes, robots: "
+        f"{', '.join(config['robots'])}.",
         "",
         "![curves](curves.png)",
         "",
-        "| step | Dice, observed | Dice, hybrid | cosine, aligned | cosine, misaligned |",
-        "|---|---|---|---|---|",
+        f"| step | {' | '.join(columns.values())} |",
+        "|---" * (1 + len(columns)) + "|",
     ]
     lines += [
-        f"| {entry['step']} | {entry['dice_observed']:.4f} | {entry['dice_hybrid']:.4f} "
-        f"| {entry['similarity_aligned']:.3f} | {entry['similarity_misaligned']:.3f} |"
-        for entry in history.validations
+        f"| {entry['step']} | {' | '.join(f'{entry[name]:.4f}' for name in columns)} |" for entry in history.validations
     ]
     lines += [
         "",
         "Validation images are made like the training images, from random numbers that training never sees.",
         "",
-        "White: true positives. Black: true negatives. Orange: false positives. Red: false negatives.",
-        "",
         "![example predictions](predictions.jpg)",
+        "",
+        "In predictions of masks, white is a true positive, black a true negative, orange a false positive and red a",
+        "false negative. Parts are red (shaft), green (wrist) and blue (jaws).",
         "",
         "## Settings",
         "",

@@ -13,15 +13,15 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from ..errors import SettingsError
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .loader import training_batches, validation_set
-from .network import FeatureNetwork, channels_last
-from .objective import Objective
+from .network import UNet, channels_last
 from .report import write_report
+from .task import Batch
+from .tasks import task_of
 from .training_config import TrainingConfig
-from .validation import Validation, validate
 from .weights import read_weights, save_weights
 
-WEIGHTS_FILE = "features.safetensors"
 _LOG_EVERY = 10
+_EXAMPLES = 6
 _MAY_CHANGE = ("steps", "workers", "threads", "device", "validation_every", "checkpoint_every")
 
 
@@ -37,7 +37,7 @@ class TrainingProgress:
     """Loss, averaged over the last steps."""
     seconds_per_step: float
     """Wall time per step [s]."""
-    validation: Validation | None
+    validation: dict[str, float] | None
     """The newest validation."""
 
 
@@ -49,7 +49,7 @@ class TrainingResult:
     """Weights file, ready for `FeatureExtractor.load`."""
     report: Path
     """The training report."""
-    validation: Validation
+    validation: dict[str, float]
     """Figures of the saved weights."""
     seconds: float
     """Wall time spent in training steps, over all resumed parts [s]."""
@@ -78,14 +78,14 @@ class _Run:
     """The state of one training run."""
 
     def __init__(self, config: TrainingConfig, output: Path) -> None:
-        self.config, self.output = config, output
+        self.config, self.output, self.task = config, output, task_of(config.network)
         torch.manual_seed(config.seed)
         self.network = channels_last(_first_network(config).to(config.device))
-        self.objective = Objective(config.architecture.widths[0], config.objective).to(config.device)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
-        parameters = [*self.network.parameters(), *self.objective.parameters()]
-        self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
-        self.modules = {"network": self.network, "objective": self.objective, "average": self.average}
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.modules = {"network": self.network, "average": self.average}
         self.step, self.history = 0, History()
         self._resume()
 
@@ -105,19 +105,19 @@ class _Run:
         self.step, self.history = checkpoint.step, checkpoint.history
 
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
-        images, classes = validation_set(self.config)
+        samples = validation_set(self.config)
         validation = None
         if self.step < self.config.steps:
             batches = training_batches(self.config, self.step)
             sums: dict[str, float] = {}
             count, started = 0, time.perf_counter()
             while self.step < self.config.steps:
-                for name, value in self._train_step(*next(batches)).items():
+                for name, value in self._train_step(next(batches)).items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
                 last = self.step == self.config.steps
                 if last or self.step % self.config.validation_every == 0:
-                    validation = self._validate(images, classes)
+                    validation = self._validate(samples)
                 if last or count == _LOG_EVERY:
                     means = {name: value / count for name, value in sums.items()}
                     self.history.losses.append({"step": self.step, **means})
@@ -128,19 +128,20 @@ class _Run:
                 if last or self.step % self.config.checkpoint_every == 0:
                     self._checkpoint()
         if validation is None:
-            validation = validate(self._averaged(), images, classes)
+            validation = self.task.validate(self._averaged().folded(), samples)
             self._save(validation)
+        examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
         report = write_report(
-            self.output / "report", config_json(self.config), self.history, self._averaged(), images, classes
+            self.output / "report", json.loads(config_json(self.config)), self.history, self.task.columns, examples
         )
-        return TrainingResult(self.output / WEIGHTS_FILE, report, validation, self.history.seconds)
+        return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
 
-    def _train_step(self, images: torch.Tensor, classes: torch.Tensor) -> dict[str, float]:
+    def _train_step(self, batch: Batch) -> dict[str, float]:
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self.config.steps)
         self.network.train()
-        device = self.config.device
-        loss, terms = self.objective(self.network, images.to(device).float() / 255, classes.to(device))
+        on_device = tuple(part.to(self.config.device) for part in batch)
+        loss, terms = self.task.loss(self.config, self.network, on_device)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -149,38 +150,50 @@ class _Run:
         self.step += 1
         return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
 
-    def _averaged(self) -> FeatureNetwork:
+    def _averaged(self) -> UNet:
         network = self.average.module
-        assert isinstance(network, FeatureNetwork)
+        assert isinstance(network, UNet)
         return network
 
-    def _validate(self, images: torch.Tensor, classes: torch.Tensor) -> Validation:
-        validation = validate(self._averaged(), images, classes)
-        self.history.validations.append({"step": self.step, **asdict(validation)})
+    def _validate(self, samples: Batch) -> dict[str, float]:
+        validation = self.task.validate(self._averaged().folded(), samples)
+        self.history.validations.append({"step": self.step, **validation})
         self._save(validation)
         return validation
 
-    def _save(self, validation: Validation) -> None:
-        training = {"step": self.step, "validation": asdict(validation), "config": json.loads(config_json(self.config))}
+    def _save(self, validation: dict[str, float]) -> None:
+        training = {"step": self.step, "validation": validation, "config": json.loads(config_json(self.config))}
         field = self.config.images.field_width
         # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
         working_size = (field, field * 3 // 4)
-        save_weights(self._averaged(), self.output / WEIGHTS_FILE, training, working_size)
+        save_weights(self._averaged(), weights_file(self.config, self.output), training, working_size)
 
     def _checkpoint(self) -> None:
         save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
 
 
-def _first_network(config: TrainingConfig) -> FeatureNetwork:
+def _first_network(config: TrainingConfig) -> UNet:
+    fresh = task_of(config.network).network(config)
+    assert isinstance(fresh, UNet)
     if config.start is None:
-        return FeatureNetwork(config.architecture)
+        return fresh
     network = read_weights(config.start).network
+    if network.kind != config.network:
+        raise SettingsError(
+            f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
+            "weights of that kind, or start from random weights."
+        )
     if network.architecture != config.architecture:
         raise SettingsError(
             f"{config.start} holds a network of {network.architecture}, but {config.architecture} is asked for. Give "
             "the architecture of the file, or start from random weights."
         )
     return network
+
+
+def weights_file(config: TrainingConfig, output: Path) -> Path:
+    """Where a run leaves its weights."""
+    return output / f"{config.network}.safetensors"
 
 
 def schedule(step: int, warmup: int, steps: int) -> float:

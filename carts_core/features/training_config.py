@@ -5,25 +5,29 @@ from pathlib import Path
 
 from ..errors import SettingsError
 from ..resources import shipped_robot
-from .domain_randomization import PairSettings
+from .domain_randomization import ImageSettings
 from .network import Architecture
 from .objective import ObjectiveWeights
+from .surface_task import SurfaceWeights
+from .tasks import NetworkName
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """Everything that a training run depends on."""
 
+    network: NetworkName = "feature"
+    """Which network is trained: `feature` for the paper's loss, `surface` for Gauss-Newton."""
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots whose images are made."""
     start: Path | None = None
     """Weights file to start from, for fine-tuning; random weights without it."""
     steps: int = 4000
     """Optimizer steps."""
-    batch_pairs: int = 8
-    """Pairs of an observed and a hybrid image per step."""
+    batch_size: int = 8
+    """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: int = 2
-    """How often a pair is used, mirrored by chance after the first time: making one takes as long as learning it."""
+    """How often a sample is used, mirrored by chance after the first time: making one takes as long as learning it."""
     learning_rate: float = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
     weight_decay: float = 1e-4
@@ -34,8 +38,8 @@ class TrainingConfig:
     """Decay per step of the running average of the weights, which is what is saved."""
     validation_every: int = 250
     """Steps between validations."""
-    validation_pairs: int = 32
-    """Pairs of the fixed validation set."""
+    validation_samples: int = 32
+    """Samples of the fixed validation set."""
     checkpoint_every: int = 100
     """Steps between checkpoints."""
     workers: int = 2
@@ -46,20 +50,22 @@ class TrainingConfig:
     """Seed of everything random."""
     device: str = "cpu"
     """Where the network is trained."""
-    images: PairSettings = field(default_factory=PairSettings)
+    images: ImageSettings = field(default_factory=ImageSettings)
     """What training images look like."""
     objective: ObjectiveWeights = field(default_factory=ObjectiveWeights)
-    """Weights of the loss terms."""
+    """Weights of the feature network's loss terms."""
+    surface_objective: SurfaceWeights = field(default_factory=SurfaceWeights)
+    """Weights of the surface network's loss terms."""
     architecture: Architecture = field(default_factory=Architecture)
     """The network."""
 
     def __post_init__(self) -> None:
         for name in (
             "steps",
-            "batch_pairs",
+            "batch_size",
             "reuse",
             "validation_every",
-            "validation_pairs",
+            "validation_samples",
             "checkpoint_every",
             "threads",
         ):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,13 +10,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ..errors import SettingsError, WeightsError
-from .network import Architecture, FeatureNetwork
+from .network import Architecture, FeatureNetwork, UNet
+from .surface_network import SurfaceNetwork
 
-FORMAT = "carts-feature-network"
 VERSION = "1"
 WORKING_SIZE = (320, 240)
 """Width and height [px] that a 640x480 image is reduced to before the network sees it."""
 
+_NETWORKS: dict[str, Callable[[Architecture], UNet]] = {
+    f"carts-{network.kind}-network": network for network in (FeatureNetwork, SurfaceNetwork)
+}
 _REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipped ones back."
 
 
@@ -23,7 +27,7 @@ _REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipp
 class Weights:
     """What a weights file holds."""
 
-    network: FeatureNetwork
+    network: UNet
     """The trained network, in evaluation mode, not folded."""
     working_size: tuple[int, int]
     """Width and height [px] of the images that it was trained for."""
@@ -33,7 +37,7 @@ class Weights:
     """Fingerprint of the file."""
 
 
-def save_weights(network: FeatureNetwork, path: Path, training: dict, working_size: tuple[int, int]) -> None:
+def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[int, int]) -> None:
     """Write a weights file; a reader never sees half of it.
 
     Args:
@@ -44,7 +48,7 @@ def save_weights(network: FeatureNetwork, path: Path, training: dict, working_si
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {
-        "format": FORMAT,
+        "format": f"carts-{network.kind}-network",
         "version": VERSION,
         "architecture": network.architecture.to_json(),
         "working_size": json.dumps(working_size),
@@ -74,10 +78,10 @@ def read_weights(path: Path) -> Weights:
             f"weights file {path} is not a readable safetensors file ({error}). Allowed is what `carts train` writes. "
             f"{_REMEDY}"
         ) from error
-    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
+    if metadata.get("format") not in _NETWORKS or metadata.get("version") != VERSION:
         raise WeightsError(
             f"weights file {path} says format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed "
-            f"is {FORMAT!r}, version {VERSION!r}. {_REMEDY}"
+            f"is {' or '.join(map(repr, _NETWORKS))}, version {VERSION!r}. {_REMEDY}"
         )
     try:
         architecture = Architecture.from_json(metadata["architecture"])
@@ -88,7 +92,7 @@ def read_weights(path: Path) -> Weights:
             f"weights file {path} has unreadable metadata ({error}). Allowed are an architecture with widths, "
             f"encoder_convolutions and decoder_convolutions, a working size and the training settings. {_REMEDY}"
         ) from error
-    network = FeatureNetwork(architecture)
+    network = _NETWORKS[metadata["format"]](architecture)
     try:
         network.load_state_dict(state)
     except RuntimeError as error:

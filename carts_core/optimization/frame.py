@@ -6,19 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
-from .objective import Evaluation, FrameObjective
+from .evaluation import Evaluation, Objective
+from .feature_objective import FeatureObjective
 from .parameters import ParameterVector
 from .settings import FreeParameters, OptimizerSettings
 from .solvers import make_solver
-
-_WIDE_SHARE = 0.5
-"""Share of the iterations that descend in the wide attention."""
+from .surface_objective import SurfaceObjective
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Iterate:
     """Number of steps before it; 0 is the start."""
     state: SceneState
     loss: float
-    """In the final attention, so comparable through all iterates."""
+    """In the final stage, so comparable through all iterates."""
     terms: dict[str, float]
     """Parts of the objective that was descended."""
     gradient_norms: dict[str, float]
@@ -43,7 +42,7 @@ class Iterate:
     """Rendered arms at the working resolution, RGB."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
-    """Cosine similarity of features, at most 1."""
+    """Of what is compared: cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
 
     def joint_positions(self) -> dict[str, np.ndarray]:
         """Arm name -> joint positions [dofs], [rad, m]."""
@@ -61,13 +60,14 @@ class Progress:
 
 
 class FrameOptimizer:
-    """ACS optimization of one frame (paper, section 3), one iterate at a time.
+    """Optimization of one frame (paper, section 3), one iterate at a time.
 
     Args:
         scene: arms and cameras.
         frame: observed images and measured joint positions.
         backgrounds: camera name -> mean background BG_m.
         extractor: the feature network.
+        ignore: camera name -> pixels that show an occluder; the loss `surface` leaves them out.
         start: arm name -> joint positions to start from, the measured ones by default.
         settings: solver, loss, steps.
         free: what is unknown.
@@ -85,6 +85,7 @@ class FrameOptimizer:
         backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]],
         extractor: FeatureExtractor,
         *,
+        ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
         start: Mapping[str, ArrayLike] | None = None,
         settings: OptimizerSettings | None = None,
         free: FreeParameters | None = None,
@@ -95,15 +96,22 @@ class FrameOptimizer:
         self._arm_names = tuple(arm.name for arm in scene.arms)
         state = scene.state(frame.measured if start is None else start, extractor.device)
         self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
-        self._objective = FrameObjective(scene, frame.images, backgrounds, extractor, self._parameters, self.settings)
+        self._objective: Objective
+        if self.settings.loss == "surface":
+            self._objective = SurfaceObjective(scene, frame.images, extractor, self._parameters, self.settings, ignore)
+        else:
+            self._objective = FeatureObjective(
+                scene, frame.images, backgrounds, extractor, self._parameters, self.settings
+            )
         self.reset()
 
     def reset(self) -> None:
         """Go back to the start; the history is emptied."""
         self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
-        self._solver = make_solver(self.settings)
+        self._solver = make_solver(self.settings, self._parameters, self._objective.stages)
         self.history: list[Progress] = []
         self.best: Iterate | None = None
+        self._epoch = 0
         self.stop_reason: str | None = None
 
     def cancel(self) -> None:
@@ -118,21 +126,16 @@ class FrameOptimizer:
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
-        index = len(self.history)
-        last = self.settings.solver == "none" or index >= self.settings.iterations
-        wide = index < _WIDE_SHARE * self.settings.iterations
-        offsets = self._offsets.clone().requires_grad_(not last)
-        evaluation = self._objective(offsets, wide=wide)
-        gradient = torch.zeros_like(self._offsets)
-        if not last:
-            (gradient,) = torch.autograd.grad(evaluation.objective, offsets)
-            gradient = torch.nan_to_num(gradient)
-            self._offsets = self._parameters.clamp(self._offsets + self._solver(gradient, index))
-        iterate = self._iterate(index, offsets.detach(), evaluation, gradient, time.perf_counter() - began)
+        index, offsets, solver = len(self.history), self._offsets, self._solver
+        epoch = self._objective.epoch(solver.stage)
+        moves = self.settings.solver != "none"
+        evaluation = self._objective(offsets, solver.stage, gradient=moves)
+        self._offsets = solver(offsets, evaluation)
+        iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
-        if self.best is None or iterate.loss < self.best.loss:
-            self.best = iterate
-        self.stop_reason = self._reason_to_stop(last)
+        if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
+            self.best, self._epoch = iterate, epoch
+        self.stop_reason = solver.finished
         return iterate
 
     def __iter__(self) -> Iterator[Iterate]:
@@ -140,30 +143,17 @@ class FrameOptimizer:
         while (iterate := self.step()) is not None:
             yield iterate
 
-    def _reason_to_stop(self, last: bool) -> str | None:
-        if last:
-            return "not optimized" if self.settings.solver == "none" else "iterations"
-        losses = [entry.loss for entry in self.history]
-        patience = self.settings.patience
-        if self.settings.tolerance > 0 and len(losses) > patience:
-            if min(losses[:-patience]) - min(losses) < self.settings.tolerance:
-                return "converged"
-        return None
-
-    def _iterate(
-        self, index: int, offsets: torch.Tensor, evaluation: Evaluation, gradient: torch.Tensor, seconds: float
-    ) -> Iterate:
-        rendering = evaluation.rendering
-        image = (rendering.image.detach().movedim(-3, -1) * 255.0).to(torch.uint8)
+    def _iterate(self, index: int, offsets: torch.Tensor, evaluation: Evaluation, seconds: float) -> Iterate:
+        image = (evaluation.image.movedim(-3, -1) * 255.0).to(torch.uint8)
         return Iterate(
             index=index,
             state=self._parameters.state(offsets).detached(),
             loss=evaluation.loss,
-            terms={"similarity": float(evaluation.objective.detach()) - evaluation.prior, "prior": evaluation.prior},
-            gradient_norms=dict(zip(self._parameters.names, gradient.abs().tolist(), strict=True)),
+            terms={"similarity": evaluation.value - evaluation.prior, "prior": evaluation.prior},
+            gradient_norms=dict(zip(self._parameters.names, evaluation.gradient.abs().tolist(), strict=True)),
             seconds=seconds,
             arm_names=self._arm_names,
-            silhouette=rendering.silhouette.detach().cpu().numpy().copy(),
+            silhouette=evaluation.silhouette.cpu().numpy().copy(),
             image=image.cpu().numpy().copy(),
             attention=evaluation.attention.cpu().numpy(),
             similarity=evaluation.similarity.cpu().numpy(),

@@ -1,5 +1,6 @@
 """Between a scene's state and the vector of unknowns that a solver sees."""
 
+import math
 from dataclasses import dataclass
 
 import roma
@@ -112,15 +113,20 @@ class ParameterVector:
     def __len__(self) -> int:
         return len(self.names)
 
+    def prior_precision(self, prior_deg: float) -> Float[Tensor, " n"]:
+        """Inverse variance of each unknown at the start, where its expected error is `prior_deg` [1/rad^2]."""
+        return torch.full_like(self.lower, math.radians(prior_deg) ** -2)
+
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""
         return torch.minimum(torch.maximum(offsets, self.lower), self.upper)
 
     def state(self, offsets: Float[Tensor, "*batch n"]) -> SceneState:
         """The scene's state at the given offsets, differentiable."""
-        joints = list(self.start.joint_positions)
-        T_world_base, T_camera_world = self.start.T_world_base, self.start.T_camera_world
-        intrinsics = self.start.intrinsics
+        batch = offsets.shape[:-1]
+        start = self.start.map(lambda value: value.expand(*batch, *value.shape)) if batch else self.start
+        joints = list(start.joint_positions)
+        T_world_base, T_camera_world, intrinsics = start.T_world_base, start.T_camera_world, start.intrinsics
         for block in self._blocks:
             part = offsets[..., block.start : block.start + block.size]
             if block.kind == "joints":

@@ -1,12 +1,13 @@
 """What an optimization may change, and how it goes about it."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, get_args
 
 from ..errors import SettingsError
 from ..losses import Loss
 
-Solver = Literal["adam", "gradient_descent", "none"]
+SolverName = Literal["gauss_newton", "adam", "gradient_descent", "none"]
 """`none` evaluates the start and stops ("CaRTS without optimization")."""
 
 
@@ -32,12 +33,26 @@ class FreeParameters:
 class OptimizerSettings:
     """How one frame is optimized. The defaults are a measured compromise; `paper()` gives the paper's."""
 
-    solver: Solver = "adam"
-    """Which solver."""
-    loss: Loss = "acs"
+    solver: SolverName = "gauss_newton"
+    """Which solver; `gauss_newton` needs the loss `surface`."""
+    loss: Loss = "surface"
     """Which loss; see `carts_core.losses.Loss`."""
     iterations: int = 60
-    """Number of steps [1]."""
+    """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
+    blurs: tuple[float, ...] = (6.0, 3.0, 1.5, 0.8)
+    """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
+    looks: int = 2
+    """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
+    stage_iterations: int = 6
+    """`gauss_newton`: largest number of steps in a stage [1]."""
+    noise: float = 0.25
+    """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
+    robust: float = 0.5
+    """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
+    normals_weight: float = 0.5
+    """`surface`: weight of normals beside coverage [1]."""
+    prior_deg: float = 3.0
+    """`surface`: expected error of an unknown at the start [deg]; `lever` turns it into metres."""
     learning_rate: float = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `lever` times as many metres."""
     decay: float = 0.82
@@ -59,15 +74,28 @@ class OptimizerSettings:
     """The same during the first half of the steps [px of the working image]."""
     working_width: int = 320
     """Width of the images that are compared [px]."""
-    tolerance: float = 0.0
-    """Stop when the best loss has improved by less than this in `patience` steps [1]; 0 never stops early."""
+    tolerance: float = 1e-3
+    """`gauss_newton`: a stage ends when no more than this share of the objective is to be gained [1]. Other solvers
+    stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
     patience: int = 10
     """See `tolerance` [1]."""
 
     def __post_init__(self) -> None:
-        _require(self.solver in get_args(Solver), "solver", self.solver, f"one of {', '.join(get_args(Solver))}")
+        _require(
+            self.solver in get_args(SolverName), "solver", self.solver, f"one of {', '.join(get_args(SolverName))}"
+        )
         _require(self.loss in get_args(Loss), "loss", self.loss, f"one of {', '.join(get_args(Loss))}")
         _require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
+        _require(1 <= self.stage_iterations <= 1000, "stage_iterations", self.stage_iterations, "1 to 1000")
+        _require(1 <= self.looks <= 10, "looks", self.looks, "1 to 10")
+        blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
+        _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
+        _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
+        _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
+        _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
+        _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
+        fits = self.solver != "gauss_newton" or self.loss == "surface"
+        _require(fits, "solver", self.solver, f"adam or gradient_descent for the loss {self.loss}")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")
         _require(0 < self.decay <= 1, "decay", self.decay, "above 0, at most 1")
         _require(1 <= self.decay_every <= 10_000, "decay_every", self.decay_every, "1 to 10000")
@@ -87,9 +115,16 @@ class OptimizerSettings:
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
 
     @staticmethod
+    def acs(iterations: int = 60) -> "OptimizerSettings":
+        """The paper's loss, independent of the attention's size, with a schedule that suits it better."""
+        return OptimizerSettings(solver="adam", loss="acs", iterations=iterations, tolerance=0.0)
+
+    @staticmethod
     def paper(iterations: int = 50) -> "OptimizerSettings":
         """The paper's setting: Adam at 1e-3, times 0.9 every 5 steps, its own loss, no prior."""
         return OptimizerSettings(
+            solver="adam",
+            tolerance=0.0,
             loss="acs_paper",
             iterations=iterations,
             learning_rate=1e-3,

@@ -1,43 +1,62 @@
-"""Solvers: from a gradient to the next step. All share one protocol, so that the optimizer does not know which runs."""
-
-from typing import Protocol
+"""Solvers that only need a gradient, with the paper's schedule."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .evaluation import Evaluation, Solver, Stay
+from .gauss_newton import GaussNewton
+from .parameters import ParameterVector
 from .settings import OptimizerSettings
 
-
-class StepRule(Protocol):
-    """Turns the gradient at the present offsets into a step."""
-
-    def __call__(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
-        """The step to add to the offsets; `iteration` counts from 0."""
-        ...
+_FINE_FROM = 0.5
+"""Share of the iterations after which the objective's last stage begins."""
 
 
-class GradientDescent:
+class _Descent:
+    """Steps of a planned size, coarse stages first, for a planned number of iterations."""
+
+    def __init__(self, settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> None:
+        self._settings, self._parameters, self._stages = settings, parameters, stages
+        self._losses: list[float] = []
+        self.stage = 0
+        self.finished: str | None = None
+
+    def _direction(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
+        """A step of about unit size."""
+        raise NotImplementedError
+
+    def __call__(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Float[Tensor, " n"]:
+        """One step down the gradient."""
+        iteration = len(self._losses)
+        self._losses.append(evaluation.loss)
+        step = -step_size(self._settings, iteration) * self._direction(evaluation.gradient, iteration)
+        planned = self._settings.iterations
+        self.stage = min(int((iteration + 1) / (_FINE_FROM * planned) * (self._stages - 1)), self._stages - 1)
+        self.finished = "iterations" if iteration >= planned else self._stalled()
+        return self._parameters.clamp(offsets + step)
+
+    def _stalled(self) -> str | None:
+        losses, patience, tolerance = self._losses, self._settings.patience, self._settings.tolerance
+        if tolerance > 0 and len(losses) > patience and min(losses[:-patience]) - min(losses) < tolerance:
+            return "converged"
+        return None
+
+
+class GradientDescent(_Descent):
     """Steps down the gradient; its largest component moves by the present step size."""
 
-    def __init__(self, settings: OptimizerSettings) -> None:
-        self._settings = settings
-
-    def __call__(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
-        """The step to add."""
-        return -step_size(self._settings, iteration) * gradient / gradient.abs().max().clamp(min=1e-12)
+    def _direction(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
+        return gradient / gradient.abs().max().clamp(min=1e-12)
 
 
-class Adam:
+class Adam(_Descent):
     """Adam with the paper's schedule (step size times `decay` every `decay_every` steps)."""
 
-    def __init__(self, settings: OptimizerSettings) -> None:
-        self._settings = settings
-        self._mean: Tensor | None = None
-        self._square: Tensor | None = None
+    _mean: Tensor | None = None
+    _square: Tensor | None = None
 
-    def __call__(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
-        """The step to add."""
+    def _direction(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
         beta_mean, beta_square = 0.9, 0.999
         if self._mean is None or self._square is None:
             self._mean, self._square = torch.zeros_like(gradient), torch.zeros_like(gradient)
@@ -45,7 +64,7 @@ class Adam:
         self._square = beta_square * self._square + (1 - beta_square) * gradient.square()
         mean = self._mean / (1 - beta_mean ** (iteration + 1))
         square = self._square / (1 - beta_square ** (iteration + 1))
-        return -step_size(self._settings, iteration) * mean / (square.sqrt() + 1e-10)
+        return mean / (square.sqrt() + 1e-10)
 
 
 def step_size(settings: OptimizerSettings, iteration: int) -> float:
@@ -53,6 +72,9 @@ def step_size(settings: OptimizerSettings, iteration: int) -> float:
     return settings.learning_rate * settings.decay ** (iteration // settings.decay_every)
 
 
-def make_solver(settings: OptimizerSettings) -> StepRule:
+def make_solver(settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> Solver:
     """A fresh solver of the kind that the settings name."""
-    return GradientDescent(settings) if settings.solver == "gradient_descent" else Adam(settings)
+    if settings.solver == "none":
+        return Stay(stages)
+    kinds = {"gauss_newton": GaussNewton, "adam": Adam, "gradient_descent": GradientDescent}
+    return kinds[settings.solver](settings, parameters, stages)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..parts import link_parts
 from ..scene import Scene, SceneState
 
 
@@ -24,6 +25,8 @@ class SceneGeometry:
     faces: Int[Tensor, "F 3"]
     face_links: Int[Tensor, " F"]
     face_arms: Int[Tensor, " F"]
+    face_parts: Int[Tensor, " F"]
+    """Index into `carts_core.parts.PARTS`."""
     face_colors: Float[Tensor, "3 F"]
     face_barycentric: Float[Tensor, "8 F"]
     """Affine maps from a point on the triangle to its second and third barycentric coordinate, one after the other."""
@@ -33,10 +36,11 @@ class SceneGeometry:
     @staticmethod
     def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
         """Gather the link meshes of a scene."""
-        vertices, normals, faces, face_links, arms, colors, counts = [], [], [], [], [], [], []
+        vertices, normals, faces, face_links, arms, face_parts, colors, counts = [], [], [], [], [], [], [], []
         first_link, first_vertex = 0, 0
         for arm_index, arm in enumerate(scene.arms):
             counts += [0] * len(arm.robot.link_names)
+            parts = link_parts(arm.robot)
             for mesh in sorted(arm.robot.meshes, key=lambda mesh: mesh.link):
                 link, count = first_link + mesh.link, len(mesh.faces)
                 vertices.append(mesh.vertices)
@@ -45,6 +49,7 @@ class SceneGeometry:
                 faces.append(mesh.faces + first_vertex)
                 face_links.append(np.full(count, link))
                 arms.append(np.full(count, arm_index))
+                face_parts.append(np.full(count, parts[mesh.link]))
                 colors.append(np.broadcast_to(mesh.color, (count, 3)))
                 first_vertex += len(mesh.vertices)
             first_link += len(arm.robot.link_names)
@@ -59,6 +64,7 @@ class SceneGeometry:
             tensor(face, torch.int32),
             tensor(np.concatenate(face_links), torch.int64),
             tensor(np.concatenate(arms), torch.int64),
+            tensor(np.concatenate(face_parts), torch.int64),
             tensor(np.concatenate(colors).T),
             tensor(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
             tensor(np.concatenate(normals)[face].reshape(-1, 9).T),

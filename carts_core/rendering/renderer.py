@@ -12,6 +12,7 @@ from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
 from .shading import phong, visible_points
+from .surface import SurfaceRendering, Tangents, surface_maps
 from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch
 
@@ -55,6 +56,7 @@ class Renderer:
         width, height: size of the rendered images [px], by default that of the first camera. The intrinsics of a
             state are those of the camera's own size and are scaled.
         cameras: names of the cameras to render, all by default.
+        window: left, top, width and height [px] of the part of these images that is rendered, all of it by default.
         device: "cpu" (compiled visibility kernel) or a CUDA device (torch visibility).
     """
 
@@ -65,6 +67,7 @@ class Renderer:
         width: int | None = None,
         height: int | None = None,
         cameras: Sequence[str] | None = None,
+        window: tuple[int, int, int, int] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         self.scene = scene.with_cameras(cameras)
@@ -75,6 +78,8 @@ class Renderer:
         self._faces = self.geometry.faces.cpu().numpy()
         scale = [[self.width / camera.width, self.height / camera.height] * 2 for camera in self.scene.cameras]
         self._scale = torch.tensor(scale, dtype=torch.float32, device=device)
+        left, top, self.width, self.height = window or (0, 0, self.width, self.height)
+        self._shift = torch.tensor([0, 0, left, top], dtype=torch.float32, device=device)
         self._indices = [scene.cameras.index(camera) for camera in self.scene.cameras]
 
     def __call__(self, state: SceneState) -> Rendering:
@@ -102,13 +107,40 @@ class Renderer:
             self.geometry.face_arms,
         )
 
-    @torch.no_grad()
     def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
         """Index of the visible arm per pixel, -1 for background; visibility alone, so faster than a rendering."""
+        return self._visible(state, self.geometry.face_arms)
+
+    def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
+        """Index of the visible link per pixel, -1 for background.
+
+        Links are counted through all arms: `Robot.link_names` of the first arm, then those of the second.
+        """
+        return self._visible(state, self.geometry.face_links)
+
+    @torch.no_grad()
+    def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
+        """Label of the visible triangle per pixel, -1 for background."""
         Ts, intrinsics = self._views(state)
         face_ids, _ = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
-        arm_ids = torch.where(face_ids >= 0, self.geometry.face_arms[face_ids.long()], -1)
-        return arm_ids.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
+        labels = torch.where(face_ids >= 0, face_labels[face_ids.long()], -1)
+        return labels.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
+
+    @torch.no_grad()
+    def surface(self, state: SceneState, tangents: Tangents | None = None) -> SurfaceRendering:
+        """Surface maps of one state (no batch), with their Jacobian if tangents are given."""
+        Ts, intrinsics = self._views(state)
+        face_ids, inverse_depth = self._visibility(Ts, intrinsics)
+        points = visible_points(self.geometry, face_ids, inverse_depth, Ts, intrinsics)
+        parts = self.geometry.face_parts[points.face]
+        colors = self.geometry.face_colors[:, points.face]
+        return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents)
+
+    @torch.no_grad()
+    def tangents(self, low: SceneState, high: SceneState, distance: float) -> Tangents:
+        """Derivatives from batches of states on both sides of one, an unknown each, that far from each other."""
+        (Ts_low, K_low), (Ts_high, K_high) = self._views(low), self._views(high)
+        return Tangents((Ts_high - Ts_low) / distance, (K_high - K_low) / distance)
 
     def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
         """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
@@ -120,7 +152,7 @@ class Renderer:
                 state.T_camera_world[..., self._indices, :, :],
                 state.intrinsics[..., self._indices, :],
             )
-        return link_transforms(self.scene, state), state.intrinsics * self._scale
+        return link_transforms(self.scene, state), state.intrinsics * self._scale - self._shift
 
     @torch.no_grad()
     def _visibility(self, views_T: Tensor, views_K: Tensor) -> tuple[Tensor, Tensor]:

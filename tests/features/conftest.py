@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from carts_core.features.domain_randomization import PairGenerator, PairSettings, TrainingPair
+from carts_core.features.domain_randomization import ImageSettings, PairGenerator, TrainingPair
 from carts_core.features.network import Architecture, FeatureNetwork
 from carts_core.features.weights import save_weights
 from carts_core.robot import Robot
@@ -37,5 +37,5 @@ def small_weights(small_network: FeatureNetwork, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def pairs(shipped_psm: Robot) -> list[TrainingPair]:
     """Some training pairs of the shipped robot."""
-    generator = PairGenerator([shipped_psm], PairSettings(), seed=5)
+    generator = PairGenerator([shipped_psm], ImageSettings(), seed=5)
     return [generator() for _ in range(24)]

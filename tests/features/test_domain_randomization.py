@@ -7,8 +7,8 @@ from carts_core.features.domain_randomization import (
     HEAD,
     SHAFT,
     AppearanceRanges,
+    ImageSettings,
     PairGenerator,
-    PairSettings,
     TrainingPair,
     variants,
 )
@@ -39,7 +39,7 @@ def test_a_pair_is_two_images_and_their_classes(pairs: list[TrainingPair]):
 
 
 def test_the_same_seed_makes_the_same_pairs_and_another_seed_others(shipped_psm: Robot):
-    first, again, other = (PairGenerator([shipped_psm], PairSettings(), seed)() for seed in (3, 3, 4))
+    first, again, other = (PairGenerator([shipped_psm], ImageSettings(), seed)() for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.observed, again.observed)
     np.testing.assert_array_equal(first.hybrid, again.hybrid)
     assert not np.array_equal(first.observed, other.observed)
@@ -65,7 +65,7 @@ def test_about_half_of_the_hybrids_show_the_observed_kinematics(pairs: list[Trai
 
 def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Robot, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(variants, "PERFECT_MODEL", 1.0)
-    settings = PairSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
+    settings = ImageSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
     pair = PairGenerator([shipped_psm], settings, seed=11)()
     overlap = (pair.observed_classes > 0) & (pair.hybrid_classes > 0)
     union = (pair.observed_classes > 0) | (pair.hybrid_classes > 0)
@@ -102,7 +102,7 @@ def test_a_range_that_makes_no_sense_is_refused(arguments: dict):
 )
 def test_pair_settings_out_of_range_are_refused(arguments: dict):
     with pytest.raises(SettingsError, match="give"):
-        PairSettings(**arguments)
+        ImageSettings(**arguments)
 
 
 def test_backgrounds_are_bright_enough_and_differ():

@@ -7,7 +7,10 @@ from safetensors.torch import save_file
 from carts_core.errors import WeightsError
 from carts_core.features import FeatureExtractor
 from carts_core.features.network import Architecture, FeatureNetwork
-from carts_core.features.weights import FORMAT, VERSION, read_weights
+from carts_core.features.surface_network import SurfaceNetwork
+from carts_core.features.weights import VERSION, read_weights, save_weights
+
+FORMAT = "carts-feature-network"
 
 
 def test_what_was_saved_is_what_is_loaded(small_weights: Path, small_network: FeatureNetwork):
@@ -18,8 +21,8 @@ def test_what_was_saved_is_what_is_loaded(small_weights: Path, small_network: Fe
         extractor.probability(images), small_network.logits(images).sigmoid(), atol=1e-5, rtol=1e-4
     )
     assert extractor.working_size == (320, 240)
-    assert extractor.training == {"step": 3}
-    assert (extractor.channels, extractor.stride) == (4, 4)
+    assert extractor.weights["feature"].training == {"step": 3}
+    assert (extractor.channels, extractor.stride) == (4, 16)
     assert len(extractor.sha256) == 64
 
 
@@ -28,12 +31,12 @@ def test_gradients_reach_the_image_and_no_weight(small_weights: Path):
     images = torch.rand(1, 3, 32, 48, requires_grad=True)
     extractor.features(images).square().sum().backward()
     assert images.grad is not None and images.grad.abs().sum() > 0
-    assert all(not parameter.requires_grad for parameter in extractor._network.parameters())
+    assert all(not parameter.requires_grad for parameter in extractor._features.parameters())
 
 
 def test_the_gradient_agrees_with_finite_differences(small_weights: Path):
     extractor = FeatureExtractor.load(small_weights)
-    extractor._network.double()
+    extractor._features.double()
     images = torch.rand(1, 3, 16, 16, dtype=torch.float64, requires_grad=True)
     direction = torch.randn_like(images)
     weights = torch.randn(1, 4, 16, 16, dtype=torch.float64)
@@ -68,7 +71,7 @@ def test_truncated_weights_are_refused(small_weights: Path):
 def test_safetensors_of_another_program_are_refused_with_what_is_allowed(tmp_path: Path):
     path = tmp_path / "other.safetensors"
     save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(WeightsError, match=f"format None.*allowed is '{FORMAT}', version '{VERSION}'"):
+    with pytest.raises(WeightsError, match=f"format None.*allowed is '{FORMAT}' or .*, version '{VERSION}'"):
         FeatureExtractor.load(path)
 
 
@@ -112,3 +115,20 @@ def test_weights_that_are_not_finite_are_refused(small_network: FeatureNetwork, 
     _save(path, small_network)
     with pytest.raises(WeightsError, match="not finite"):
         read_weights(path)
+
+
+def test_a_surface_network_takes_the_place_of_the_shipped_one(tmp_path: Path, small_architecture: Architecture):
+    torch.manual_seed(2)
+    network = SurfaceNetwork(small_architecture).eval()
+    save_weights(network, tmp_path / "surface.safetensors", {}, (320, 240))
+    extractor = FeatureExtractor.load(tmp_path / "surface.safetensors")
+    images, believed = torch.rand(1, 3, 32, 48), torch.rand(1, 6, 32, 48)
+    torch.testing.assert_close(
+        extractor.surface(images, believed), network(images, believed).map(), atol=1e-5, rtol=1e-4
+    )
+    assert extractor.sha256 != FeatureExtractor.load().sha256
+
+
+def test_two_files_of_one_kind_are_refused_by_name(small_weights: Path):
+    with pytest.raises(WeightsError, match=r"small\.safetensors and .*small\.safetensors both hold a feature network"):
+        FeatureExtractor.load(small_weights, small_weights)

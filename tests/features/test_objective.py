@@ -3,7 +3,7 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.features.network import FeatureNetwork
-from carts_core.features.objective import Objective, ObjectiveWeights, consistency_loss, soft_dice_loss
+from carts_core.features.objective import ObjectiveWeights, consistency_loss, feature_loss, soft_dice_loss
 
 
 def _scene() -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,8 +47,7 @@ def test_dice_loss_is_zero_for_the_truth_and_near_one_for_its_opposite():
 
 def test_a_weight_of_zero_leaves_its_term_out(small_network: FeatureNetwork):
     images, classes = torch.rand(2, 2, 3, 16, 16), torch.randint(0, 3, (2, 2, 16, 16), dtype=torch.uint8)
-    paper = Objective(4, ObjectiveWeights(dice=0, consistency=0, parts=0))
-    loss, terms = paper(small_network, images, classes)
+    loss, terms = feature_loss(small_network, images, classes, ObjectiveWeights(dice=0, consistency=0))
     torch.testing.assert_close(loss, terms["cross_entropy"])
 
 

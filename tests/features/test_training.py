@@ -12,7 +12,7 @@ import torch
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.features import FeatureExtractor
 from carts_core.features.checkpoint import CHECKPOINT_FILE, load_checkpoint
-from carts_core.features.domain_randomization import PairSettings
+from carts_core.features.domain_randomization import ImageSettings
 from carts_core.features.loader import training_batches, validation_set
 from carts_core.features.network import Architecture
 from carts_core.features.training import TrainingProgress, schedule, train
@@ -20,12 +20,12 @@ from carts_core.features.training_config import TrainingConfig
 from carts_core.features.weights import read_weights
 
 SMALL = {
-    "batch_pairs": 2,
+    "batch_size": 2,
     "learning_rate": 1e-2,
     "warmup": 5,
     "average": 0.8,
     "validation_every": 15,
-    "validation_pairs": 2,
+    "validation_samples": 2,
     "checkpoint_every": 5,
     "workers": 0,
     "threads": 1,
@@ -34,7 +34,7 @@ SMALL = {
 
 def small_config(**changes) -> TrainingConfig:
     architecture = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
-    images = PairSettings(width=64, height=48, field_width=80)
+    images = ImageSettings(width=64, height=48, field_width=80)
     return TrainingConfig(**({**SMALL, "steps": 30, "architecture": architecture, "images": images} | changes))
 
 
@@ -53,8 +53,8 @@ def test_a_run_learns_and_leaves_weights_a_checkpoint_and_a_report(tmp_path: Pat
     assert events[-1].validation == result.validation
     extractor = FeatureExtractor.load(result.weights)
     assert extractor.working_size == (80, 60)
-    assert extractor.training["step"] == 30
-    assert extractor.training["config"]["robots"] == ["psm_lnd.urdf"]
+    assert extractor.weights["feature"].training["step"] == 30
+    assert extractor.weights["feature"].training["config"]["robots"] == ["psm_lnd.urdf"]
     page = result.report.read_text()
     assert "| 30 |" in page
     for picture in ("curves.png", "predictions.jpg"):
@@ -98,7 +98,7 @@ def test_a_killed_run_goes_on_where_its_last_checkpoint_was(tmp_path: Path):
     first = after.history.losses[0]["loss"]
     resumed = after.history.losses[-1]["loss"]
     assert resumed < first
-    assert FeatureExtractor.load(result.weights).training["step"] == steps
+    assert read_weights(result.weights).training["step"] == steps
 
 
 def test_a_restored_network_is_the_one_that_was_saved(tmp_path: Path):
@@ -159,7 +159,7 @@ def test_the_validation_set_is_always_the_same_and_not_the_training_stream():
     again, _ = validation_set(config)
     assert torch.equal(images, again)
     first, _ = next(training_batches(config, first_step=0))
-    assert not torch.equal(first[0].float() / 255, images[0])
+    assert not torch.equal(first[0], images[0])
 
 
 def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():
@@ -183,3 +183,18 @@ def test_settings_survive_json(tmp_path: Path):
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None
     assert json.loads(checkpoint.config_json)["images"]["width"] == 64
+
+
+def test_a_surface_network_learns_and_reports(tmp_path: Path):
+    result = train(small_config(network="surface", steps=30), tmp_path)
+    assert result.weights.name == "surface.safetensors"
+    assert set(result.validation) == {"dice", "dice_believed", "part_accuracy", "normal_error_deg"}
+    history = json.loads(json.dumps(load_checkpoint(tmp_path).history.losses))  # pyright: ignore
+    assert history[-1]["loss"] < history[0]["loss"]
+    assert read_weights(result.weights).network.kind == "surface"
+    assert "pixels with the right part" in result.report.read_text()
+
+
+def test_weights_of_another_network_are_no_start(tmp_path: Path, small_weights: Path):
+    with pytest.raises(SettingsError, match="holds a feature network, but a surface network is to be trained"):
+        train(small_config(network="surface", start=small_weights), tmp_path)

@@ -22,8 +22,9 @@ from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp, serve
 from carts_viewer.bench import RawTab
 from carts_viewer.layers import Layer, mask
+from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.picture import Painter
-from carts_viewer.stage import OVERLAY
+from carts_viewer.stage import FRAME, OVERLAY
 
 
 def _get(app: ViewerApp, path: str, **headers: str) -> http.client.HTTPResponse:
@@ -93,17 +94,64 @@ def test_two_tabs_see_one_state(open_viewer: Callable[..., ViewerApp]) -> None:
 
 
 def test_a_missing_image_is_an_error_in_the_page_and_the_server_stays_up(open_viewer: Callable[..., ViewerApp]) -> None:
-    app = open_viewer()
-    image = app.sequence.path.parent / "regular" / "left" / "003.png"
+    app = open_viewer(frames=12)
+    image = app.sequence.path.parent / "regular" / "left" / "012.png"  # Too far away to be read in advance.
     image.rename(image.with_suffix(".gone"))
-    app.mailbox.put(ask.ShowFrame(2))
+    app.mailbox.put(ask.ShowFrame(11))
     state = app.wait_until_shown()
-    assert state.error is not None and "003.png" in state.error and state.index == 0
+    assert state.error is not None and "012.png" in state.error and state.index == 0
     image.with_suffix(".gone").rename(image)
-    app.mailbox.put(ask.ShowFrame(2))
+    app.mailbox.put(ask.ShowFrame(11))
     state = app.wait_until_shown()
-    assert state.index == 2 and state.error is None
+    assert state.index == 11 and state.error is None
     assert _get(app, "/").status == 200
+
+
+def test_the_old_frame_stays_until_the_next_one_is_decoded(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = open_viewer(frames=6)
+    asked, decoded = threading.Event(), threading.Event()
+    read = app.sequence.frame
+
+    def slow(index: int, *arguments):
+        if index == 5:
+            asked.set()
+            assert decoded.wait(30)
+        return read(index, *arguments)
+
+    monkeypatch.setattr(app.sequence, "frame", slow)
+    before = app.state
+    sent = app.stage.sent(FRAME)
+    app.mailbox.put(ask.ShowFrame(5))
+    assert asked.wait(30)
+    assert app.state.frame is before.frame and app.stage.sent(FRAME) == sent
+    decoded.set()
+    state = app.wait_until_shown()
+    assert state.index == state.frame.index == 5 and app.stage.sent(FRAME) != sent
+
+
+def test_the_offset_between_the_clocks_is_shown(open_viewer: Callable[..., ViewerApp]) -> None:
+    def describe(text: str) -> str:
+        frames = '[frames]\ntable = "frames.csv"\nframe_id = "{frame:03d}"\ntime_offset = -0.035\n'
+        return text.replace('frame_id = "{frame:03d}"\n', "").replace("[[arms]]", frames + "[[arms]]", 1)
+
+    def add_times(folder: Path) -> None:
+        (folder / "frames.csv").write_text("frame,timestamp\n1,0.1\n2,0.15\n3,0.2\n")
+
+    app = open_viewer(edit=describe, prepare=add_times)
+    app.mailbox.put(ask.ShowFrame(1))
+    app.wait_until_shown()
+    captions = [panel._caption.content for panel in app.display._panels if isinstance(panel, BrowsePanel)]
+    assert ["0.150 s, time offset <b>-0.035 s</b>" in caption for caption in captions] == [True]
+
+
+def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer(frames=6)
+    app.mailbox.put(ask.ShowFrame(1))
+    app.wait_until_shown()
+    app.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "carts-frames"]
 
 
 def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:

@@ -247,12 +247,12 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
 def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    app = open_viewer()
+    app = open_viewer(frames=12)
     tab = open_tab(app)
-    (app.sequence.path.parent / "regular" / "left" / "003.png").unlink()
-    tab.type_value(app.page.find("Frame"), 3)
+    (app.sequence.path.parent / "regular" / "left" / "012.png").unlink()  # Too far away to be read in advance.
+    tab.type_value(app.page.find("Frame"), 12)
     message = tab.page.locator(".carts-error[role=alert]")
-    expect(message).to_contain_text("003.png", timeout=20_000)
+    expect(message).to_contain_text("012.png", timeout=20_000)
     tab.button("Dismiss")
     expect(message).to_be_hidden()
     tab.type_value(app.page.find("Frame"), 2)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from ...parts import link_parts
 from ...robot import Robot
 
 Intrinsics = tuple[float, float, float, float]
@@ -27,6 +28,7 @@ class RobotGeometry:
         vertices, normals: of all parts, each in the frame of its link [V, 3].
         faces: triangles [F, 3].
         face_part: index of the part (`Robot.meshes`) that a triangle belongs to [F].
+        part_class: index into `carts_core.parts.PARTS` of each part.
         shaft: index of the longest part, the instrument's shaft.
         shaft_axis: unit vector along the shaft in its link's frame, pointing away from the tip [3].
         shaft_end: the shaft's end at the tip, in its link's frame [3] [m].
@@ -46,6 +48,7 @@ class RobotGeometry:
         self._vertex_part = np.repeat(np.arange(len(meshes)), counts)
         self._vertex_link = np.repeat([mesh.link for mesh in meshes], counts)
         self.part_link = np.array([mesh.link for mesh in meshes])
+        self.part_class = link_parts(robot)[self.part_link]
         extents = [np.ptp(mesh.vertices, axis=0).max() for mesh in meshes]
         self.shaft = int(np.argmax(extents))
         self.shaft_axis, self.shaft_end = self._shaft_line()

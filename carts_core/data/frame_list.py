@@ -1,0 +1,151 @@
+"""The frames of a sequence: how they are called, when they were taken, and which frames of a video they are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import SequenceError
+from .patterns import FrameId, expand
+from .table import Table, read_table
+from .toml_table import TomlTable
+from .video_index import index_video
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """The frames of a sequence, in order."""
+
+    frame_ids: tuple[str, ...]
+    timestamps: Float[np.ndarray, " frames"] | None
+    """When each image was taken [s]."""
+    video_frames: tuple[int, ...]
+    """Number of every frame in its video, from 0."""
+    counted: str
+    """How errors say how many there are, say "the kinematics table has 3 rows"."""
+
+
+@dataclass(frozen=True)
+class FrameNames:
+    """Where a table has the frames' ids."""
+
+    column: str
+    pattern: str
+    """How a frame is called, from its cell in that column."""
+    asked_by: str
+    """What names the column, for errors."""
+
+    def of(self, table: Table) -> tuple[str, ...]:
+        """The id of every row.
+
+        Raises:
+            SequenceError: no such column, or an id is missing, repeated, or not a number where the pattern wants one.
+        """
+        key = f"{table.path}, column {self.column!r}"
+        cells = table.text(self.column, self.asked_by)
+        ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
+        lines: dict[str, int] = {}
+        for frame_id, line in zip(ids, table.lines, strict=True):
+            if not frame_id:
+                raise SequenceError(f"{key}, line {line}: the frame has no id. Fill it in.")
+            if frame_id in lines:
+                raise SequenceError(
+                    f"{key}: frame {frame_id!r} is in line {lines[frame_id]} and again in line {line}. "
+                    "Remove one of them, or number the frames anew."
+                )
+            lines[frame_id] = line
+        return ids
+
+
+def take_frame_names(section: TomlTable) -> FrameNames:
+    """The keys `frame` and `frame_id`.
+
+    Raises:
+        SequenceError: the pattern does not tell frames apart.
+    """
+    return FrameNames(section.take("frame", str, "frame"), _take_pattern(section), f"`frame` in {section.where}")
+
+
+def take_frame_list(section: TomlTable) -> FrameList:
+    """The frames that the `[frames]` table describes: the rows of a table, or all frames of a video.
+
+    Raises:
+        SequenceError: the table or video is missing, wrong, or has no times.
+    """
+    if "video" in section:
+        return _frames_of_video(section)
+    if "table" not in section:
+        raise section.error(
+            "table", "is missing. Name a CSV file with a row per frame and its time, or a `video` whose times count."
+        )
+    table = read_table(section.path(section.take("table", str)), take_delimiter(section), "table of frames")
+    timestamp = section.take("timestamp", str, "timestamp")
+    if not timestamp:
+        raise section.error("timestamp", "is empty. Name the column with the time of every frame [s].")
+    return list_of_rows(table, take_frame_names(section), timestamp, section, f"{table.path} has {len(table)} rows")
+
+
+def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
+    """A frame per row of a table; takes the key `video_frame`.
+
+    Args:
+        table: the table.
+        names: where it has the frames' ids.
+        timestamp: its column with the time [s]; empty for frames without times.
+        section: what describes the table.
+        counted: how errors say how many frames there are.
+
+    Raises:
+        SequenceError: ids, times or video frame numbers are wrong.
+    """
+    frame_ids = names.of(table)
+    times = table.numbers(timestamp, section.name("timestamp")) if timestamp else None
+    column = section.take("video_frame", str, "")
+    video_frames = _video_frames(table, column, section) if column else tuple(range(len(table)))
+    return FrameList(frame_ids, times, video_frames, counted)
+
+
+def take_delimiter(section: TomlTable) -> str:
+    """The key `delimiter`.
+
+    Raises:
+        SequenceError: it is not one character.
+    """
+    delimiter = section.take("delimiter", str, ",")
+    if len(delimiter) != 1:
+        raise section.error("delimiter", f"is {delimiter!r}, but must be one character.")
+    return delimiter
+
+
+def _frames_of_video(section: TomlTable) -> FrameList:
+    path = section.path(section.take("video", str))
+    for key in ("table", "frame", "timestamp", "video_frame", "delimiter"):
+        if key in section:
+            raise section.error(key, "does not go with `video`, all of whose frames are meant. Remove one of them.")
+    pattern = _take_pattern(section)
+    index = index_video(path)
+    if index.timestamps is None:
+        raise section.error(
+            "video",
+            f"is {path}, which gives its frames no times. Name a `table` with the time of every frame instead.",
+        )
+    numbers = tuple(range(index.count))
+    ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
+    return FrameList(ids, index.timestamps, numbers, f"{path} has {index.count} frames")
+
+
+def _take_pattern(section: TomlTable) -> str:
+    pattern = section.take("frame_id", str, "{frame}")
+    if "{frame" not in pattern:
+        raise section.error("frame_id", f'is {pattern!r}. It must contain {{frame}}, say "{{frame:03d}}".')
+    return pattern
+
+
+def _video_frames(table: Table, column: str, section: TomlTable) -> tuple[int, ...]:
+    numbers = table.numbers(column, section.name("video_frame"))
+    if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
+        raise SequenceError(
+            f"{table.path}, line {table.lines[wrong[0]]}, column {column!r}: {numbers[wrong[0]]:g} is not a frame "
+            "number. Frames of a video are counted 0, 1, 2, ..."
+        )
+    return tuple(int(number) for number in numbers)

@@ -1,0 +1,117 @@
+"""Joint positions at the times of the frames, from a table whose rows have times of their own."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import SequenceError
+from .frame_list import FrameList
+from .table import Table
+from .toml_table import TomlTable
+
+INTERPOLATIONS = ("linear", "nearest")
+_ROUNDING = 1e-6
+"""Times closer than this are the same [s]."""
+
+
+@dataclass(frozen=True)
+class TimeMatching:
+    """How frames find their joint positions: at the frame's time plus `time_offset` in the table's clock."""
+
+    time_offset: float = 0.0
+    """Time in the table minus time of the image [s]."""
+    interpolation: str = "linear"
+    """`linear` between the row before and the row after, or the `nearest` row."""
+    max_gap: float = 0.1
+    """How far in time every row that is used may be from where it is used [s]."""
+
+
+def take_matching(section: TomlTable) -> TimeMatching:
+    """The keys `time_offset`, `interpolation` and `max_gap` of `[frames]`.
+
+    Raises:
+        SequenceError: a value is not finite, or unknown.
+    """
+    time_offset = float(section.take("time_offset", float, 0.0))
+    if not np.isfinite(time_offset):
+        raise section.error("time_offset", f"is {time_offset}, but must be a finite number [s].")
+    interpolation = section.take_choice("interpolation", INTERPOLATIONS, "linear")
+    max_gap = float(section.take("max_gap", float, TimeMatching.max_gap))
+    if not 0.0 < max_gap < np.inf:
+        raise section.error("max_gap", f"is {max_gap}, but must be a positive number [s].")
+    return TimeMatching(time_offset, interpolation, max_gap)
+
+
+@dataclass(frozen=True)
+class JointSamples:
+    """Joint positions as a table has them."""
+
+    positions: Float[np.ndarray, "rows dofs"]
+    """[rad, m]"""
+    path: Path
+    """The table, for errors."""
+    lines: tuple[int, ...]
+    """Its line of each row, for errors."""
+    times: Float[np.ndarray, " rows"] | None
+    """Of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
+
+    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames dofs"]:
+        """The joint positions of every frame [rad, m].
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        assert self.times is not None and frames.timestamps is not None
+        wanted = frames.timestamps + matching.time_offset
+        last = len(self.times) - 1
+        # Beyond the ends both are the row at the end.
+        after = np.searchsorted(self.times, wanted).clip(0, last)
+        before = np.where(self.times[after] > wanted, after - 1, after).clip(0, last)
+        to_before, to_after = np.abs(wanted - self.times[before]), np.abs(self.times[after] - wanted)
+        if matching.interpolation == "nearest":
+            before = after = np.where(to_before <= to_after, before, after)
+            distance = np.minimum(to_before, to_after)
+            share = np.zeros(len(wanted))
+        else:
+            distance = np.maximum(to_before, to_after)
+            share = np.where(before == after, 0.0, to_before / np.maximum(to_before + to_after, _ROUNDING))
+        if (far := np.flatnonzero(distance > matching.max_gap + _ROUNDING)).size:
+            raise self._too_far(frames, matching, far)
+        return (1.0 - share)[:, None] * self.positions[before] + share[:, None] * self.positions[after]
+
+    def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray) -> SequenceError:
+        assert self.times is not None and frames.timestamps is not None
+        row = far[0]
+        wanted = frames.timestamps + matching.time_offset
+        after = int(np.searchsorted(self.times, wanted[row]))
+        near = " and ".join(
+            f"line {self.lines[index]} at {self.times[index]:.6g} s"
+            for index in (after - 1, after)
+            if 0 <= index < len(self.times)
+        )
+        return SequenceError(
+            f"{self.path} has no joint positions for {len(far)} of {len(wanted)} frames. The first is frame "
+            f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
+            f"{matching.time_offset:g} s), next to {near}; a row that is used may be {matching.max_gap:g} s away. "
+            f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
+            f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave the frames "
+            "out by a table of the others, or allow a larger `max_gap`."
+        )
+
+
+def row_times(table: Table, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
+    """The time of every row [s].
+
+    Raises:
+        SequenceError: no such column, not numbers, or not increasing.
+    """
+    times = table.numbers(column, asked_by)
+    if (wrong := np.flatnonzero(np.diff(times) <= 0.0)).size:
+        row = wrong[0] + 1
+        raise SequenceError(
+            f"{table.path}, line {table.lines[row]}, column {column!r}: {times[row]:.9g} s does not come after "
+            f"{times[row - 1]:.9g} s in line {table.lines[row - 1]}. Sort the rows by time, and keep one of each time."
+        )
+    return times

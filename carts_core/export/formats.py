@@ -1,0 +1,88 @@
+"""Every export format by name, and the one function that runs them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from .coco import write_coco
+from .cvat import write_cvat
+from .dataset import Dataset
+from .datumaro import write_datumaro
+from .dvrk import write_dvrk
+from .kinematics_files import write_kinematics_csv, write_kinematics_json, write_kinematics_npz
+from .masks import write_masks
+from .monitor import Monitor
+from .publish import MARKER, published
+from .video import write_video
+from .voc import write_voc
+from .yolo import write_yolo
+
+FormatName = Literal["masks", "coco", "yolo", "voc", "cvat", "datumaro", "csv", "npz", "json", "dvrk", "video"]
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format that frames can be exported in."""
+
+    label: str
+    """For people."""
+    write: Callable[[Dataset, Path, Monitor], None]
+    """Writes the file, or makes the folder."""
+    suffix: str = ""
+    """Of the file; empty for a format that is a folder."""
+
+
+FORMATS: dict[FormatName, ExportFormat] = {
+    "masks": ExportFormat("PNG masks", write_masks),
+    "coco": ExportFormat("COCO", write_coco),
+    "yolo": ExportFormat("YOLO segmentation", write_yolo),
+    "voc": ExportFormat("Pascal VOC", write_voc),
+    "cvat": ExportFormat("CVAT for images", write_cvat),
+    "datumaro": ExportFormat("Datumaro", write_datumaro),
+    "csv": ExportFormat("Kinematics, CSV", write_kinematics_csv, ".csv"),
+    "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
+    "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
+    "dvrk": ExportFormat("Base frames for the dVRK", write_dvrk, ".json"),
+    "video": ExportFormat("Overlay video", write_video),
+}
+
+
+def export(
+    dataset: Dataset, name: FormatName, output: Path, *, overwrite: bool = False, monitor: Monitor | None = None
+) -> Path:
+    """Write a dataset in a format; `output` is there whole at the end, or as it was before.
+
+    Args:
+        dataset: what to write.
+        name: one of `FORMATS`.
+        output: the folder, or the file, to make. A file's name gets the format's suffix if it has another one.
+        overwrite: replace a file, or a folder that an export made.
+        monitor: gets progress and can cancel.
+
+    Returns:
+        The path that was written.
+
+    Raises:
+        ExportCancelled: the monitor said so.
+        CartsError: the output exists, cannot be written, or what it needs is missing.
+    """
+    chosen = FORMATS[name]
+    if chosen.suffix and output.suffix.lower() != chosen.suffix:
+        output = output.with_name(output.name + chosen.suffix)
+    with published(output, overwrite=overwrite) as path:
+        chosen.write(dataset, path, monitor or Monitor())
+        if not chosen.suffix:
+            (path / MARKER).write_text(_summary(dataset, name), encoding="utf-8")
+    return output
+
+
+def _summary(dataset: Dataset, name: FormatName) -> str:
+    """What an exported folder says about itself."""
+    views = [
+        {"name": name, "frame": frame.frame_id, "index": frame.index, "camera": camera.name, "source": frame.source}
+        for name, frame, camera in dataset.steps
+    ]
+    content = {"format": name, "sequence": dataset.sequence.name, "domain": dataset.domain, "views": views}
+    return json.dumps(content, indent=1, ensure_ascii=False)

@@ -1,0 +1,57 @@
+"""What is exported of each frame."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from jaxtyping import Bool
+from numpy import ndarray
+
+from ..data import Sequence
+from ..errors import SequenceError
+from .kinematics import KinematicsRow
+
+
+@dataclass(frozen=True)
+class ExportFrame(KinematicsRow):
+    """One frame: which one, where the arms are, who says so, and masks where somebody corrected them."""
+
+    index: int = field(kw_only=True)
+    """0-based position in the sequence."""
+    masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
+    """Camera -> where arms are visible, at the camera's size; a camera without an entry gets the rendered mask."""
+
+
+def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
+    """Frames with the joint positions that the sequence measured."""
+    return [
+        ExportFrame(
+            sequence.frame_ids[index],
+            "measured",
+            {arm: positions[index] for arm, positions in sequence.measured.items()},
+            index=index,
+        )
+        for index in indices
+    ]
+
+
+def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
+    """Those of the frames `indices` that have a row, with its joint positions.
+
+    Raises:
+        SequenceError: a row is of a frame that the sequence does not have, or two are of the same.
+    """
+    known = set(sequence.frame_ids)
+    by_id: dict[str, KinematicsRow] = {}
+    for row in rows:
+        if row.frame_id not in known:
+            raise SequenceError(
+                f"the kinematics are of frame {row.frame_id!r}, which {sequence.path} does not have. "
+                "Give the table that was made from this sequence."
+            )
+        if row.frame_id in by_id:
+            raise SequenceError(f"the kinematics have frame {row.frame_id!r} twice. Remove one of the rows.")
+        by_id[row.frame_id] = row
+    chosen = ((index, by_id[sequence.frame_ids[index]]) for index in indices if sequence.frame_ids[index] in by_id)
+    return [
+        ExportFrame(row.frame_id, row.source, row.joint_positions, row.joint_std, index=index) for index, row in chosen
+    ]

@@ -1,0 +1,61 @@
+"""Kinematics of an export as one file: CSV, NPZ or JSON."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from .dataset import Dataset
+from .kinematics import joint_columns, joint_units, kinematics_csv, position_values, std_values
+from .monitor import Monitor
+
+
+def write_kinematics_csv(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+    """The table that `read_kinematics_csv` reads, and `carts export --kinematics`."""
+    path.write_text(kinematics_csv(dataset.scene, monitor.track(dataset.frames)), encoding="utf-8", newline="")
+
+
+def write_kinematics_npz(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+    """NumPy's archive without pickles.
+
+    Arrays: `frame_id` and `source` (text) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
+    `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a `joint_std` that is not known
+    is NaN.
+    """
+    frames = list(monitor.track(dataset.frames))
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file,
+            frame_id=np.array([frame.frame_id for frame in frames]),
+            index=np.array([frame.index for frame in frames]),
+            source=np.array([frame.source for frame in frames]),
+            column=np.array(joint_columns(dataset.scene)),
+            unit=np.array(joint_units(dataset.scene)),
+            joint_positions=np.array([position_values(dataset.scene, frame) for frame in frames]),
+            joint_std=np.array([std_values(dataset.scene, frame) for frame in frames]),
+        )
+
+
+def write_kinematics_json(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+    """JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if unknown."""
+    columns = joint_columns(dataset.scene)
+    frames = [
+        {
+            "frame": frame.frame_id,
+            "index": frame.index,
+            "source": frame.source,
+            "joint_positions": dict(zip(columns, position_values(dataset.scene, frame).tolist(), strict=True)),
+            "joint_std": {
+                column: None if math.isnan(value) else value
+                for column, value in zip(columns, std_values(dataset.scene, frame).tolist(), strict=True)
+            },
+        }
+        for frame in monitor.track(dataset.frames)
+    ]
+    content = {
+        "sequence": dataset.sequence.name,
+        "units": dict(zip(columns, joint_units(dataset.scene), strict=True)),
+        "frames": frames,
+    }
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False), encoding="utf-8")

@@ -1,0 +1,69 @@
+"""A video per camera (H.264 in MP4) with the rendered arms over the frames and a line along their masks."""
+
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ..camera import Camera
+from .dataset import Dataset, View
+from .files import unique_file_names
+from .monitor import Monitor
+from .overlay import image_and_mask, outlined, overlay
+
+_DEFAULT_RATE = 25.0
+_OPACITY = 0.5
+_QUALITY = {"crf": "18", "preset": "medium"}
+
+
+def write_video(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+    """Write `CAMERA.mp4` for every camera."""
+    folder.mkdir()
+    rate = Fraction(frame_rate(dataset)).limit_denominator(1001)
+    cameras = dataset.scene.cameras
+    names = unique_file_names([camera.name for camera in cameras])
+    with ExitStack() as stack:
+        streams = {}
+        for name, camera in zip(names, cameras, strict=True):
+            container = stack.enter_context(av.open(str(folder / f"{name}.mp4"), "w"))
+            stream = container.add_stream("libx264", rate=rate, options=_QUALITY)
+            stream.width, stream.height, stream.pix_fmt = *_even(camera), "yuv420p"
+            streams[camera.name] = container, stream
+        for view in dataset.views(monitor):
+            container, stream = streams[view.camera.name]
+            picture = av.VideoFrame.from_ndarray(_padded(_picture(dataset, view)), format="rgb24")
+            container.mux(stream.encode(picture))
+        for container, stream in streams.values():
+            container.mux(stream.encode(None))
+
+
+def frame_rate(dataset: Dataset) -> float:
+    """Frames per second of a video: as set, else as the frames were recorded, else 25."""
+    times = dataset.sequence.timestamps
+    if dataset.frame_rate is not None:
+        return dataset.frame_rate
+    if times is None or len(dataset.frames) < 2:
+        return _DEFAULT_RATE
+    steps = np.diff([times[frame.index] for frame in dataset.frames])
+    return 1.0 / float(np.median(steps)) if np.median(steps) > 0 else _DEFAULT_RATE
+
+
+def _picture(dataset: Dataset, view: View) -> UInt8[np.ndarray, "height width 3"]:
+    state = dataset.scene.state(view.frame.joint_positions)
+    image, rendered = image_and_mask(dataset.renderers[view.camera.name], state)
+    mask = view.link_ids >= 0
+    return outlined(overlay(dataset.image(view), image, rendered & mask, _OPACITY), mask)
+
+
+def _even(camera: Camera) -> tuple[int, int]:
+    """Width and height [px] as H.264 wants them."""
+    return camera.width + camera.width % 2, camera.height + camera.height % 2
+
+
+def _padded(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    height, width = image.shape[:2]
+    return cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

@@ -1,0 +1,169 @@
+"""Observed training images: random arms in front of a random camera, shaded and photographed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from ...errors import SettingsError
+from ...robot import Robot
+from .backgrounds import random_background
+from .clutter import add_clutter, cast_shadow
+from .gbuffer import GBuffer, render_gbuffer
+from .geometry import Intrinsics, RobotGeometry
+from .lens import photograph
+from .placement import Placement, random_intrinsics, random_placement
+from .ranges import AppearanceRanges
+from .shading import shade
+from .variants import Variant, random_variant
+
+SUPERSAMPLING = 2
+_VARIANTS = 12
+_VARIANT_LIFE = 40
+_TRIES = 12
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """What training images look like."""
+
+    width: int = 192
+    """Width of a training image [px]."""
+    height: int = 160
+    """Height of a training image [px]."""
+    field_width: int = 320
+    """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
+    two_arms: float = 0.4
+    """Share of pairs with two arms."""
+    same_kinematics: float = 0.5
+    """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
+    same_background: float = 0.7
+    """Share of pairs whose mean background is that of the observed image."""
+    coverage: tuple[float, float] = (0.004, 0.5)
+    """Allowed share of the image that shows arms."""
+    appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
+    """The camera's ranges."""
+
+    def __post_init__(self) -> None:
+        if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
+            raise SettingsError(
+                f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
+            )
+        if self.field_width < self.width:
+            raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
+        for name in ("two_arms", "same_kinematics", "same_background"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
+        if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
+            raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """An observed image and everything that it was made of."""
+
+    image: Float[np.ndarray, "h w 3"]
+    """RGB in [0, 1]."""
+    variant: Variant
+    placements: list[Placement]
+    intrinsics: Intrinsics
+    view: GBuffer
+    """What each pixel's centre sees."""
+    fine: GBuffer
+    """The same, `SUPERSAMPLING` times as fine."""
+    coverage: Float[np.ndarray, "h w"]
+    """Share of each pixel that shows an arm."""
+    background: Float[np.ndarray, "h w 3"]
+    """Without arms, before the camera."""
+    camera_seed: int
+    """Seed of what the camera did to the image."""
+
+
+class Observer:
+    """Makes observed images without end; each depends on the seed and the images before it only.
+
+    Args:
+        robots: the robots that arms are made of.
+        settings: what the images look like.
+        seed: seed of the random numbers.
+    """
+
+    def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.settings = settings
+        self._robots = robots
+        self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
+
+    def __call__(self) -> Observation:
+        """The next observation."""
+        rng, settings = self.rng, self.settings
+        variant = self._variant(1 + int(rng.random() < settings.two_arms))
+        size = settings.width, settings.height
+        intrinsics, placements, view = self._visible_placements(variant)
+        fine = look(variant.geometries, placements, intrinsics, *size, SUPERSAMPLING)
+        coverage = cv2.resize(fine.image(np.ones(len(fine.rows), np.float32)), size, interpolation=cv2.INTER_AREA)
+        background = add_clutter(rng, random_background(rng, *size)).astype(np.float32)
+        camera_seed = int(rng.integers(2**63))
+        image = self._observe(variant, fine, background, coverage, camera_seed)
+        return Observation(image, variant, placements, intrinsics, view, fine, coverage, background, camera_seed)
+
+    def _variant(self, arms: int) -> Variant:
+        """A scene from a small pool, replaced after some use: building one costs as much as several images."""
+        key = arms, int(self.rng.integers(_VARIANTS))
+        variant, uses = self._variants.get(key, (None, 0))
+        if variant is None or uses >= _VARIANT_LIFE:
+            settings = self.settings
+            variant, uses = random_variant(self.rng, self._robots, arms, settings.width, settings.height), 0
+        self._variants[key] = variant, uses + 1
+        return variant
+
+    def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
+        """Arms of which the camera sees neither too little nor too much; after some tries, whatever it sees."""
+        settings, rng = self.settings, self.rng
+        size = settings.width, settings.height
+        tries = 0
+        while True:
+            intrinsics = random_intrinsics(rng, *size, settings.field_width)
+            placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
+            view = look(variant.geometries, placements, intrinsics, *size)
+            share = len(view.rows) / (settings.width * settings.height)
+            tries += 1
+            if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
+                return intrinsics, placements, view
+
+    def _observe(
+        self, variant: Variant, fine: GBuffer, background: np.ndarray, coverage: np.ndarray, camera_seed: int
+    ) -> Float[np.ndarray, "h w 3"]:
+        rng = self.rng
+        color = shade(rng, fine, list(variant.geometries), background.mean((0, 1)))
+        # Averaging the shaded subpixels gives colour times coverage, which is what compositing needs.
+        arms = cv2.resize(fine.image(color.astype(np.float32)), coverage.shape[::-1], interpolation=cv2.INTER_AREA)
+        for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
+            background = cast_shadow(rng, background, coverage)
+        composed = background * (1 - coverage[..., None]) + arms
+        return photograph(np.random.default_rng(camera_seed), composed, self.settings.appearance)
+
+
+def look(
+    geometries: Sequence[RobotGeometry],
+    placements: Sequence[Placement],
+    intrinsics: Intrinsics,
+    width: int,
+    height: int,
+    supersampling: int = 1,
+) -> GBuffer:
+    """What the camera sees of placed arms."""
+    posed = [
+        geometry.posed(placement.T_camera_base @ geometry.link_transforms(placement.joint_positions))
+        for geometry, placement in zip(geometries, placements, strict=True)
+    ]
+    fx, fy, cx, cy = intrinsics
+    scaled = fx * supersampling, fy * supersampling, cx * supersampling, cy * supersampling
+    return render_gbuffer(geometries, posed, scaled, width * supersampling, height * supersampling)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """An image in [0, 1] as bytes."""
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

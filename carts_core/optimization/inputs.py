@@ -1,0 +1,66 @@
+"""Camera images as an objective takes them: checked, in the working size, stacked."""
+
+import math
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+
+from ..errors import SettingsError
+from ..scene import Scene
+
+
+def stacked_images(
+    scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
+) -> Float[Tensor, "cameras 3 height width"]:
+    """Images of the scene's cameras, reduced to a size (width, height) [px], RGB in [0, 1].
+
+    Raises:
+        SettingsError: one is missing, or of another size than its camera.
+    """
+    resized = []
+    for camera in scene.cameras:
+        if camera.name not in images:
+            raise SettingsError(f"no {what} of camera {camera.name!r} was given; given are: {', '.join(images)}.")
+        image = images[camera.name]
+        if image.shape != (camera.height, camera.width, 3):
+            raise SettingsError(
+                f"the {what} of camera {camera.name!r} has shape {image.shape}, but its camera says "
+                f"({camera.height}, {camera.width}, 3)."
+            )
+        resized.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:
+    """Width and height [px] of the compared images: the first camera's shape, in multiples of the network's stride."""
+    camera = scene.cameras[0]
+    width = max(round(min(width, camera.width) / stride), 1) * stride
+    return width, max(round(width * camera.height / camera.width / stride), 1) * stride
+
+
+def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[Tensor, "n channels h w"]:
+    """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
+    if deviation == 0:
+        return images
+    size = _kernel_size(deviation)
+    return gaussian_blur2d(images, (size, size), (deviation, deviation), border_type="replicate")
+
+
+def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Tensor, "*batch h w"]:
+    """The same as `blurred`, without autograd, for any number of channels, and much faster on a CPU."""
+    flat = images.reshape(-1, *images.shape[-2:])
+    if deviation == 0 or images.device.type != "cpu":
+        return blurred(flat[None], deviation).view(images.shape)
+    kernel = cv2.getGaussianKernel(_kernel_size(deviation), deviation, cv2.CV_32F)
+    planes = flat.permute(1, 2, 0).contiguous().numpy()
+    result = cv2.sepFilter2D(planes, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(result.reshape(planes.shape)).permute(2, 0, 1).reshape(images.shape)
+
+
+def _kernel_size(deviation: float) -> int:
+    return 2 * math.ceil(2.5 * deviation) + 1

@@ -1,0 +1,218 @@
+"""The surface objective for one frame: the surface map of a state against the one that the network sees in the image.
+
+What the surface network predicts (parts and normals, see `carts_core.surface`) the renderer knows exactly for every
+state, so no background, no shading and no network enter an iteration, and residuals have a Jacobian. A robust weight
+per pixel keeps what cannot be explained (an occluder, a false detection) from pulling.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from ..errors import SettingsError
+from ..features.extractor import FeatureExtractor
+from ..rendering import Renderer, SurfaceRendering
+from ..scene import Scene, SceneState
+from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from .evaluation import Evaluation
+from .inputs import smoothed, stacked_images, working_size
+from .parameters import ParameterVector
+from .settings import OptimizerSettings
+from .window import Window
+
+_MARGIN = 40
+"""What is compared beyond the arms as they are believed to be [px of the working image]."""
+
+_COARSEST = 4
+"""Working pixels per side of a pixel in the coarsest stages."""
+
+_SMALLEST_BLUR = 1.2
+"""A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
+
+_EPSILON = 1e-3
+"""Distance of the states that transforms are differentiated between [rad]."""
+
+
+class SurfaceObjective:
+    """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
+
+    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. Each look
+    has the stages that `blurs` tell, a later one only its last two.
+
+    Args:
+        scene: with the cameras that take part.
+        images: camera name -> observed RGB image.
+        extractor: the networks.
+        parameters: the unknowns.
+        settings: blurs, noise and prior.
+        ignore: camera name -> pixels that show an occluder.
+
+    Raises:
+        SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        extractor: FeatureExtractor,
+        parameters: ParameterVector,
+        settings: OptimizerSettings,
+        ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+    ) -> None:
+        self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
+        later = settings.blurs[-2:]
+        self._plan = [(0, blur) for blur in settings.blurs]
+        self._plan += [(look, blur) for look in range(1, settings.looks) for blur in later]
+        self.stages = len(self._plan)
+        self._size = working_size(scene, settings.working_width, extractor.stride)
+        device = extractor.device
+        self._images = stacked_images(scene, images, self._size, "image").to(device)
+        self._weight = _weights(scene, ignore or {}, self._size).to(device)
+        width, height = self._size
+        self._whole = Renderer(scene, width=width, height=height, device=device)
+        self._prior = parameters.prior_precision(settings.prior_deg)
+        self._look = -1
+
+    def epoch(self, stage: int) -> int:
+        """Losses compare within an epoch only: which look at the image a stage belongs to."""
+        return self._plan[stage][0]
+
+    def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> Evaluation:
+        """Evaluate at the given offsets; each stage of a look blurs less than the one before."""
+        with torch.no_grad():
+            look, _ = self._plan[stage]
+            if look != self._look:
+                self._look_at(offsets, look)
+            first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
+            return self._evaluate(offsets, self._stages[stage - first], gradient)
+
+    def _look_at(self, offsets: Tensor, look: int) -> None:
+        """Have the network say what the image shows, knowing the present estimate."""
+        believed = self._whole.surface(self.parameters.state(offsets)).maps
+        window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
+        observed = self._extractor.surface(window.of(self._images), window.of(believed))
+        weight = window.of(self._weight)
+        self._look, self._window = look, window
+        self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
+        blurs = [blur for number, blur in self._plan if number == look]
+        self._stages = [_Stage(self.scene, self._size, window, observed, weight, blur, self.settings) for blur in blurs]
+
+    def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:
+        state = self.parameters.state(offsets)
+        neighbours = _neighbours(self.parameters, offsets) if gradient else None
+        compared = stage.compare(state, neighbours)
+        final = compared if stage is self._stages[-1] else self._stages[-1].compare(state, None)
+        prior = 0.5 * float((self._prior * offsets.square()).sum())
+        slope, curvature = torch.zeros_like(offsets), None
+        if compared.gradient is not None and compared.curvature is not None:
+            slope = self._prior * offsets + compared.gradient
+            curvature = torch.diag(self._prior) + compared.curvature
+        coverage = final.rendering.maps[:, COVERAGE].sum(1)
+        area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
+        empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])
+        paste = self._window.paste
+        return Evaluation(
+            value=compared.cost / self.settings.noise**2 + prior,
+            loss=2.0 * final.cost / area,
+            prior=prior,
+            gradient=slope,
+            curvature=curvature,
+            image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
+            silhouette=paste(coverage, empty.clone()),
+            similarity=paste(final.similarity, torch.ones_like(empty)),
+            attention=paste(final.trust, empty),
+        )
+
+
+def _weights(
+    scene: Scene, ignore: Mapping[str, Bool[np.ndarray, "h w"]], size: tuple[int, int]
+) -> Float[Tensor, "cameras 1 h w"]:
+    """0 where an occluder is known to be, 1 elsewhere."""
+    weight = np.ones((len(scene.cameras), 1, size[1], size[0]), np.float32)
+    for index, camera in enumerate(scene.cameras):
+        mask = ignore.get(camera.name)
+        if mask is None:
+            continue
+        if mask.shape != (camera.height, camera.width):
+            raise SettingsError(
+                f"the ignore mask of camera {camera.name!r} has shape {mask.shape}, but its camera says "
+                f"({camera.height}, {camera.width})."
+            )
+        weight[index, 0] = 1.0 - cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(weight)
+
+
+class _Stage:
+    """The comparison under one blur, at the resolution that the blur leaves."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        size: tuple[int, int],
+        window: Window,
+        observed: Float[Tensor, "cameras 6 h w"],
+        weight: Float[Tensor, "cameras 1 h w"],
+        blur: float,
+        settings: OptimizerSettings,
+    ) -> None:
+        self._factor = max(f for f in (1, 2, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._blur, self._robust = blur / self._factor, settings.robust
+        # A pixel of a coarse stage stands for many of the last one.
+        self._precision = self._factor**2 / settings.noise**2
+        left, top, columns, rows = (v // self._factor for v in (window.left, window.top, window.width, window.height))
+        self.renderer = Renderer(
+            scene,
+            width=size[0] // self._factor,
+            height=size[1] // self._factor,
+            window=(left, top, columns, rows),
+            device=observed.device,
+        )
+        self._weight = functional.avg_pool2d(weight, self._factor)
+        maps = functional.avg_pool2d(observed * weight, self._factor)
+        self._observed = smoothed(maps, self._blur)
+        self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
+        self._channels[NORMALS] = settings.normals_weight
+
+    def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "_Comparison":
+        """Compare a state; with neighbours, also say how the cost changes."""
+        tangents = self.renderer.tangents(*neighbours, 2 * _EPSILON) if neighbours else None
+        rendering = self.renderer.surface(state, tangents)
+        residual = self._observed - smoothed(rendering.maps * self._weight, self._blur)
+        squared = (residual.square() * self._channels).sum(1, keepdim=True)
+        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
+        ratio = 1.0 / (1.0 + squared / self._robust**2)
+        cost = 0.5 * self._factor**2 * float((squared * ratio).sum())
+        comparison = _Comparison(
+            cost, rendering, (1.0 - squared[:, 0]).clamp(min=-1.0), (ratio.square() * self._weight)[:, 0]
+        )
+        if rendering.jacobian is None:
+            return comparison
+        jacobian = smoothed(rendering.jacobian * self._weight, self._blur).flatten(1)
+        weighted = jacobian * (ratio.square() * self._channels * self._precision).flatten()
+        return replace(comparison, gradient=-weighted @ residual.flatten(), curvature=weighted @ jacobian.T)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    cost: float
+    """Half the sum of robust squared residuals [px of the working image]."""
+    rendering: SurfaceRendering
+    similarity: Float[Tensor, "cameras h w"]
+    trust: Float[Tensor, "cameras h w"]
+    """Weight of each pixel, in [0, 1]."""
+    gradient: Float[Tensor, " n"] | None = None
+    """Of the cost in units of the noise."""
+    curvature: Float[Tensor, "n n"] | None = None
+
+
+def _neighbours(parameters: ParameterVector, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
+    """Batches of states a little below and above, one unknown each."""
+    step = _EPSILON * torch.eye(len(offsets), device=offsets.device)
+    return parameters.state(offsets - step), parameters.state(offsets + step)

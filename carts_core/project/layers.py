@@ -1,0 +1,117 @@
+"""What a person paints over a frame, one 8-bit PNG per layer, so that any image viewer shows it."""
+
+import struct
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from ..errors import ProjectError
+
+_ADDED, _REMOVED, _IGNORED = np.uint8(255), np.uint8(127), np.uint8(255)
+_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A painted layer. Made by the `of` of its subclasses.
+
+    Raises:
+        ProjectError: the bytes are no PNG.
+    """
+
+    png: bytes
+
+    def __post_init__(self) -> None:
+        if not self.png.startswith(_HEADER) or len(self.png) < len(_HEADER) + 8:
+            raise ProjectError("a painted layer is not a PNG image. Make it with `of`.")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px], as the PNG's header says."""
+        return struct.unpack_from(">II", self.png, len(_HEADER))
+
+    def encode(self) -> bytes:
+        """As it is kept."""
+        return self.png
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """What `encode` gave.
+
+        Raises:
+            ProjectError: it is something else.
+        """
+        return cls(bytes(data))
+
+    def pixels(self) -> UInt8[np.ndarray, "height width"]:
+        """The PNG's values.
+
+        Raises:
+            ProjectError: the PNG is damaged.
+        """
+        image = cv2.imdecode(np.frombuffer(self.png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if image is None or image.shape[::-1] != self.size:
+            raise ProjectError("a painted layer is damaged. Undo to before it was painted, or paint it anew.")
+        return image.astype(np.uint8, copy=False)
+
+
+class MaskCorrection(Layer):
+    """Pixels that a person added to the rendered mask (255) or removed from it (127); 0 elsewhere."""
+
+    @classmethod
+    def of(cls, added: Bool[np.ndarray, "height width"], removed: Bool[np.ndarray, "height width"]) -> Self:
+        """A correction of these pixels.
+
+        Raises:
+            ProjectError: the shapes differ, or a pixel is both.
+        """
+        added, removed = np.asarray(added, bool), np.asarray(removed, bool)
+        if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
+            raise ProjectError(
+                f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be two masks of one size "
+                "that share no pixel. A later stroke takes its pixels out of the other mask."
+            )
+        return cls(_png(added * _ADDED + removed * _REMOVED))
+
+    def added(self) -> Bool[np.ndarray, "height width"]:
+        """Pixels that belong to an arm although none is rendered there."""
+        return self.pixels() == _ADDED
+
+    def removed(self) -> Bool[np.ndarray, "height width"]:
+        """Pixels that belong to no arm although one is rendered there."""
+        return self.pixels() == _REMOVED
+
+    def applied_to(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+        """The corrected mask."""
+        pixels = self.pixels()
+        return (mask | (pixels == _ADDED)) & (pixels != _REMOVED)
+
+
+class IgnoreRegion(Layer):
+    """Pixels where something hides the arms (255); 0 elsewhere. The optimizer leaves them out."""
+
+    @classmethod
+    def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
+        """The region of these pixels.
+
+        Raises:
+            ProjectError: it is not a mask.
+        """
+        region = np.asarray(region, bool)
+        if region.ndim != 2:
+            raise ProjectError(f"an ignore region has shape {region.shape}. Give a mask [height, width].")
+        return cls(_png(region * _IGNORED))
+
+    def region(self) -> Bool[np.ndarray, "height width"]:
+        """True where pixels are ignored."""
+        return self.pixels() == _IGNORED
+
+
+def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:
+    ok, data = cv2.imencode(".png", pixels)
+    if not ok:
+        raise ProjectError(f"a painted layer of shape {pixels.shape} could not be written as PNG.")
+    return data.tobytes()

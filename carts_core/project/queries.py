@@ -1,0 +1,56 @@
+"""Which frame to look at next."""
+
+import math
+from collections.abc import Callable, Collection, Iterable
+
+from .state import ProjectState
+from .values import Figures, ReviewState
+
+UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
+"""States in which nobody has judged the frame yet."""
+
+
+def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> list[int]:
+    """Indices of the frames in one of these review states, in order."""
+    return [index for index in range(len(state.identity.frame_ids)) if state.review(index).state in review_states]
+
+
+def next_unreviewed(state: ProjectState, after: int, step: int = 1) -> int | None:
+    """The next frame that nobody has judged, coming round at the end; None if there is none.
+
+    Args:
+        state: of the project.
+        after: index of the present frame, which comes last.
+        step: 1 forwards, -1 backwards.
+    """
+    frames = len(state.identity.frame_ids)
+    around = ((after + step * offset) % frames for offset in range(1, frames + 1))
+    return next((index for index in around if state.review(index).state in UNREVIEWED), None)
+
+
+def worst_first(
+    state: ProjectState,
+    frames: Iterable[int] | None = None,
+    badness: Callable[[Figures], float | None] | None = None,
+) -> list[int]:
+    """Frames by how badly they fit, worst first; those without figures come last, in order.
+
+    Args:
+        state: of the project.
+        frames: indices to order, by default all.
+        badness: larger is worse, None unknown. By default 1 - Dice if any of the frames has Dice, else the loss.
+    """
+    indices = list(range(len(state.identity.frame_ids)) if frames is None else frames)
+    known = {index: figures for index in indices if (figures := state.figures(index)) is not None}
+    if badness is None:
+        badness = _dice_badness if any(figures.dice is not None for figures in known.values()) else _loss
+    judged = {index: value for index, figures in known.items() if (value := badness(figures)) is not None}
+    return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
+
+
+def _dice_badness(figures: Figures) -> float | None:
+    return None if figures.dice is None else 1 - figures.dice
+
+
+def _loss(figures: Figures) -> float | None:
+    return figures.loss

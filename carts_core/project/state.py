@@ -1,0 +1,161 @@
+"""Everything a project says at one moment, as an immutable snapshot."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+from .identity import SequenceIdentity
+from .keys import WHOLE_PROJECT, Edits, Key, Kind
+from .values import Figures, JointCorrection, Review, Source
+
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One gesture, which is one step of undo."""
+
+    number: int
+    """From 1, without gaps."""
+    name: str
+    time: float
+    """When it was made [s since 1970]."""
+
+
+@dataclass(frozen=True)
+class ExportRecord:
+    """One finished export."""
+
+    time: float
+    """When it was finished [s since 1970]."""
+    format: str
+    path: str
+    frames: int
+    """How many frames it holds."""
+    settings: str
+    """JSON text."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A value and the step that made it. The value is None where that step removed it."""
+
+    step: int
+    value: Any
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of one frame, or of the whole project."""
+
+    entries: Mapping[Key[Any], Entry]
+    """What differs from the sequence, or once did."""
+    figures: Mapping[int, Figures]
+    """By revision; see `ProjectState.revision`."""
+
+
+_EMPTY = Record({}, {})
+_MARKS = (Kind.KEYFRAME, Kind.REVIEW)
+"""Kinds that say something about a frame and do not change how its arms fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectState:
+    """Everything a project says at one moment. Nothing changes it; an edit makes a new one."""
+
+    identity: SequenceIdentity
+    steps: tuple[Step, ...] = ()
+    """The history, oldest first; those after `position` are undone and can be redone."""
+    position: int = 0
+    """How many steps are done."""
+    records: Mapping[int, Record] = field(default_factory=dict)
+    """By frame. An edit copies this and the records that it touches, so it must not be one flat table."""
+    exports: tuple[ExportRecord, ...] = ()
+
+    def get(self, key: Key[V]) -> V | None:
+        """The value under a key; None where it is as the sequence says."""
+        entry = self._record(key.frame).entries.get(key)
+        return None if entry is None else entry.value
+
+    def values(self, kind: Kind) -> dict[Key[Any], Any]:
+        """All values of one kind."""
+        entries = (item for record in self.records.values() for item in record.entries.items())
+        return {key: entry.value for key, entry in entries if key.kind is kind and entry.value is not None}
+
+    def joints(self, frame: int) -> dict[str, JointCorrection]:
+        """Corrected joint positions of a frame, for the arms that have some."""
+        found = {arm: self.get(Key.joints(frame, arm)) for arm in self.identity.arms}
+        return {arm: correction for arm, correction in found.items() if correction is not None}
+
+    def review(self, frame: int) -> Review:
+        """Review state and note of a frame; untouched at first."""
+        return self.get(Key.review(frame)) or Review()
+
+    def is_keyframe(self, frame: int) -> bool:
+        """Whether propagation must keep the frame: a person said so, or made its joint positions and said nothing."""
+        said = self.get(Key.keyframe(frame))
+        if said is not None:
+            return said.held
+        return any(correction.provenance.source is Source.HAND for correction in self.joints(frame).values())
+
+    def figures(self, frame: int) -> Figures | None:
+        """Figures of a frame as it now is; None if they were not computed since it changed."""
+        return self._record(frame).figures.get(self.revision(frame))
+
+    def revision(self, frame: int) -> int:
+        """The last step that changed what figures of this frame depend on; 0 if none did."""
+        entries = self._record(frame).entries.items()
+        own = max((entry.step for key, entry in entries if key.kind not in _MARKS), default=0)
+        return max(own, self._calibration_revision)
+
+    @property
+    def undoable(self) -> Step | None:
+        """The step that `Project.undo` takes back."""
+        return self.steps[self.position - 1] if self.position else None
+
+    @property
+    def redoable(self) -> Step | None:
+        """The step that `Project.redo` does again."""
+        return self.steps[self.position] if self.position < len(self.steps) else None
+
+    def after(self, step: Step, edits: Edits) -> "ProjectState":
+        """The state after one more step; what could be redone is gone."""
+        state = self if self.redoable is None else self._without_undone_steps()
+        changed = {key: Entry(step.number, value) for key, value in edits.items()}
+        return replace(state.with_entries(changed), steps=(*state.steps, step), position=step.number)
+
+    def with_entries(self, changed: Mapping[Key[Any], Entry | None]) -> "ProjectState":
+        """The state with other entries under these keys; None for none."""
+        by_frame: defaultdict[int, dict[Key[Any], Entry | None]] = defaultdict(dict)
+        for key, entry in changed.items():
+            by_frame[key.frame][key] = entry
+        records = dict(self.records)
+        for frame, entries in by_frame.items():
+            record = self._record(frame)
+            merged = {**record.entries, **entries}
+            records[frame] = Record({key: e for key, e in merged.items() if e is not None}, record.figures)
+        return replace(self, records=records)
+
+    def with_figures(self, figures: Mapping[tuple[int, int], Figures]) -> "ProjectState":
+        """The state with these figures of (frame, revision) added."""
+        records = dict(self.records)
+        for (frame, revision), value in figures.items():
+            record = records.get(frame, _EMPTY)
+            records[frame] = Record(record.entries, {**record.figures, revision: value})
+        return replace(self, records=records)
+
+    @cached_property
+    def _calibration_revision(self) -> int:
+        return max((entry.step for entry in self._record(WHOLE_PROJECT).entries.values()), default=0)
+
+    def _record(self, frame: int) -> Record:
+        return self.records.get(frame, _EMPTY)
+
+    def _without_undone_steps(self) -> "ProjectState":
+        records = {
+            frame: Record(record.entries, {r: value for r, value in record.figures.items() if r <= self.position})
+            for frame, record in self.records.items()
+        }
+        return replace(self, steps=self.steps[: self.position], records=records)

@@ -1,0 +1,254 @@
+"""What a project keeps: corrections with their provenance, review marks and figures. All immutable."""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from functools import lru_cache
+from typing import Any, Self, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from ..camera import rigid_transform
+from ..errors import ProjectError, SettingsError
+
+_Choice = TypeVar("_Choice", bound=StrEnum)
+
+LONGEST_NOTE = 10_000
+"""Characters."""
+
+
+class Source(StrEnum):
+    """Who or what made a value."""
+
+    MEASURED = "measured"
+    HAND = "hand"
+    OPTIMIZER = "optimizer"
+    PROPAGATED = "propagated"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Who or what made a value, and how.
+
+    Raises:
+        ProjectError: an optimizer's value without settings, settings that are not JSON, or a hash that is none.
+    """
+
+    source: Source
+    settings: str | None = None
+    """JSON text of the settings; required for the optimizer."""
+    weights_sha256: str | None = None
+    """Hash of the network's weights; required for the optimizer."""
+
+    def __post_init__(self) -> None:
+        _set(self, "source", _choice(Source, self.source, "provenance"))
+        if self.source is Source.OPTIMIZER and (self.settings is None or self.weights_sha256 is None):
+            raise ProjectError("an optimizer's value needs its settings and the hash of its weights. Give both.")
+        if self.settings is not None:
+            _check_json(self.settings)
+        if self.weights_sha256 is not None and not re.fullmatch("[0-9a-f]{64}", self.weights_sha256):
+            raise ProjectError(f"{self.weights_sha256!r} is not a SHA-256 hash. Give 64 hexadecimal digits.")
+
+    @staticmethod
+    def made_by_optimizer(
+        settings: Mapping[str, Any], weights_sha256: str, source: Source = Source.OPTIMIZER
+    ) -> "Provenance":
+        """Provenance of an optimizer's result.
+
+        Args:
+            settings: what JSON can hold, say `asdict(OptimizerSettings())`.
+            weights_sha256: of the weights file.
+            source: OPTIMIZER, or PROPAGATED for a frame that was solved between keyframes.
+        """
+        return Provenance(source, json.dumps(settings, sort_keys=True, allow_nan=False), weights_sha256)
+
+
+class JsonValue:
+    """A dataclass that is kept as JSON text."""
+
+    def encode(self) -> str:
+        """As JSON text."""
+        return json.dumps(asdict(self), allow_nan=False)  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def decode(cls, text: str) -> Self:
+        """What `encode` wrote.
+
+        Raises:
+            ValueError, TypeError, ProjectError: it is something else.
+        """
+        values = json.loads(text)
+        if "provenance" in values:
+            values["provenance"] = _shared_provenance(**values["provenance"])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class JointCorrection(JsonValue):
+    """Joint positions of one arm in one frame. Any sequences of numbers are taken and kept as tuples.
+
+    Raises:
+        ProjectError: a number is not finite, or the lengths differ.
+    """
+
+    joint_positions: tuple[float, ...]
+    """In the order of `Robot.joint_names` [rad, m]."""
+    provenance: Provenance
+    standard_deviations: tuple[float | None, ...] | None = None
+    """Of each joint [rad, m], None where it is not determined; NaN and infinity become None."""
+
+    def __post_init__(self) -> None:
+        _set(self, "joint_positions", _finite(self.joint_positions, "joint positions"))
+        if self.standard_deviations is not None:
+            deviations = tuple(_deviation(value) for value in self.standard_deviations)
+            if len(deviations) != len(self.joint_positions):
+                raise ProjectError(
+                    f"{len(deviations)} standard deviations were given for {len(self.joint_positions)} joints. "
+                    "Give one per joint."
+                )
+            _set(self, "standard_deviations", deviations)
+
+
+@dataclass(frozen=True)
+class CorrectedTransform(JsonValue):
+    """A rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera.
+
+    Raises:
+        ProjectError: it is not a rigid transform.
+    """
+
+    transform: tuple[tuple[float, ...], ...]
+    """4 rows of 4 numbers [m]."""
+    provenance: Provenance
+
+    def __post_init__(self) -> None:
+        try:
+            matrix = rigid_transform(self.transform, "the corrected transform")
+        except SettingsError as error:
+            raise ProjectError(str(error)) from error
+        _set(self, "transform", tuple(tuple(row) for row in matrix.tolist()))
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """A copy of the transform."""
+        return np.array(self.transform)
+
+
+@dataclass(frozen=True)
+class CorrectedIntrinsics(JsonValue):
+    """Intrinsics of a camera.
+
+    Raises:
+        ProjectError: not four finite numbers, or a focal length that is not positive.
+    """
+
+    intrinsics: tuple[float, ...]
+    """fx, fy, cx, cy [px]."""
+    provenance: Provenance
+
+    def __post_init__(self) -> None:
+        values = _finite(self.intrinsics, "intrinsics")
+        if len(values) != 4 or min(values[:2]) <= 0:
+            raise ProjectError(f"intrinsics are {list(values)}. Give fx, fy, cx, cy [px] with positive fx and fy.")
+        _set(self, "intrinsics", values)
+
+
+@dataclass(frozen=True)
+class Keyframe(JsonValue):
+    """Whether a frame is a keyframe, where a person said so; see `ProjectState.is_keyframe`."""
+
+    held: bool
+
+
+class ReviewState(StrEnum):
+    """What a person, or the last run, says about a frame."""
+
+    UNTOUCHED = "untouched"
+    OPTIMIZED = "optimized"
+    NEEDS_WORK = "needs work"
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True)
+class Review(JsonValue):
+    """Review state of a frame and a note about it.
+
+    Raises:
+        ProjectError: there is no such state, or the note is too long.
+    """
+
+    state: ReviewState = ReviewState.UNTOUCHED
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        _set(self, "state", _choice(ReviewState, self.state, "review state"))
+        if not isinstance(self.note, str) or len(self.note) > LONGEST_NOTE:
+            raise ProjectError(f"a note must be text of at most {LONGEST_NOTE} characters. Shorten it.")
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How well a frame's arms fit its image.
+
+    Raises:
+        ProjectError: a figure is not finite.
+    """
+
+    loss: float | None = None
+    """The optimizer's loss; smaller is better."""
+    dice: float | None = None
+    """Overlap with the true mask, 0 to 1; None where there is no truth."""
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "dice"):
+            value = getattr(self, name)
+            if value is not None:
+                _set(self, name, _finite([value], name)[0])
+
+
+@lru_cache(maxsize=1024)
+def _shared_provenance(source: str, settings: str | None, weights_sha256: str | None) -> Provenance:
+    """One object for all frames of a run: settings are long and frames are many."""
+    return Provenance(Source(source), settings, weights_sha256)
+
+
+def _set(instance: object, name: str, value: object) -> None:
+    """Normalise a field of a frozen dataclass while it is being made."""
+    object.__setattr__(instance, name, value)
+
+
+def _choice(kind: type[_Choice], value: object, what: str) -> _Choice:
+    try:
+        return kind(value)
+    except ValueError as error:
+        raise ProjectError(f"{what} is {value!r}, but must be one of: {', '.join(kind)}.") from error
+
+
+def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError) as error:
+        raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
+    if not all(map(math.isfinite, numbers)):
+        raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
+    return numbers
+
+
+def _deviation(value: float | None) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    if value < 0:
+        raise ProjectError(f"a standard deviation is {value:g}. Give 0 or more [rad, m], or None.")
+    return float(value)
+
+
+def _check_json(text: str) -> None:
+    try:
+        json.loads(text)
+    except ValueError as error:
+        raise ProjectError(f"settings are not JSON ({error}). Give what json.dumps writes.") from error

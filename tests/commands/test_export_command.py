@@ -1,0 +1,140 @@
+"""`carts export`, as a user types it."""
+
+import json
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+
+from carts_core.cli import BAD_INPUT, main
+from carts_core.data import Sequence
+from carts_core.data.images import read_image, read_mask
+from carts_core.export import FORMATS, FormatName, KinematicsRow, kinematics_csv
+
+_REPEATED = """
+import sys
+from pathlib import Path
+from carts_core.data import Sequence
+from carts_core.export import Dataset, export, measured_frames
+sequence = Sequence.open(sys.argv[1])
+dataset = Dataset(sequence, tuple(measured_frames(sequence, range(len(sequence)))), sequence.scene, "regular")
+print("ready", flush=True)
+while True:
+    export(dataset, "coco", Path(sys.argv[2]), overwrite=True)
+"""
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> str:
+    return str(tiny_sequence(frames=3, domains=("regular", "smoke"), cameras=("left", "right"), width=160, height=128))
+
+
+def _coco(folder: Path) -> Any:  # its own type hints know no further keys of an image
+    return COCO(str(folder / "annotations" / "instances_default.json"))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_written(sequence: str, tmp_path: Path, name: FormatName) -> None:
+    (tmp_path / "exports").mkdir()
+    main(["export", sequence, str(tmp_path / "exports" / "out"), "--format", name, "--frames", "1"])
+    (written,) = (tmp_path / "exports").iterdir()
+    assert written.name == "out" + FORMATS[name].suffix
+    assert written.is_dir() == (not FORMATS[name].suffix)
+
+
+def test_the_command_knows_every_format() -> None:
+    assert list(FORMATS) == list(get_args(FormatName))
+
+
+def test_frames_cameras_and_domain_are_chosen(sequence: str, tmp_path: Path) -> None:
+    choice = ["--frames", "0,2", "--camera", "right", "--domain", "smoke", "--parts", "links"]
+    main(["export", sequence, str(tmp_path / "out"), "--format", "coco", *choice])
+    images = list(_coco(tmp_path / "out").imgs.values())
+    assert [(image["frame"], image["camera"]) for image in images] == [("001", "right"), ("003", "right")]
+    assert {category["supercategory"] for category in _coco(tmp_path / "out").cats.values()} == {"PSM1"}
+    written = read_image(tmp_path / "out" / "images" / images[0]["file_name"])
+    np.testing.assert_array_equal(written, read_image(Path(sequence).parent / "smoke" / "right" / "001.png"))
+
+
+def test_corrected_kinematics_decide_frames_and_masks(sequence: str, tmp_path: Path) -> None:
+    opened = Sequence.open(sequence)
+    truth = (opened.truth or {})["PSM1"]
+    rows = [KinematicsRow(opened.frame_ids[index], "optimized", {"PSM1": truth[index]}) for index in (1, 2)]
+    table = tmp_path / "kinematics of mine.csv"
+    table.write_text(kinematics_csv(opened.scene, rows))
+    command = ["export", sequence, str(tmp_path / "out"), "--kinematics", str(table), "--camera", "left"]
+    main([*command, "--format", "coco"])
+    coco = _coco(tmp_path / "out")
+    assert [(image["frame"], image["source"]) for image in coco.imgs.values()] == [
+        ("002", "optimized"),
+        ("003", "optimized"),
+    ]
+    for annotation in coco.anns.values():
+        frame = coco.imgs[annotation["image_id"]]["frame"]
+        true = read_mask(Path(sequence).parent / "masks" / "left" / f"{frame}.png")
+        np.testing.assert_array_equal(coco.annToMask(annotation) > 0, true)
+    main([*command, "--format", "csv"])
+    assert (tmp_path / "out.csv").read_bytes() == table.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--domain", "all"], "an export holds one"),
+        (["--frames", "9"], "outside"),
+        (["--frame-rate", "0"], "frame rate"),
+        (["--kinematics", "missing.csv"], "missing.csv is not a readable kinematics table"),
+    ],
+)
+def test_bad_choices_are_told_and_write_nothing(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as stop:
+        main(["export", sequence, str(tmp_path / "out"), "--format", "coco", *options])
+    assert stop.value.code == BAD_INPUT and message in " ".join(capsys.readouterr().err.split())
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_earlier_export_is_replaced_on_request_only(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", sequence, str(tmp_path / "out"), "--format", "coco", "--frames"]
+    main([*command, "0"])
+    with pytest.raises(SystemExit):
+        main([*command, "1"])
+    assert "Add --overwrite" in " ".join(capsys.readouterr().err.split())
+    main([*command, "1", "--overwrite"])
+    assert {image["frame"] for image in _coco(tmp_path / "out").imgs.values()} == {"002"}
+
+
+def _kill_and_check(sequence: str, folder: Path, seconds: float) -> None:
+    """Kill a process that exports again and again; what is there must be whole."""
+    child = subprocess.Popen([sys.executable, "-c", _REPEATED, sequence, folder / "out"], stdout=subprocess.PIPE)
+    assert child.stdout is not None and child.stdout.readline() == b"ready\n"
+    time.sleep(seconds)
+    child.kill()
+    child.communicate()
+    if (folder / "out").exists():
+        summary = json.loads((folder / "out" / "export.json").read_text())
+        images = {f"{view['name']}.png" for view in summary["views"]}
+        assert {path.name for path in (folder / "out" / "images").iterdir()} == images and len(images) == 6
+        assert len(_coco(folder / "out").anns) == 6
+
+
+@pytest.mark.parametrize("count", [3, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+def test_kills_at_any_moment_leave_whole_exports(sequence: str, tmp_path: Path, count: int) -> None:
+    folder = tmp_path / "exports"
+    folder.mkdir()
+    moments = random.Random(count)
+    for _ in range(count):
+        _kill_and_check(sequence, folder, moments.uniform(0.0, 0.4))
+    main(["export", sequence, str(folder / "out"), "--format", "coco", "--overwrite"])
+    assert [path.name for path in folder.iterdir()] == ["out"] and len(_coco(folder / "out").imgs) == 6

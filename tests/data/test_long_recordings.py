@@ -1,0 +1,57 @@
+"""What keeps long recordings light: opening decodes nothing, and browsing keeps no more than the cache may hold."""
+
+import math
+
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.data.bench import browse, make_recording, open_seconds
+
+FRAMES = 60
+IMAGE_BYTES = 640 * 480 * 3
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return make_recording(tmp_path_factory.mktemp("recording"), FRAMES)
+
+
+def test_images_and_video_of_a_recording_have_the_same_frames(recording):
+    files, video = (Sequence.open(path) for path in recording.values())
+    assert len(files) == len(video) == FRAMES
+    assert (files.matching, video.matching is None) == (None, False)
+    for index in (0, 31, FRAMES - 1):
+        difference = files.frame(index).images["left"].astype(int) - video.frame(index).images["left"]
+        assert abs(difference).mean() < 6
+        neighbour = files.frame(index - 1 if index else 1).images["left"].astype(int)
+        assert abs(difference).mean() < abs(neighbour - video.frame(index).images["left"]).mean()
+
+
+def test_opening_decodes_no_image(recording, monkeypatch):
+    def refuse(*arguments: object):
+        raise AssertionError("an image was decoded")
+
+    monkeypatch.setattr("carts_core.data.images.cv2.imdecode", refuse)
+    monkeypatch.setattr("carts_core.data.video_index.decoded_frames", refuse)
+    monkeypatch.setattr("carts_core.data.video.decoded_frames", refuse)
+    for path in recording.values():
+        sequence = Sequence.open(path)
+        with pytest.raises(AssertionError, match="an image was decoded"):
+            sequence.frame(0)
+
+
+def test_browsing_keeps_no_more_than_the_cache_may_hold(recording, monkeypatch):
+    monkeypatch.setattr("carts_core.data.sequence.CACHE_BYTES", 10 * IMAGE_BYTES)
+    monkeypatch.setattr("carts_core.data.frame_reader.CACHE_BYTES", 10 * IMAGE_BYTES)
+    for path in recording.values():
+        sequence = Sequence.open(path)
+        times, memory = browse(sequence, range(FRAMES))
+        assert len(times) == FRAMES and len(memory) == 5 and all(megabytes > 0 for megabytes in memory)
+        assert sequence._cache._used <= 10 * IMAGE_BYTES
+        cached = [index for index in range(FRAMES) if ("image", "left", "regular", index) in sequence._cache]
+        assert len(cached) == 10 and cached[-1] == FRAMES - 1
+
+
+def test_the_bench_times_the_opening(recording):
+    (seconds,) = open_seconds(recording["image files"], 1)
+    assert 0 < seconds < math.inf

@@ -1,0 +1,101 @@
+"""Which pixel belongs to whom, and what files are called."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from awkward import ARMS, CAMERA, all_views, expected_masks
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError, SequenceError, SettingsError
+from carts_core.export import Dataset, KinematicsRow, corrected_frames, file_name, measured_frames
+from carts_core.export.dataset import labelled
+from carts_core.export.files import unique_file_names
+from carts_core.rendering import Renderer
+
+
+def test_masks_of_measured_frames_are_those_of_the_renderer(dataset: Dataset) -> None:
+    frame = dataset.frames[0]
+    arm_ids = Renderer(dataset.scene).segment(dataset.scene.state(frame.joint_positions))[0]
+    np.testing.assert_array_equal(dataset.label_image(all_views(dataset)[0]).astype(int) - 1, arm_ids)
+    assert set(np.unique(arm_ids)) == {-1, 0, 1}, "the scene must show both arms"
+
+
+def test_links_of_an_arm_make_up_the_arm(dataset: Dataset) -> None:
+    by_link = replace(dataset, parts="links")
+    view = all_views(dataset)[0]
+    links = list(by_link.instances(view))
+    assert len(links) > len(ARMS) and all(category.name.startswith(f"{category.arm}.") for category, _ in links)
+    for category, mask in dataset.instances(view):
+        parts = [part for link, part in links if link.arm == category.name]
+        np.testing.assert_array_equal(np.sum(parts, axis=0), mask)
+
+
+def test_a_corrected_mask_decides_where_arms_are_and_the_rendering_whose_they_are(dataset: Dataset) -> None:
+    view = all_views(dataset)[2]
+    mask = dataset.frames[2].masks[CAMERA]
+    np.testing.assert_array_equal(view.link_ids >= 0, mask)
+    rendered = all_views(replace(dataset, frames=tuple(replace(frame, masks={}) for frame in dataset.frames)))[2]
+    both = mask & (rendered.link_ids >= 0)
+    np.testing.assert_array_equal(view.link_ids[both], rendered.link_ids[both])
+
+
+def test_an_empty_mask_has_no_objects(dataset: Dataset) -> None:
+    assert {name for name, _ in expected_masks(dataset)} == {dataset.steps[0][0], dataset.steps[2][0]}
+
+
+def test_added_pixels_get_the_nearest_label() -> None:
+    rendered = np.array([[3, -1, -1, -1, -1, 7]])
+    np.testing.assert_array_equal(
+        labelled(np.array([[False, True, True, False, True, True]]), rendered, "here"), [[-1, 3, 3, -1, 7, 7]]
+    )
+
+
+def test_pixels_that_nothing_rendered_explains_are_an_error() -> None:
+    with pytest.raises(CartsError, match="here: the mask has 2 pixels, but no arm is in view"):
+        labelled(np.array([[True, True]]), np.array([[-1, -1]]), "here")
+
+
+@pytest.mark.parametrize("mask", [np.zeros((2, 2), bool), np.zeros((1, 2), np.uint8)])
+def test_a_mask_of_another_size_or_kind_is_an_error(mask: np.ndarray) -> None:
+    with pytest.raises(CartsError, match=r"here: the mask is .*Give a Boolean mask"):
+        labelled(mask, np.array([[-1, -1]]), "here")
+
+
+def test_names_are_safe_and_unique(dataset: Dataset) -> None:
+    assert [name for name, _, _ in dataset.steps] == [f"linke_Kamera_ü_Bild_{n}_ä" for n in (1, 2, 3)]
+    assert unique_file_names(["a b", "a_b", "A/B", "..", ""]) == ["a_b", "a_b-2", "A_B-3", "_", "_-2"]
+    assert file_name("../../etc/passwd") == "_.._etc_passwd"
+
+
+def test_an_export_of_no_frames_is_refused(sequence: Sequence) -> None:
+    with pytest.raises(SettingsError, match="no frame to export"):
+        Dataset(sequence, (), sequence.scene, "regular")
+
+
+def test_masks_of_an_unknown_camera_are_refused(dataset: Dataset) -> None:
+    frame = replace(dataset.frames[0], masks={"middle": np.zeros((127, 161), bool)})
+    with pytest.raises(SettingsError, match=r"masks for cameras middle, which .* does not have"):
+        replace(dataset, frames=(frame,))
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), 1e9])
+def test_an_impossible_frame_rate_is_refused(sequence: Sequence, rate: float) -> None:
+    with pytest.raises(SettingsError, match="frame rate"):
+        Dataset(sequence, tuple(measured_frames(sequence, [0])), sequence.scene, "regular", frame_rate=rate)
+
+
+def test_only_frames_with_a_row_are_corrected(sequence: Sequence) -> None:
+    positions = {arm.name: np.full(len(arm.robot.joint_names), 0.1) for arm in sequence.scene.arms}
+    rows = [KinematicsRow(sequence.frame_ids[1], "optimized", positions)]
+    (frame,) = corrected_frames(sequence, range(3), rows)
+    assert (frame.index, frame.frame_id, frame.source) == (1, sequence.frame_ids[1], "optimized")
+    assert corrected_frames(sequence, [0, 2], rows) == []
+
+
+def test_rows_of_unknown_or_repeated_frames_are_refused(sequence: Sequence) -> None:
+    row = KinematicsRow(sequence.frame_ids[0], "optimized", {})
+    with pytest.raises(SequenceError, match="twice"):
+        corrected_frames(sequence, range(3), [row, row])
+    with pytest.raises(SequenceError, match=r"'999', which .* does not have"):
+        corrected_frames(sequence, range(3), [replace(row, frame_id="999")])

@@ -1,0 +1,140 @@
+"""COCO, YOLO, Pascal VOC and PNG masks, each read back by the library that people read it with."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import supervision
+from awkward import ARMS, CAMERA, SOURCES, Masks, all_views, assert_same_masks, expected_masks
+from PIL import Image
+from pycocotools.coco import COCO
+
+from carts_core.data.images import read_image
+from carts_core.export import Dataset, export
+
+
+def _read_coco(folder: Path) -> tuple[Any, Masks]:
+    coco: Any = COCO(str(folder / "annotations" / "instances_default.json"))
+    masks: Masks = {}
+    for annotation in coco.anns.values():
+        name = Path(coco.imgs[annotation["image_id"]]["file_name"]).stem
+        masks[name, coco.cats[annotation["category_id"]]["name"]] = coco.annToMask(annotation).astype(bool)
+    return coco, masks
+
+
+@pytest.mark.parametrize("parts", ["arms", "links"])
+def test_coco_comes_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path, parts) -> None:
+    dataset = replace(dataset, parts=parts)
+    coco, masks = _read_coco(export(dataset, "coco", tmp_path / "out"))
+    expected = expected_masks(dataset)
+    assert_same_masks(masks, expected)
+    assert [category["name"] for category in coco.cats.values()] == [category.name for category in dataset.categories]
+    assert [image["source"] for image in coco.imgs.values()] == list(SOURCES)
+    for annotation in coco.anns.values():
+        left, top, width, height = annotation["bbox"]
+        mask = coco.annToMask(annotation)
+        assert annotation["area"] == mask.sum() == mask[top : top + height, left : left + width].sum()
+        assert (
+            mask[top].any() and mask[:, left].any() and mask[top + height - 1].any() and mask[:, left + width - 1].any()
+        )
+
+
+def test_images_lie_beside_their_labels_and_can_be_left_out(dataset: Dataset, tmp_path: Path) -> None:
+    folder = export(dataset, "coco", tmp_path / "with")
+    for view in all_views(dataset):
+        np.testing.assert_array_equal(read_image(folder / "images" / f"{view.name}.png"), dataset.image(view))
+    assert not (export(replace(dataset, images=False), "coco", tmp_path / "without") / "images").exists()
+
+
+def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
+    summary = json.loads((export(dataset, "coco", tmp_path / "out") / "export.json").read_text(encoding="utf-8"))
+    assert (summary["format"], summary["sequence"], summary["domain"]) == ("coco", "tiny", "regular")
+    assert summary["views"][2] == {
+        "name": dataset.steps[2][0],
+        "frame": "Bild 3/ä",
+        "index": 2,
+        "camera": CAMERA,
+        "source": SOURCES[2],
+    }
+
+
+def _read_supervision(read: supervision.DetectionDataset) -> Masks:
+    """Masks of a category in an image are joined: YOLO has an object per part."""
+    masks: Masks = {}
+    for path, _, detections in read:
+        if len(detections):
+            assert detections.mask is not None and detections.class_id is not None
+            for mask, category in zip(np.asarray(detections.mask), detections.class_id, strict=True):
+                key = Path(path).stem, read.classes[category]
+                masks[key] = masks.get(key, np.zeros_like(mask, dtype=bool)) | mask.astype(bool)
+    return masks
+
+
+def _assert_within_a_pixel(found: Masks, expected: Masks) -> None:
+    assert found.keys() == expected.keys()
+    for key, mask in expected.items():
+        grown, shrunk = (
+            change(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) for change in (cv2.dilate, cv2.erode)
+        )
+        assert not (found[key] & ~grown).any() and not (shrunk & ~found[key]).any(), key
+        assert (found[key] != mask).mean() < 1e-3, key
+
+
+def test_yolo_comes_back_within_a_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    folder = export(dataset, "yolo", tmp_path / "out")
+    read = supervision.DetectionDataset.from_yolo(
+        str(folder / "images"), str(folder / "labels"), str(folder / "data.yaml"), force_masks=True
+    )
+    assert read.classes == list(ARMS) and len(read) == 3
+    _assert_within_a_pixel(_read_supervision(read), expected_masks(dataset))
+
+
+def test_yolo_is_the_same_for_readers_that_cut_fractions_off(dataset: Dataset, tmp_path: Path) -> None:
+    """As Ultralytics does, which is not among the tests' packages."""
+    folder = export(dataset, "yolo", tmp_path / "out")
+    masks: Masks = {}
+    for view in all_views(dataset):
+        for line in (folder / "labels" / f"{view.name}.txt").read_text().splitlines():
+            category, *values = line.split()
+            size = (view.camera.width, view.camera.height)
+            points = (np.array(values, np.float32).reshape(-1, 2) * size).astype(np.int32)
+            mask = masks.setdefault((view.name, ARMS[int(category)]), np.zeros(size[::-1], bool))
+            mask |= cv2.fillPoly(np.zeros(size[::-1], np.uint8), [points], 1).astype(bool)
+    _assert_within_a_pixel(masks, expected_masks(dataset))
+
+
+def test_voc_polygons_come_back_within_a_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    folder = export(dataset, "voc", tmp_path / "out")
+    read = supervision.DetectionDataset.from_pascal_voc(str(folder / "JPEGImages"), str(folder / "Annotations"))
+    assert len(read) == 3
+    _assert_within_a_pixel(_read_supervision(read), expected_masks(dataset))
+
+
+def test_voc_label_images_come_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    folder = export(dataset, "voc", tmp_path / "out")
+    names = (folder / "ImageSets" / "Segmentation" / "trainval.txt").read_text(encoding="utf-8").split()
+    assert names == [view.name for view in all_views(dataset)]
+    for view in all_views(dataset):
+        image = Image.open(folder / "SegmentationClass" / f"{view.name}.png")
+        assert image.mode == "P" and (image.getpalette() or [])[:9] == [0, 0, 0, 128, 0, 0, 0, 128, 0]
+        np.testing.assert_array_equal(np.array(image), dataset.label_image(view))
+        objects = np.array(Image.open(folder / "SegmentationObject" / f"{view.name}.png"))
+        np.testing.assert_array_equal(objects > 0, view.link_ids >= 0)
+        assert objects.max() == len(list(dataset.instances(view)))
+
+
+def test_png_masks_come_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    folder = export(dataset, "masks", tmp_path / "out")
+    meaning = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    assert list(meaning["arms"].values()) == ["background", *ARMS]
+    for view in all_views(dataset):
+        read = {kind: np.array(Image.open(folder / kind / f"{view.name}.png")) for kind in ("binary", "arms", "links")}
+        np.testing.assert_array_equal(read["binary"], np.where(view.link_ids >= 0, 255, 0))
+        np.testing.assert_array_equal(read["links"].astype(int), view.link_ids + 1)
+        for value, name in meaning["links"].items():
+            arm = next((number for number, arm in enumerate(ARMS, 1) if name.startswith(arm)), 0)
+            assert set(np.unique(read["arms"][read["links"] == int(value)])) <= {arm}
