@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from ..export import write_bytes
 from . import paper
@@ -100,6 +101,8 @@ def _convergence(data: Measurements) -> Figure | None:
         _band(by_time, np.median(seconds, axis=0), dice, method)
     by_step.set(title="Dice by iteration", xlabel="iteration", ylabel="Dice")
     by_time.set(title="Dice by time", xlabel="seconds (log)", ylabel="Dice", xscale="log")
+    by_time.xaxis.set_major_formatter("{x:g}")
+    by_time.xaxis.set_minor_formatter(NullFormatter())
     loss.set(title="loss by iteration", xlabel="iteration", ylabel="share of the loss's fall still to come")
     _finish(figure.axes)
     return figure

@@ -61,7 +61,7 @@ class Scope:
 
 
 QUICK = Scope(
-    frames=2,
+    frames=3,
     sequence_frames=3,
     samples=4,
     paper_iterations=50,
