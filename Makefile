@@ -38,6 +38,7 @@ bench: setup-dev ## Run the slow tests and print the measurements
 	$(BIN)/python -m carts_core.bench
 	$(BIN)/python -m carts_core.data.bench
 	$(BIN)/python -m carts_viewer.bench
+	$(BIN)/carts bench --quick
 
 wheel: setup-dev ## Build the sdist and the wheel into dist/
 	$(BIN)/python -m hatchling build -t sdist -t wheel

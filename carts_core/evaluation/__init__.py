@@ -7,5 +7,15 @@ from .evaluate import start_positions as start_positions
 from .evaluate import to_json as to_json
 from .metrics import dice as dice
 from .metrics import joint_mae_deg as joint_mae_deg
+from .metrics import normalized_surface_distance as normalized_surface_distance
 
-__all__ = ["FrameScore", "dice", "evaluate", "joint_mae_deg", "mean_score", "start_positions", "to_json"]
+__all__ = [
+    "FrameScore",
+    "dice",
+    "evaluate",
+    "joint_mae_deg",
+    "mean_score",
+    "normalized_surface_distance",
+    "start_positions",
+    "to_json",
+]

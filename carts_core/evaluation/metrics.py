@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -12,6 +13,31 @@ def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
     """Dice score of two masks, 0 to 1; two empty masks agree."""
     total = int(a.sum()) + int(b.sum())
     return 1.0 if total == 0 else 2.0 * int((a & b).sum()) / total
+
+
+def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"], tolerance: float) -> float:
+    """Share of both masks' outlines that lies within `tolerance` [px] of the other's outline, 0 to 1 (NSD).
+
+    An outline is the mask's pixels that have a neighbour (left, right, above, below) outside the mask. The image's
+    border is no outline: there the mask is cut off, not ended. Two masks without outline agree if they are equal.
+    """
+    outlines = [_outline(mask) for mask in (a, b)]
+    total = sum(int(outline.sum()) for outline in outlines)
+    if total == 0:
+        return float(np.array_equal(a, b))
+    if not all(outline.any() for outline in outlines):
+        return 0.0
+    near = 0
+    for outline, other in (outlines, reversed(outlines)):
+        distance = cv2.distanceTransform((~other).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        near += int((distance[outline] <= tolerance + 1e-4).sum())
+    return near / total
+
+
+def _outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    # OpenCV erodes as if the mask went on beyond the image.
+    return mask & (cv2.erode(mask.astype(np.uint8), cross) == 0)
 
 
 def joint_mae_deg(

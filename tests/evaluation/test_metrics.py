@@ -1,10 +1,10 @@
-"""Dice and joint errors."""
+"""Dice, normalized surface distance and joint errors."""
 
 import numpy as np
 import pytest
 from tiny import tiny_scene
 
-from carts_core.evaluation import dice, joint_mae_deg
+from carts_core.evaluation import dice, joint_mae_deg, normalized_surface_distance
 from carts_core.perturbation import perturb
 from carts_core.robot import Robot
 
@@ -17,6 +17,56 @@ def test_dice_of_equal_disjoint_and_half_overlapping_masks() -> None:
     b[:] = False
     b[1:3] = True
     assert dice(a, b) == 0.5
+
+
+def _normalized_surface_distance_ref(a: np.ndarray, b: np.ndarray, tolerance: float) -> float:
+    """Every outline pixel against every other one."""
+
+    def outline(mask: np.ndarray) -> list[tuple[int, int]]:
+        height, width = mask.shape
+        return [
+            (row, column)
+            for row, column in np.argwhere(mask).tolist()
+            if any(
+                0 <= row + y < height and 0 <= column + x < width and not mask[row + y, column + x]
+                for y, x in ((0, 1), (1, 0), (0, -1), (-1, 0))
+            )
+        ]
+
+    outlines = outline(a), outline(b)
+    if not outlines[0] and not outlines[1]:
+        return float(np.array_equal(a, b))
+    near = sum(
+        any(np.hypot(row - y, column - x) <= tolerance for y, x in other)
+        for one, other in (outlines, outlines[::-1])
+        for row, column in one
+    )
+    return near / (len(outlines[0]) + len(outlines[1]))
+
+
+def test_the_normalized_surface_distance_is_that_of_its_slow_twin() -> None:
+    rng = np.random.default_rng(0)
+    for tolerance in (0.0, 1.0, 1.5, 3.0):
+        for share in (0.02, 0.3, 0.9):
+            a, b = rng.random((2, 17, 23)) < share
+            expected = _normalized_surface_distance_ref(a, b, tolerance)
+            assert normalized_surface_distance(a, b, tolerance) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_surface_distance_of_a_shifted_bar_counts_its_sides_and_not_where_the_image_cuts_it() -> None:
+    a, b = np.zeros((2, 20, 40), bool)
+    a[:, 10:20] = True
+    b[:, 13:23] = True
+    assert normalized_surface_distance(a, a, 0.0) == 1.0
+    assert normalized_surface_distance(a, b, 2.0) == 0.0
+    assert normalized_surface_distance(a, b, 3.0) == 1.0
+
+
+def test_the_surface_distance_of_empty_and_full_masks() -> None:
+    none, some, all_ = np.zeros((9, 9), bool), np.zeros((9, 9), bool), np.ones((9, 9), bool)
+    some[3:6, 3:6] = True
+    assert normalized_surface_distance(none, none, 2.0) == normalized_surface_distance(all_, all_, 2.0) == 1.0
+    assert normalized_surface_distance(none, some, 2.0) == normalized_surface_distance(none, all_, 2.0) == 0.0
 
 
 def test_the_joint_error_counts_measured_revolute_joints_in_degrees(shipped_psm: Robot) -> None:

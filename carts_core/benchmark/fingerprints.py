@@ -1,0 +1,49 @@
+"""What a measurement depends on, as a short text: a line of other settings, weights or code is not used again."""
+
+import hashlib
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+
+from ..features.extractor import FeatureExtractor
+from .frame import TOLERANCE
+from .methods import METHODS
+from .plan import Run, Scope
+
+_MEASURED = (
+    "*.py",
+    "data/**/*.py",
+    "evaluation/**/*.py",
+    "features/**/*.py",
+    "optimization/**/*.py",
+    "rendering/**/*.py",
+    "benchmark/frame.py",
+)
+_NOT_CODE = {"bench.py", "cli.py"}
+
+
+@cache
+def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
+    """SHA-256 over modules of the package; by default those that decide what a method returns, and how it is scored."""
+    package = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for pattern in patterns:
+        for path in sorted(package.glob(pattern)):
+            if path.name not in _NOT_CODE:
+                digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source: str) -> str:
+    """SHA-256 over everything that a run's result depends on, but the machine.
+
+    Args:
+        run: the run.
+        scope: with the number of steps in the paper's setting.
+        extractor: the network and its device.
+        source: fingerprint of the images and kinematics.
+    """
+    make = METHODS[run.method].settings
+    settings = asdict(make(scope.paper_iterations)) if make else {}
+    parts = (settings, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

@@ -1,0 +1,112 @@
+"""What a run measured, and its line in the results file."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from .plan import Run
+
+
+@dataclass(frozen=True)
+class Score:
+    """How good one estimate is."""
+
+    loss: float | None
+    """None for a method without one."""
+    dice: float
+    nsd: float
+    """Normalized surface distance within `frame.TOLERANCE`."""
+    joint_mae_deg: float | None
+    """Over measured revolute joints; None without true joint positions."""
+    visible_joint_mae_deg: float | None
+    """The same over those that the image determines; None where the optimizer does not report which."""
+    seconds: float
+    """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One run's result."""
+
+    run: Run
+    final: Score
+    """Of what the method returns."""
+    trace: tuple[Score, ...]
+    """Of every iterate, the start first; empty for a method without iterates."""
+    best: tuple[int, ...]
+    """For each iterate, the place of the one that the optimizer held for the best when it had come there. Losses of a
+    coarse and a fine stage need not compare, so only the optimizer knows."""
+    stopped: str
+    """Why the optimization ended."""
+    machine: str
+    """What it ran on, for people."""
+
+    @property
+    def start(self) -> Score | None:
+        """The score before anything is corrected; None where the method has no start."""
+        return self.trace[0] if self.trace else None
+
+    @property
+    def iterations(self) -> int:
+        """Number of steps."""
+        return max(len(self.trace) - 1, 0)
+
+    @property
+    def made_worse(self) -> bool:
+        """Whether Dice fell by more than 0.01."""
+        return self.start is not None and self.final.dice < self.start.dice - 0.01
+
+    def best_of(self, iterations: int) -> Score | None:
+        """What would have been returned after so many steps; None where the run was cut before them.
+
+        Its `seconds` are those of all these steps.
+        """
+        if not self.trace or (iterations > self.iterations and self.stopped == "iterations"):
+            return None
+        last = min(iterations, self.iterations)
+        return replace(self.trace[self.best[last]], seconds=self.trace[last].seconds)
+
+    def best_so_far(self) -> list[Score]:
+        """For each iterate, the score of the best until then."""
+        return [self.trace[place] for place in self.best]
+
+    def to_json(self) -> dict[str, Any]:
+        """The measurement without what identifies its settings; lists by column keep the line short."""
+        names = [field.name for field in fields(Score)]
+        return {
+            "run": asdict(self.run),
+            "final": _rounded(asdict(self.final)),
+            "trace": {name: [_round(getattr(score, name)) for score in self.trace] for name in names},
+            "best": self.best,
+            "stopped": self.stopped,
+            "machine": self.machine,
+        }
+
+    @staticmethod
+    def from_json(line: Mapping[str, Any]) -> "Measurement":
+        """The measurement that `to_json` wrote.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is not one.
+        """
+        names = [field.name for field in fields(Score)]
+        rows = list(zip(*(line["trace"][name] for name in names), strict=True))
+        best = tuple(line["best"])
+        if len(best) != len(rows) or not all(0 <= place <= index for index, place in enumerate(best)):
+            raise ValueError(f"best is {best}, but there are {len(rows)} iterates")
+        return Measurement(
+            run=Run(**line["run"]),
+            final=Score(**line["final"]),
+            trace=tuple(Score(**dict(zip(names, row, strict=True))) for row in rows),
+            best=best,
+            stopped=line["stopped"],
+            machine=line["machine"],
+        )
+
+
+def _round(value: float | None) -> float | None:
+    return None if value is None else round(value, 6)
+
+
+def _rounded(values: dict[str, float | None]) -> dict[str, float | None]:
+    return {name: _round(value) for name, value in values.items()}

@@ -1,0 +1,62 @@
+"""The report's page, to be filled in."""
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>CaRTS benchmark</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c1f23; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.7rem; margin-bottom: .3rem; }
+h2 { margin-top: 2.6rem; border-bottom: 1px solid #d8dce0; padding-bottom: .2rem; }
+h3 { margin: 1.6rem 0 .2rem; }
+p { max-width: 62rem; margin: .3rem 0 .7rem; color: #4a5058; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .28rem .6rem; border-bottom: 1px solid #e4e7ea; text-align: left; vertical-align: top; }
+thead th { border-bottom: 2px solid #aab2ba; font-weight: 600; }
+td { white-space: nowrap; }
+.targets td, .facts td { white-space: normal; }
+.targets td:nth-child(n+2):nth-child(-n+4) { white-space: nowrap; }
+.targets td:nth-child(5) { max-width: 15rem; }
+small { display: block; color: #737b84; font-size: .8em; }
+.met { color: #17713a; font-weight: 600; }
+.missed { color: #b02a1c; font-weight: 600; }
+.open { color: #737b84; }
+.warning { border-left: 4px solid #d9a300; background: #fff8e0; padding: .4rem .8rem; color: #5a4500; }
+nav a { margin-right: .8rem; }
+figure { margin: 1.4rem 0 2rem; }
+figure img { max-width: 100%; }
+figcaption { color: #4a5058; max-width: 62rem; }
+</style>
+</head>
+<body>
+<h1>CaRTS benchmark</h1>
+$facts
+<nav><a href="#targets">Targets</a> <a href="#figures">Figures</a> $contents
+<a href="#method">How it is measured</a></nav>
+<section id="targets"><h2>Targets</h2>
+<p>Of the default solver. Target, figure and verdict are computed from the runs of this report. Sequence mode, several
+eyes at once, calibration and occlusion are not part of it.</p>
+<div class="wide">$targets</div></section>
+<section id="figures"><h2>Figures</h2>$figures</section>
+$sections
+<section id="method"><h2>How it is measured</h2>
+<p>Every method gets the same image, the same mean background and the same wrong joint positions of a frame, and works
+on that frame alone, in one camera. Its mask is drawn by the renderer at the camera's size from the joint positions
+that it returns (the U-Net's is its own) and compared with the given mask.</p>
+<p><b>Dice</b>: overlap of the masks. <b>NSD</b>: share of both masks' outlines within $tolerance px of each other.
+<b>Joint MAE</b>: mean absolute error of the measured revolute joints of all arms.</p>
+<p><b>Paper's setting</b>: Adam with step size 1e-3, times 0.9 every 5 steps, the paper's form of the loss, no prior,
+with our renderer and network. It is not the original implementation, whose renderer has no silhouette gradient.
+<b>Best of n</b>: the iterate of the lowest loss among the first n steps, the start included.</p>
+<p><b>Synthetic frames</b> are path-traced and were made for this benchmark, with a seed that nothing was tuned on.
+<b>Real frames</b> are altered in memory: blood, smoke and low light by the code of the synthetic domains, over the
+depth of the arms as measured before a plane; another background by compositing with the given masks.</p>
+<p>Small grey numbers are the paper's, after the column where they stand there (R: its real recording, S: its synthetic
+one). They were taken on its own recordings, so they show trends and are no race: $source.</p>
+</section>
+</body>
+</html>
+"""

@@ -1,0 +1,121 @@
+"""Where the evaluated frames come from: a synthetic sequence that nothing was tuned on, and a real one if given."""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import UInt8
+
+from ..data import Frame, Sequence
+from ..data.background import spread
+from ..errors import SettingsError
+from ..mesh_cache import cache_dir
+from ..scene import Scene
+from ..synthesis.config import MotionConfig, RenderConfig, SynthesisConfig
+from ..synthesis.synthesize import Progress, synthesize
+from .backdrop import backdrop
+from .counterfactual import Counterfactual
+from .fingerprints import code_fingerprint
+from .plan import REAL, SYNTHETIC, Scope
+
+TEST_SEED = 730_511
+"""Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
+_MOTION_SECONDS = 6.0
+_ALTERING_CODE = ("benchmark/backdrop.py", "benchmark/counterfactual.py", "benchmark/real_surface.py")
+
+
+class Recording(Protocol):
+    """What `Sequence` and `Counterfactual` have in common."""
+
+    scene: Scene
+    measured_joints: dict[str, tuple[str, ...]]
+
+    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
+        """One frame in a domain."""
+        ...
+
+    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """The mean background in a domain."""
+        ...
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames to evaluate. Nothing is rendered before `open` is called."""
+
+    name: str
+    """`synthetic` or `real`."""
+    description: str
+    """For people: which frames these are."""
+    camera: str
+    """The camera that takes part."""
+    frames: list[int]
+    fingerprint: str
+    """Of images and kinematics."""
+    open: Callable[[Progress], Recording]
+
+
+def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
+    """A synthetic sequence; it is made when it is first opened, and kept in the cache.
+
+    Raises:
+        SettingsError: the seed is that of the shipped sequence.
+    """
+    if seed == SynthesisConfig().seed:
+        raise SettingsError(
+            f"--seed {seed} is the shipped sequence's, on which settings were chosen. Any other seed will do; "
+            f"the default is {TEST_SEED}."
+        )
+    frames = scope.sequence_frames
+    config = SynthesisConfig(
+        seed=seed,
+        name=f"fresh {seed}",
+        motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
+        render=RenderConfig(samples=scope.samples),
+    )
+    code = code_fingerprint(("synthesis/*.py",))
+    fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
+    folder = cache_dir() / "benchmark" / f"sequence_{seed}_{fingerprint[:8]}"
+
+    def open_(progress: Progress) -> Sequence:
+        file = folder / "sequence.toml"
+        if not file.is_file():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            synthesize(config, folder, progress)
+        return Sequence.open(file)
+
+    evaluated = spread(frames, scope.frames)
+    what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
+    counted = f"{len(evaluated)} of {frames} frames, {scope.samples} paths per pixel"
+    return Source(SYNTHETIC, f"{what}, {counted}", "left", evaluated, fingerprint, open_)
+
+
+def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
+    """The frames of a real sequence that have a mask, in its first camera.
+
+    Raises:
+        SequenceError: the sequence is not usable.
+        SettingsError: no frame has a mask.
+    """
+    sequence = Sequence.open(path)
+    camera = sequence.scene.cameras[0]
+    masked = [index for index in range(len(sequence)) if camera.name in (sequence.frame(index).masks or {})]
+    if not masked:
+        raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
+    frames = [masked[place] for place in spread(len(masked), scope.frames)]
+    code = code_fingerprint(("synthesis/*.py", *_ALTERING_CODE))
+    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
+    for index in frames:
+        frame = sequence.frame(index, cameras=[camera.name])
+        fingerprint.update(frame.images[camera.name].tobytes())
+        fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
+
+    def open_(progress: Progress) -> Counterfactual:
+        progress("backdrop of the real frames", 0, 1)
+        return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
+
+    description = f"{sequence.name}, camera {camera.name}, {len(frames)} of {len(masked)} frames with masks"
+    return Source(REAL, description, camera.name, frames, fingerprint.hexdigest()[:32], open_)

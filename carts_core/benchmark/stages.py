@@ -1,0 +1,65 @@
+"""Milliseconds of the stages of an iteration, measured on the shipped sequence."""
+
+import json
+from pathlib import Path
+
+import torch
+
+from ..bench import iteration_figures, milliseconds, render_figures
+from ..data import Sequence
+from ..export import write_bytes
+from ..features.extractor import FeatureExtractor
+from ..resources import sample_sequence
+from .fingerprints import code_fingerprint
+from .machine import machine
+
+_RUNS = 10
+
+
+def known_stages(path: Path, extractor: FeatureExtractor) -> dict[str, float]:
+    """Figures that this machine and this code have written to `path`; none if there are no such."""
+    try:
+        stored = json.loads(path.read_bytes())
+        return stored["ms"] if stored["of"] == _of(extractor) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
+    """Measure all stages, on the CPU, and write them to `path`, unless they are there."""
+    if known_stages(path, extractor):
+        return
+    sequence = Sequence.open(sample_sequence())
+    figures = {
+        **render_figures(sequence, _RUNS),
+        **network_figures(extractor),
+        **iteration_figures(sequence, _RUNS),
+    }
+    write_bytes(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1).encode())
+
+
+def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
+    """Times of the networks on a whole working image [ms]."""
+    width, height = extractor.working_size
+    image = torch.rand(1, 3, height, width, device=extractor.device)
+
+    def forward() -> None:
+        with torch.no_grad():
+            extractor.features(image)
+
+    def both() -> None:
+        extractor.features(image.requires_grad_()).sum().backward()
+
+    believed = torch.rand(1, 6, height, width, device=extractor.device)
+
+    return {
+        f"surface network forward, {width}x{height}": milliseconds(
+            lambda: extractor.surface(image.detach(), believed), _RUNS
+        ),
+        f"feature network forward, {width}x{height}": milliseconds(forward, _RUNS),
+        f"feature network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
+    }
+
+
+def _of(extractor: FeatureExtractor) -> list[str]:
+    return [machine(), extractor.sha256, code_fingerprint()]

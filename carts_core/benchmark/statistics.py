@@ -1,0 +1,65 @@
+"""Selecting measurements, and means and deviations over them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .measurement import Measurement, Score
+
+ANY = object()
+"""Matches every error at the start."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over frames."""
+
+    mean: float
+    deviation: float
+    count: int
+
+    @staticmethod
+    def of(values: Iterable[float | None]) -> "Spread | None":
+        """Over the values that are known; None where there are none."""
+        known = [value for value in values if value is not None]
+        return Spread(float(np.mean(known)), float(np.std(known)), len(known)) if known else None
+
+
+class Measurements:
+    """What is known, and a way to ask for a part of it."""
+
+    def __init__(self, measurements: Iterable[Measurement]) -> None:
+        self.all = list(measurements)
+
+    def of(
+        self,
+        *,
+        source: str | None = None,
+        domain: str | None = None,
+        method: str | None = None,
+        error_deg: object = ANY,
+    ) -> list[Measurement]:
+        """The measurements that match; what is not named matches everything, `error_deg=None` the measured start."""
+        return [
+            measurement
+            for measurement in self.all
+            if source in (None, measurement.run.source)
+            and domain in (None, measurement.run.domain)
+            and method in (None, measurement.run.method)
+            and (error_deg is ANY or measurement.run.error_deg == error_deg)
+        ]
+
+    def domains(self, source: str) -> list[str]:
+        """The domains that occur in a source, in the order in which they were measured."""
+        return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
+
+    def sources(self) -> list[str]:
+        """The sources that occur."""
+        return list(dict.fromkeys(measurement.run.source for measurement in self.all))
+
+
+def scores(measurements: Iterable[Measurement], iterations: int | None = None) -> list[Score]:
+    """What each method returned, or its best of the first so many steps."""
+    found = (entry.final if iterations is None else entry.best_of(iterations) for entry in measurements)
+    return [score for score in found if score is not None]

@@ -1,0 +1,79 @@
+"""`carts bench`: measure all methods on frames that nothing was tuned on, and write the report."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from ..errors import CartsError
+from .selection import Network
+
+_DEFAULT_FOLDER = Path("runs") / "bench"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure accuracy and speed of all methods, and write a report; run it again to go on after a stop."""
+
+    output: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
+    quick: bool = False
+    """Few frames and steps: some minutes instead of hours."""
+    real: Path | None = None
+    """Sequence file with real frames and masks, to be measured too."""
+    report_only: bool = False
+    """Measure nothing; write the report of what is there."""
+    frames: int | None = None
+    """Frames of each sequence to evaluate, if not as many as usual."""
+    seed: int | None = None
+    """Seed of the synthetic sequence, if not the usual one."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def run(self) -> None:
+        """Measure what is not known yet and write the report."""
+        from importlib.metadata import version
+
+        from ..benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
+        from ..benchmark.fingerprints import code_fingerprint
+        from ..benchmark.methods import METHODS
+        from ..benchmark.sources import real_source, synthetic_source
+        from ..benchmark.stages import known_stages, measure_stages
+        from ..features.extractor import FeatureExtractor
+
+        console = Console()
+        scope = QUICK if self.quick else FULL
+        if self.frames is not None:
+            scope = scope.with_frames(self.frames)
+        name = "quick" if self.quick else "full"
+        folder = self.output or _DEFAULT_FOLDER / name
+        seed = TEST_SEED if self.seed is None else self.seed
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        sources = [synthetic_source(scope, seed)]
+        if self.real is not None:
+            sources.append(real_source(self.real, scope, seed))
+        runs = plan(scope, {source.name: source.frames for source in sources}, tuple(METHODS))
+        results = ResultsFile(folder / "measurements.jsonl")
+        benchmark = Benchmark(scope, sources, extractor, results, runs)
+        if results.unreadable:
+            console.print(f"{results.path}: {results.unreadable} torn lines are left out and measured again")
+        stages = folder / "stages.json"
+        if not self.report_only:
+            benchmark.run(console)
+            measure_stages(stages, extractor)
+        measurements = benchmark.measurements()
+        if not measurements:
+            raise CartsError(
+                f"{results.path} holds no measurement of these settings, weights and code. Run without --report-only."
+            )
+        facts = Facts(
+            scope=name,
+            planned=len(runs),
+            sources={source.name: source.description for source in sources},
+            weights=extractor.sha256,
+            code=code_fingerprint(),
+            version=version("carts"),
+        )
+        page = write_report(folder, measurements, facts, known_stages(stages, extractor))
+        console.print(f"wrote {page} ({len(measurements)} of {len(runs)} runs)")

@@ -1,0 +1,51 @@
+"""A benchmark over a tiny sequence with few steps."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from carts_core.benchmark import Benchmark, ResultsFile, Scope, Source, methods, plan
+from carts_core.data import Sequence
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import OptimizerSettings
+from carts_core.synthesis import DOMAINS
+
+TINY = Scope(
+    frames=1,
+    sequence_frames=1,
+    samples=1,
+    paper_iterations=2,
+    error_domains=("regular",),
+    errors_deg=(2.0,),
+    paper_errors_deg=(2.0,),
+    real_errors_deg=(),
+)
+
+
+@pytest.fixture
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two steps for every iterative method."""
+    for name, method in list(methods.METHODS.items()):
+        if method.settings is not None:
+            make = method.settings
+
+            def short(steps: int, make: Callable[[int], OptimizerSettings] = make) -> OptimizerSettings:
+                return replace(make(steps), iterations=2)
+
+            monkeypatch.setitem(methods.METHODS, name, replace(method, settings=short))
+
+
+@pytest.fixture
+def tiny_benchmark(tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps: None) -> Callable[..., Benchmark]:
+    """Factory of the same benchmark over one frame of a tiny sequence in all domains, on the same results file."""
+    path = tiny_sequence(frames=1, domains=DOMAINS, width=160, height=128)
+
+    def make(fingerprint: str = "tiny") -> Benchmark:
+        source = Source("synthetic", "tiny", "left", [0], fingerprint, lambda progress: Sequence.open(path))
+        runs = plan(TINY, {"synthetic": [0]}, tuple(methods.METHODS))
+        results = ResultsFile(tmp_path / "bench" / "measurements.jsonl")
+        return Benchmark(TINY, [source], FeatureExtractor.load(), results, runs)
+
+    return make

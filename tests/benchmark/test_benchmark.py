@@ -1,0 +1,150 @@
+"""A whole small benchmark: runs, stops, goes on, and reports."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from carts_core.benchmark import Benchmark, Facts, Measurement, runner, write_report
+from carts_core.benchmark.runner import _Bench
+from carts_core.cli import BAD_INPUT, main
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture
+def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
+    """Fills with what is really measured."""
+    measured: list[Measurement] = []
+    measure = _Bench.measure
+
+    def counting(self: _Bench, *arguments) -> Measurement:
+        measured.append(measure(self, *arguments))
+        return measured[-1]
+
+    monkeypatch.setattr(runner._Bench, "measure", counting)
+    return measured
+
+
+def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothing(
+    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], tmp_path: Path
+) -> None:
+    benchmark = tiny_benchmark()
+    benchmark.run(QUIET)
+    measurements = benchmark.measurements()
+    assert len(measurements) == len(benchmark.runs) == len(count_runs) == 32
+    by_method = {measurement.run.method: measurement for measurement in measurements}
+    assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
+    assert 1 <= by_method["ours"].iterations <= 2
+    for measurement in measurements:
+        assert 0.0 <= measurement.final.nsd <= 1.0 and 0.3 < measurement.final.dice <= 1.0
+        assert measurement.final.seconds > 0
+        if measurement.run.error_deg and measurement.start:
+            assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
+    tiny_benchmark().run(QUIET)
+    assert len(count_runs) == 32
+    facts = Facts("quick", 32, {"synthetic": "tiny"}, "w", "c", "0")
+    assert "32 of 32" in write_report(tmp_path / "bench", measurements, facts, {}).read_text()
+
+
+def test_a_stopped_benchmark_goes_on_where_it_was(
+    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = _Bench.measure
+
+    def stop_at_five(self: _Bench, *arguments) -> Measurement:
+        if len(count_runs) == 5:
+            raise KeyboardInterrupt
+        return measure(self, *arguments)
+
+    monkeypatch.setattr(runner._Bench, "measure", stop_at_five)
+    with pytest.raises(KeyboardInterrupt):
+        tiny_benchmark().run(QUIET)
+    kept = tiny_benchmark().measurements()
+    assert [entry.run for entry in kept] == [entry.run for entry in count_runs] and len(kept) == 5
+    monkeypatch.setattr(runner._Bench, "measure", measure)
+    resumed = tiny_benchmark()
+    resumed.run(QUIET)
+    assert len(count_runs) == 32 and resumed.measurements()[:5] == kept
+
+
+def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[..., Benchmark]) -> None:
+    first = tiny_benchmark()
+    run = next(iter(first.runs))
+    first.results.append(_one(first), first.runs[run])
+    assert len(tiny_benchmark().measurements()) == 1
+    assert tiny_benchmark("other images").measurements() == []
+
+
+def _one(benchmark: Benchmark) -> Measurement:
+    run = next(iter(benchmark.runs))
+    bench = _Bench(benchmark.sources[run.source], runner.Progress(console=QUIET))
+    return bench.measure(run, benchmark.scope, benchmark.extractor)
+
+
+def test_measurements_of_other_settings_weights_or_code_are_not_used(
+    tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reference = tiny_benchmark().runs
+    assert tiny_benchmark().runs == reference
+    other = tiny_benchmark()
+    other.extractor.sha256 = "0" * 64
+    changed = Benchmark(other.scope, other.sources.values(), other.extractor, other.results, other.runs)
+    assert not set(changed.runs.values()) & set(reference.values())
+    monkeypatch.setattr("carts_core.benchmark.fingerprints.code_fingerprint", lambda: "edited")
+    assert not set(tiny_benchmark().runs.values()) & set(reference.values())
+
+
+def test_a_killed_benchmark_leaves_lines_that_are_all_valid(tmp_path: Path, tiny_sequence) -> None:
+    path = tiny_sequence(frames=1, domains=("regular",), width=160, height=128)
+    script = tmp_path / "bench.py"
+    script.write_text(
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from rich.console import Console\n"
+        "from carts_core.benchmark import Benchmark, QUICK, ResultsFile, Run, Source\n"
+        "from carts_core.data import Sequence\n"
+        "from carts_core.features import FeatureExtractor\n"
+        "source = Source('synthetic', 'tiny', 'left', [0], 'tiny', lambda progress: Sequence.open(sys.argv[1]))\n"
+        "runs = [Run('synthetic', 'regular', 0, 'start', float(error)) for error in range(int(sys.argv[3]))]\n"
+        "results = ResultsFile(Path(sys.argv[2]))\n"
+        "bench = Benchmark(QUICK, [source], FeatureExtractor.load(), results, runs)\n"
+        "print(len(bench.measurements()), results.unreadable)\n"
+        "bench.run(Console(quiet=True))\n"
+    )
+    lines = tmp_path / "lines.jsonl"
+    command = [sys.executable, str(script), str(path), str(lines)]
+    running = subprocess.Popen([*command, "5000"], stdout=subprocess.DEVNULL, env=os.environ)
+    try:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and not (lines.exists() and lines.read_bytes().count(b"\n") >= 3):
+            assert running.poll() is None
+            time.sleep(0.02)
+    finally:
+        running.send_signal(signal.SIGKILL)
+        running.wait()
+    known = lines.read_bytes().count(b"\n")
+    assert known >= 3
+    again = subprocess.run([*command, str(known + 1)], capture_output=True, text=True, check=True, timeout=120)
+    found, torn = map(int, again.stdout.split())
+    assert found >= known and torn <= 1
+    assert len(lines.read_bytes().splitlines()) >= known + 1
+
+
+def test_a_report_of_nothing_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", str(tmp_path), "--quick", "--report-only"])
+    assert stop.value.code == BAD_INPUT
+    assert "holds no measurement" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_the_shipped_sequences_seed_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "--quick", "--seed", "7", "--report-only"])
+    assert stop.value.code == BAD_INPUT and "--seed 7 is the shipped sequence's" in capsys.readouterr().err

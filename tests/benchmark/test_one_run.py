@@ -1,0 +1,49 @@
+"""What is read off one run."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from handmade import make_measurement
+
+from carts_core.benchmark import Measurement, Run, Score
+
+
+def test_a_measurement_survives_its_json_line() -> None:
+    measurement = make_measurement((0.5, 0.7), error_deg=2.0)
+    assert Measurement.from_json(json.loads(json.dumps(measurement.to_json()))) == measurement
+
+
+def test_a_measurement_without_iterates_survives_too_and_has_no_start() -> None:
+    score = Score(None, 0.9, 0.8, None, None, 0.1)
+    measurement = Measurement(Run("real", "smoke", 3, "unet"), score, (), (), "not iterative", "a machine")
+    again = Measurement.from_json(json.loads(json.dumps(measurement.to_json())))
+    assert again == measurement
+    assert again.start is None and again.best_of(30) is None and not again.made_worse and again.iterations == 0
+
+
+def test_the_best_of_some_steps_has_the_time_of_all_of_them() -> None:
+    measurement = make_measurement((0.5, 0.9, 0.6, 0.95))
+    best = measurement.best_of(2)
+    assert best is not None and best.dice == 0.9 and best.seconds == 3.0
+    assert [score.dice for score in measurement.best_so_far()] == [0.5, 0.9, 0.9, 0.95]
+
+
+def test_what_the_optimizer_held_for_best_counts_although_an_earlier_loss_was_lower() -> None:
+    coarse, fine = make_measurement((0.9, 0.5)), (0, 1)
+    measurement = replace(coarse, best=fine)
+    best = measurement.best_of(1)
+    assert best is not None and best.dice == 0.5
+    with pytest.raises(ValueError, match="2 iterates"):
+        Measurement.from_json({**measurement.to_json(), "best": [0]})
+
+
+def test_a_run_that_was_cut_says_nothing_of_more_steps_but_one_that_converged_does() -> None:
+    assert make_measurement((0.5, 0.9), stopped="iterations").best_of(2) is None
+    converged = make_measurement((0.5, 0.9), stopped="converged").best_of(100)
+    assert converged is not None and converged.dice == 0.9
+
+
+@pytest.mark.parametrize(("last", "worse"), [(0.48, True), (0.495, False), (0.6, False)])
+def test_a_frame_is_made_worse_when_dice_falls_by_more_than_a_hundredth(last: float, worse: bool) -> None:
+    assert make_measurement((0.5, last)).made_worse is worse

@@ -1,0 +1,73 @@
+"""Verdicts are computed from measurements, both ways."""
+
+from handmade import make_measurement
+
+from carts_core.benchmark import Target, targets
+from carts_core.benchmark.statistics import Measurements
+from carts_core.synthesis import DOMAINS
+
+
+def _target(start: str, *measurements) -> Target:
+    (found,) = [target for target in targets(Measurements(measurements)) if target.what.startswith(start)]
+    return found
+
+
+def test_nothing_measured_gives_no_verdict_anywhere() -> None:
+    assert all(target.met is None and target.reached == "not measured" for target in targets(Measurements([])))
+
+
+def test_the_speedup_compares_the_times_to_the_papers_dice() -> None:
+    paper = make_measurement((0.5, 0.6, 0.7, 0.8), method="paper", seconds=10.0)
+    fast = make_measurement((0.5, 0.9), seconds=2.0)
+    assert _target("times faster", paper, fast).reached == "10.0"
+    assert _target("times faster", paper, fast).met is True
+    slow = make_measurement((0.5, 0.9), seconds=6.0)
+    assert _target("times faster", paper, slow).met is False
+    never = make_measurement((0.5, 0.75), seconds=0.1)
+    assert _target("times faster", paper, never).reached == "0.0"
+
+
+def test_pairs_in_which_the_paper_gains_nothing_do_not_count_as_speedup() -> None:
+    paper = make_measurement((0.9, 0.905), method="paper", seconds=10.0)
+    assert _target("times faster", paper, make_measurement((0.9, 0.95))).met is None
+
+
+def test_the_worst_domain_decides_on_dice() -> None:
+    good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0) for domain in DOMAINS[1:]]
+    fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
+    bad = make_measurement((0.6, 0.97), domain="regular", error_deg=2.0)
+    assert _target("synthetic, 2° off: mean Dice", fine, *good).met is True
+    part = _target("synthetic, 2° off: mean Dice", fine)
+    assert part.met is None and part.reached == "0.981" and "domains measured: 1" in part.basis
+    missed = _target("synthetic, 2° off: mean Dice", bad)
+    assert missed.met is False
+    missed = _target("synthetic, 2° off: mean Dice", bad, *good)
+    assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
+
+
+def test_iterations_count_until_near_the_final_dice() -> None:
+    run = make_measurement((0.6, 0.8, 0.954, 0.957, 0.958), error_deg=2.0)
+    assert _target("iterations to within", run).reached == "2"
+
+
+def test_recovery_and_made_worse_are_shares_of_runs() -> None:
+    runs = [make_measurement((0.5, dice), frame=i, error_deg=5.0) for i, dice in enumerate((0.96, 0.97, 0.4, 0.99))]
+    recovered = _target("synthetic, 5° off", *runs)
+    assert recovered.reached == "75 %" and recovered.met is False
+    worse = _target("frames made worse", *runs)
+    assert worse.reached == "25.0 %" and worse.met is False
+
+
+def test_real_frames_are_compared_with_their_clean_form() -> None:
+    clean = make_measurement((0.87, 0.965), source="real")
+    near = make_measurement((0.87, 0.958), source="real", domain="smoke")
+    far = make_measurement((0.87, 0.9), source="real", domain="bleeding")
+    assert _target("real frames, each alone", clean).met is True
+    assert _target("real frames under", clean, near).met is True
+    lost = _target("real frames under", clean, near, far)
+    assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
+
+
+def test_visible_joints_have_no_verdict_as_long_as_nobody_says_which_they_are() -> None:
+    target = _target("synthetic, 1° off: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
+    assert target.met is None and "all measured joints: 0.50°" in target.basis
