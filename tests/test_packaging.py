@@ -125,7 +125,7 @@ frame = sequence.frame(0)
 FeatureExtractor.load()
 assert len(sequence) > 0 and frame.images
 modules = (carts_core.__file__, carts_viewer.__file__)
-for path in (*modules, sample_sequence(), shipped_robot(), shipped_weights(), static_dir()):
+for path in (*modules, sample_sequence(), shipped_robot(), *shipped_weights(), static_dir()):
     assert Path(path).exists(), path
     print("PATH", path)
 """

@@ -41,10 +41,10 @@ class Truth:
         nsd = normalized_surface_distance(mask, self.mask, TOLERANCE)
         return Score(None, dice(mask, self.mask), nsd, None, None, seconds)
 
-    def score(self, iterate: Iterate, renderer: Renderer, optimizer: FrameOptimizer, seconds: float) -> Score:
+    def score(self, iterate: Iterate, renderer: Renderer, seconds: float) -> Score:
         """The score of an iterate."""
         mask = renderer.segment(iterate.state.to("cpu"))[0] >= 0
-        estimate, visible = iterate.joint_positions(), visible_joints(optimizer)
+        estimate, visible = iterate.joint_positions(), visible_joints(iterate, self.measured_joints)
         return Score(
             loss=iterate.loss,
             dice=dice(mask, self.mask),
@@ -57,12 +57,24 @@ class Truth:
         )
 
 
-def visible_joints(optimizer: FrameOptimizer) -> Mapping[str, tuple[str, ...]] | None:
-    """Arm -> measured joints that the image determines; None as long as the optimizer does not say which.
+def visible_joints(
+    iterate: Iterate, measured_joints: Mapping[str, tuple[str, ...]]
+) -> Mapping[str, tuple[str, ...]] | None:
+    """Arm -> measured joints that the image determines; None for losses that do not say which.
 
     This is the one place that reads it: what is returned here appears as "visible joints" in the whole report.
     """
-    return None
+    known = iterate.uncertainty
+    if known is None:
+        return None
+    return {
+        arm: tuple(
+            joint
+            for joint in joints
+            if f"{arm}/{joint}" in known.names and known.verdict(f"{arm}/{joint}") == "determined"
+        )
+        for arm, joints in measured_joints.items()
+    }
 
 
 def start_of(
@@ -110,9 +122,9 @@ def optimize(
         if iterate is None:
             break
         best.append(len(trace) if optimizer.best is iterate else best[-1])
-        trace.append(truth.score(iterate, renderer, optimizer, seconds))
+        trace.append(truth.score(iterate, renderer, seconds))
     assert optimizer.best is not None and optimizer.stop_reason is not None
-    final = truth.score(optimizer.best, renderer, optimizer, seconds)
+    final = truth.score(optimizer.best, renderer, seconds)
     return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine())
 
 
