@@ -101,12 +101,7 @@ class UNet(nn.Module):
         Raises:
             SettingsError: another number of channels, or a size that is no multiple of `architecture.stride`.
         """
-        stride = self.architecture.stride
-        if x.ndim != 4 or x.shape[1] != self.inputs or x.shape[2] % stride or x.shape[3] % stride:
-            raise SettingsError(
-                f"the network got a tensor of shape {tuple(x.shape)}. Give [batch, {self.inputs}, height, width] "
-                f"with height and width multiples of {stride}; pad or crop the image."
-            )
+        self._check(x, self.inputs)
         skips: list[Tensor] = []
         for level, encode in enumerate(self.encoder):
             x = encode(functional.max_pool2d(x, 2) if level else x)
@@ -120,7 +115,16 @@ class UNet(nn.Module):
 
     def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
         """Images as the first convolution gets them; see `standardize`."""
+        self._check(images, 3)
         return standardize(images, self.architecture.stride if self.architecture.local_mean else None)
+
+    def _check(self, x: Tensor, channels: int) -> None:
+        stride = self.architecture.stride
+        if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
+            raise SettingsError(
+                f"the {self.kind} network got a tensor of shape {tuple(x.shape)}. Give [batch, {channels}, height, "
+                f"width] with height and width multiples of {stride}; pad or crop the image."
+            )
 
     def folded(self) -> Self:
         """A frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""

@@ -14,7 +14,8 @@ from carts_core.features import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
 from carts_core.rendering import Renderer
 
-SHORT = OptimizerSettings(iterations=6)
+SURFACE = OptimizerSettings(iterations=8)
+SHORT = OptimizerSettings.acs(iterations=6)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,7 @@ def test_the_first_iterate_is_the_start_and_the_last_one_says_why_it_stopped(
 
 
 def test_loss_falls_and_dice_rises(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings(iterations=20))
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings.acs(iterations=20))
     first, *_ = list(optimizer)
     assert optimizer.best is not None
     assert optimizer.best.loss < first.loss
@@ -99,7 +100,31 @@ def test_no_optimization_evaluates_the_start_only(sequence: Sequence, extractor:
     assert optimizer.stop_reason == "not optimized"
 
 
-@pytest.mark.parametrize("loss", ["acs", "acs_paper", "acs_reference", "l1"])
+def test_gauss_newton_needs_few_steps_and_stops_by_itself(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings())
+    first, *_ = list(optimizer)
+    assert optimizer.best is not None and optimizer.stop_reason == "converged"
+    assert optimizer.best.loss < first.loss and len(optimizer.history) < 40
+
+
+def test_gauss_newton_refuses_a_loss_without_residuals() -> None:
+    with pytest.raises(SettingsError, match="solver is 'gauss_newton'; allowed is adam or gradient_descent for"):
+        OptimizerSettings(loss="acs")
+
+
+def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    frame = sequence.frame(0, cameras=["left"])
+    mask = (frame.masks or {})["left"]
+    everything = {"left": np.ones_like(mask)}
+    blind = optimizer_of(sequence, extractor, frame=frame, cameras=["left"], ignore=everything, settings=SURFACE)
+    iterates = list(blind)
+    assert iterates[0].attention.max() == 0.0
+    assert np.allclose(iterates[-1].joint_positions()["PSM1"], frame.measured["PSM1"], atol=1e-5)
+    with pytest.raises(SettingsError, match=r"ignore mask of camera 'left' has shape \(3, 3\)"):
+        optimizer_of(sequence, extractor, cameras=["left"], ignore={"left": np.ones((3, 3), bool)}, settings=SURFACE)
+
+
+@pytest.mark.parametrize("loss", ["surface", "acs", "acs_paper", "acs_reference", "l1"])
 @pytest.mark.parametrize("solver", ["adam", "gradient_descent"])
 def test_every_loss_and_solver_lowers_its_loss(
     sequence: Sequence, extractor: FeatureExtractor, loss: str, solver: str
@@ -119,7 +144,7 @@ def test_only_what_is_free_moves(sequence: Sequence, extractor: FeatureExtractor
 
 
 def test_a_tolerance_stops_early(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    settings = OptimizerSettings(iterations=200, tolerance=0.9, patience=3)
+    settings = replace(OptimizerSettings.acs(iterations=200), tolerance=0.9, patience=3)
     optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
     assert len(list(optimizer)) == 4
     assert optimizer.stop_reason == "converged"

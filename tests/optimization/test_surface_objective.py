@@ -1,0 +1,110 @@
+"""The surface objective and Gauss-Newton, with a network that sees exactly what is there."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from carts_core.data import Sequence
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.optimization.parameters import ParameterVector
+from carts_core.optimization.surface_objective import SurfaceObjective
+from carts_core.optimization.window import Window
+from carts_core.rendering import Renderer
+from carts_core.scene import SceneState
+
+
+class PerfectSight:
+    """Stands in for the networks: sees the surface map of the truth, whatever it is shown."""
+
+    device = torch.device("cpu")
+    stride = 16
+
+    def __init__(self, sequence: Sequence, truth: SceneState) -> None:
+        fine = Renderer(sequence.scene, width=640, height=480).surface(truth).maps
+        self.maps = functional.avg_pool2d(fine, 2)
+
+    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+        """The truth, cut to the window that `believed` lies in."""
+        state = Window(0, 0, self.maps.shape[3], self.maps.shape[2])
+        left, top = self.where
+        window = Window(left, top, images.shape[3], images.shape[2])
+        assert state.holds(window)
+        return window.of(self.maps)
+
+    where = (0, 0)
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
+
+
+@pytest.fixture
+def sight(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> FeatureExtractor:
+    seen = PerfectSight(sequence, sequence.scene.state(sequence.frame(0).truth or {}))
+    around = Window.around
+
+    def remembered(*arguments) -> Window:
+        window = around(*arguments)
+        seen.where = (window.left, window.top)
+        return window
+
+    monkeypatch.setattr(Window, "around", staticmethod(remembered))
+    return seen  # pyright: ignore[reportReturnType]
+
+
+def test_gauss_newton_finds_the_truth_that_the_network_sees(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    truth = (frame.truth or {})["PSM1"]
+    start = {"PSM1": truth + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0]) + [0, 0, 0.0015, 0, 0, 0, 0]}
+    settings = OptimizerSettings(prior_deg=10.0)
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=start, settings=settings)
+    list(optimizer)
+    assert optimizer.best is not None
+    found = optimizer.best.joint_positions()["PSM1"]
+    # Yaw, pitch and insertion move the whole arm in the image.
+    assert np.abs(found - truth)[:2].max() < np.deg2rad(0.2)
+    assert abs(found - truth)[2] < 0.0006
+
+
+def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    scene, state = sequence.scene, sequence.scene.state(frame.measured)
+    parameters = ParameterVector(scene, state, FreeParameters(), 0.15)
+    # A far robust scale makes the objective a plain sum of squares, which Gauss-Newton's gradient is exact for.
+    settings = OptimizerSettings(robust=100.0, blurs=(2.0,), looks=1)
+    objective = SurfaceObjective(scene, frame.images, sight, parameters, settings)
+    at = torch.zeros(len(parameters))
+    gradient = objective(at, 0, gradient=True).gradient
+    step = 0.005
+    for index in (0, 1, 2):
+        ahead, behind = at.clone(), at.clone()
+        ahead[index] += step
+        behind[index] -= step
+        values = [objective(offsets, 0, gradient=False).value for offsets in (ahead, behind)]
+        assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.35)
+
+
+def test_what_is_not_in_the_image_stays_and_is_said_to_be_unknown(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    truth = (frame.truth or {})["PSM1"]
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, settings=OptimizerSettings())
+    list(optimizer)
+    best = optimizer.best
+    assert best is not None and best.uncertainty is not None
+    assert best.uncertainty.verdict("PSM1/yaw") == "determined"
+    std = best.joint_std()["PSM1"]
+    assert std.shape == truth.shape and (std > 0).all()
+    assert std[2] < 0.15 * np.deg2rad(3.0), "an insertion is in metres"
+
+    away = {"PSM1": truth + np.deg2rad([60.0, 0, 0, 0, 0, 0, 0])}
+    blind = FrameOptimizer(sequence.scene, frame, {}, sight, start=away, settings=OptimizerSettings())
+    list(blind)
+    assert blind.best is not None and blind.best.uncertainty is not None
+    assert blind.best.uncertainty.verdict("PSM1/wrist_yaw") == "not visible"
+    assert np.allclose(blind.best.joint_positions()["PSM1"], away["PSM1"], atol=1e-4)
