@@ -348,7 +348,7 @@ class Controller:
             self._editor.drop()
             self._before_run, self._loss = None, None
             self.change(run=RunState(), keypoints=replace(state.keypoints, pins=(), residuals=()))
-        self.change(index=index, domain=domain, camera=camera, frame=frame, error=None)
+        self.change(index=index, domain=domain, camera=camera, frame=frame, scores=None, maps=None, error=None)
         self.refresh()
 
     # ---- Editing ---------------------------------------------------------------------------------------------------
@@ -421,9 +421,11 @@ class Controller:
         self.change(project=self._editor.view, unsaved=self._editor.unsaved)
 
     def refresh(self, maps: Maps | None = None) -> None:
-        """Bring the state up to date with the project."""
+        """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
         pose = self.session.pose(self.state.frame)
-        self.change(pose=pose, scores=None, maps=maps, project=self._editor.view, unsaved=self._editor.unsaved)
+        if not pose.equals(self.state.pose):
+            self.change(pose=pose, scores=None, maps=None)
+        self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
 
     def forget_pins(self) -> None:
         """Drop what was said about where keypoints are."""

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import torch
+
 from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
 from carts_core.optimization.keypoints import Pin
@@ -26,6 +28,15 @@ class Pose:
     scene: SceneState
     """Joint positions, base frames, extrinsics and intrinsics of the whole scene."""
     source: Source
+
+    def equals(self, other: "Pose") -> bool:
+        """Whether everything is at the same place, and from the same source."""
+        pairs = zip(_tensors(self.scene), _tensors(other.scene), strict=True)
+        return self.source is other.source and all(torch.equal(own, others) for own, others in pairs)
+
+
+def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
+    return (*scene.joint_positions, scene.T_world_base, scene.T_camera_world, scene.intrinsics)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Joint positions from points that a person has found in the image, by damped least squares."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,7 +81,8 @@ def fit_keypoints(
     settings = settings or KeypointSettings()
     arms = tuple(dict.fromkeys(pin.keypoint.arm for pin in pins))
     parameters = ParameterVector(scene, start.map(torch.Tensor.double), FreeParameters(arms=arms), settings.lever)
-    weights = parameters.prior_precision(settings.prior_deg).double().sqrt()
+    # Only joints are free, and the unknowns are in radian-like units.
+    weights = torch.full((len(parameters),), 1.0 / math.radians(settings.prior_deg), dtype=torch.float64)
 
     def distances(offsets: Float[Tensor, " n"]) -> Float[Tensor, "pins 2"]:
         return _distances(scene, parameters.state(offsets), pins)

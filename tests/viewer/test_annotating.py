@@ -105,6 +105,9 @@ def test_accept_and_next_goes_on_until_all_frames_are_reviewed(desk: Desk) -> No
 
 
 def test_a_note_is_one_step_and_stays_when_the_state_changes(desk: Desk) -> None:
+    pose = desk.state.pose
+    # The picture does not change, so it need not be sent again.
+    assert desk.do(ask.SetNote("s")).pose is pose
     desk.do(ask.SetNote("sm"), ask.SetNote("smoke"), ask.SetReview(ReviewState.NEEDS_WORK))
     review = desk.saved.review(0)
     assert (review.state, review.note) == (ReviewState.NEEDS_WORK, "smoke") and len(desk.saved.steps) == 2
