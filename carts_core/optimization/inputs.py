@@ -13,6 +13,9 @@ from torch import Tensor
 from ..errors import SettingsError
 from ..scene import Scene
 
+_MOST_CHANNELS = 128
+"""OpenCV filters no more at once."""
+
 
 def stacked_images(
     scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
@@ -57,9 +60,12 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
     kernel = cv2.getGaussianKernel(_kernel_size(deviation), deviation, cv2.CV_32F)
-    planes = flat.permute(1, 2, 0).contiguous().numpy()
-    result = cv2.sepFilter2D(planes, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(result.reshape(planes.shape)).permute(2, 0, 1).reshape(images.shape)
+    results = []
+    for part in flat.split(_MOST_CHANNELS):
+        planes = part.permute(1, 2, 0).contiguous().numpy()
+        result = cv2.sepFilter2D(planes, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+        results.append(torch.from_numpy(result.reshape(planes.shape)).permute(2, 0, 1))
+    return torch.cat(results).reshape(images.shape)
 
 
 def _kernel_size(deviation: float) -> int:
