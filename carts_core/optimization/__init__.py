@@ -1,6 +1,7 @@
 """The ACS optimizer: unknowns, settings, solvers, and one steppable object."""
 
 from .calibration import CALIBRATION as CALIBRATION
+from .calibration import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
@@ -13,6 +14,7 @@ from .settings import OptimizerSettings as OptimizerSettings
 
 __all__ = [
     "CALIBRATION",
+    "CALIBRATION_SETTINGS",
     "CalibrationIterate",
     "CalibrationOptimizer",
     "CalibrationResult",

@@ -22,6 +22,10 @@ from .settings import FreeParameters, OptimizerSettings
 CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
 """What a calibration frees unless told otherwise."""
 
+CALIBRATION_SETTINGS = OptimizerSettings(normals_weight=0.0)
+"""How a calibration goes about it unless told otherwise. Normals are left out: where they are wrong by the same angle
+in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""
+
 
 @dataclass(frozen=True)
 class CalibrationIterate:
@@ -100,13 +104,13 @@ class CalibrationOptimizer:
         frames: Sequence[Frame],
         extractor: FeatureExtractor,
         *,
-        settings: OptimizerSettings | None = None,
+        settings: OptimizerSettings = CALIBRATION_SETTINGS,
         free: FreeParameters = CALIBRATION,
         joint_prior_deg: float = 0.5,
         ignore: Ignored | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        self.settings = settings or OptimizerSettings()
+        self.settings = settings
         if self.settings.solver != "gauss_newton":
             raise SettingsError(f"solver is {self.settings.solver!r}; a calibration needs gauss_newton.")
         if not frames:

@@ -62,7 +62,7 @@ class _Observation:
     """One frame, and where its own unknowns are."""
 
     def __init__(self, parameters: _FrameUnknowns, objective: SurfaceObjective) -> None:
-        self.parameters, self._objective = parameters, objective
+        self.parameters, self.objective = parameters, objective
         self.own = torch.zeros(parameters.own, device=parameters.lower.device)
         self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
 
@@ -78,7 +78,7 @@ class _Observation:
         self._anchor = (shared, self.own, model)
 
     def __call__(self, shared: Float[Tensor, " n"], stage: int, *, gradient: bool, own: Tensor) -> Evaluation:
-        return self._objective(torch.cat([own, shared]), stage, gradient=gradient)
+        return self.objective(torch.cat([own, shared]), stage, gradient=gradient)
 
 
 class CalibrationObjective:
@@ -110,14 +110,13 @@ class CalibrationObjective:
         calibration = replace(free, joints=False)
         starts = [scene.state(frame.measured, extractor.device) for frame in frames]
         self.parameters = ParameterVector(scene, starts[0], calibration, settings.lever)
-        self._observations = []
+        self._observations: list[_Observation] = []
         for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):
             unknowns = _FrameUnknowns(scene, start, free, settings.lever, len(self.parameters), joint_prior_deg)
             ignored = ignore[index] if ignore else None
             objective = SurfaceObjective(scene, frame.images, extractor, unknowns, settings, ignored)
             self._observations.append(_Observation(unknowns, objective))
-        self._first = objective
-        self.stages = objective.stages
+        self.stages = self._observations[0].objective.stages
         self._prior = self.parameters.prior_precision(settings.prior_deg)
         self._weights = torch.ones(len(frames), dtype=torch.float64)
         self._losses = torch.zeros(len(frames), dtype=torch.float64)
@@ -125,7 +124,7 @@ class CalibrationObjective:
 
     def epoch(self, stage: int) -> int:
         """Losses compare within an epoch only: which look at the images a stage belongs to."""
-        return self._first.epoch(stage)
+        return self._observations[0].objective.epoch(stage)
 
     def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> CalibrationEvaluation:
         """Evaluate at a calibration; free joints follow it."""
