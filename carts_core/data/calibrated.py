@@ -56,7 +56,8 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         if old.intrinsics != new.intrinsics:
             table["K"] = dict(zip(("fx", "fy", "cx", "cy"), new.intrinsics, strict=True))
             table["pixel_center"] = HALF_PIXEL
-    return tomlkit.dumps(document)
+    heading = "# A calibration that carts calibrate found is filled in. Other comments are those of the original file."
+    return f"{heading}\n{tomlkit.dumps(document)}"
 
 
 def _matrix(values: np.ndarray) -> Any:
