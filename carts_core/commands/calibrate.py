@@ -44,7 +44,7 @@ class Calibrate:
     """Cameras, by name; all take part at once."""
     domain: str | None = None
     """Domain, by name; the sequence's first one if none is named."""
-    joint_prior_deg: float = 0.5
+    joint_prior_deg: float = 0.1
     """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
     all that is written."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION

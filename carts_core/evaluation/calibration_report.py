@@ -74,7 +74,7 @@ def _unknowns_figure(result: CalibrationResult) -> Figure:
             capsize=3,
         )
         panel.axvline(0.0, color="black", linewidth=0.8)
-        panel.set_xlabel(f"change [{unit}], two deviations between frames")
+        panel.set_xlabel(f"change [{unit}]")
         panel.grid(alpha=0.3)
         panel.tick_params(labelsize=8)
     return figure
@@ -110,6 +110,8 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
         "it was.",
         "",
         "![unknowns](unknowns.png)",
+        "",
+        "Bars are two standard deviations between frames.",
         "",
         "| unknown | change | of the curvature | between frames | prior | unit |",
         "|---|---|---|---|---|---|",

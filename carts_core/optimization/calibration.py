@@ -106,7 +106,7 @@ class CalibrationOptimizer:
         *,
         settings: OptimizerSettings = CALIBRATION_SETTINGS,
         free: FreeParameters = CALIBRATION,
-        joint_prior_deg: float = 0.5,
+        joint_prior_deg: float = 0.1,
         ignore: Ignored | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
