@@ -22,7 +22,7 @@ from .settings import FreeParameters, OptimizerSettings
 CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
 """What a calibration frees unless told otherwise."""
 
-CALIBRATION_SETTINGS = OptimizerSettings(normals_weight=0.0)
+CALIBRATION_SETTINGS = OptimizerSettings(normals_weight=0.0, frame_prior_deg=3.0, intrinsics_prior=0.05)
 """How a calibration goes about it unless told otherwise. Normals are left out: where they are wrong by the same angle
 in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""
 
@@ -87,7 +87,7 @@ class CalibrationOptimizer:
         scene: arms and cameras.
         frames: observed images and measured joint positions.
         extractor: the networks.
-        settings: solver `gauss_newton` and loss `surface`; `prior_deg` is of the calibration.
+        settings: solver `gauss_newton` and loss `surface`; `frame_prior_deg` and `intrinsics_prior` are its own.
         free: what is unknown. Joints are so in every frame for itself.
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
@@ -241,7 +241,11 @@ def _changes(
     # The sandwich estimator with frames as clusters: pixels of one frame share their errors, frames do not.
     pulled = covariance @ evaluation.frame_gradients.T
     between = pulled.square().sum(1).sqrt()
-    alone, prior = covariance.diagonal().sqrt(), parameters.prior_precision(settings.prior_deg).cpu() ** -0.5
+    alone, prior = (
+        covariance.diagonal().sqrt(),
+        parameters.prior_precision(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
+        ** -0.5,
+    )
     changes = []
     for index, (name, unit, scale) in enumerate(parameters.units()):
         values = (offsets[index].cpu(), alone[index], between[index], prior[index])

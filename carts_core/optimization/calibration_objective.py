@@ -51,7 +51,9 @@ class _FrameUnknowns(ParameterVector):
         self.own = len(self) - shared
         self._joint_prior_deg = joint_prior_deg
 
-    def prior_precision(self, prior_deg: float) -> Float[Tensor, " n"]:
+    def prior_precision(
+        self, joints_deg: float, frames_deg: float = 0.5, intrinsics: float = 0.01
+    ) -> Float[Tensor, " n"]:
         """That of the joints; 0 for the calibration."""
         precision = torch.zeros_like(self.lower)
         precision[: self.own] = math.radians(self._joint_prior_deg) ** -2
@@ -117,7 +119,9 @@ class CalibrationObjective:
             objective = SurfaceObjective(scene, frame.images, extractor, unknowns, settings, ignored)
             self._observations.append(_Observation(unknowns, objective))
         self.stages = self._observations[0].objective.stages
-        self._prior = self.parameters.prior_precision(settings.prior_deg)
+        self._prior = self.parameters.prior_precision(
+            settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior
+        )
         self._weights = torch.ones(len(frames), dtype=torch.float64)
         self._losses = torch.zeros(len(frames), dtype=torch.float64)
         self._stage, self._lowest = -1, math.inf

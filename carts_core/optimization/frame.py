@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
-from .evaluation import Evaluation, Objective
+from .evaluation import Evaluation, Objective, Solver
 from .feature_objective import FeatureObjective
+from .gauss_newton import GaussNewton
+from .observability import Uncertainty
 from .parameters import ParameterVector
 from .settings import FreeParameters, OptimizerSettings
 from .solvers import make_solver
@@ -36,10 +38,14 @@ class Iterate:
     seconds: float
     """Duration of this iteration [s]."""
     arm_names: tuple[str, ...]
+    joint_names: tuple[tuple[str, ...], ...]
+    """Per arm."""
     silhouette: Float[np.ndarray, "cameras h w"]
     """At the working resolution."""
     image: UInt8[np.ndarray, "cameras h w 3"]
     """Rendered arms at the working resolution, RGB."""
+    uncertainty: Uncertainty | None
+    """What the images determine; None for losses that cannot say."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
     """Of what is compared: cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
@@ -48,6 +54,14 @@ class Iterate:
         """Arm name -> joint positions [dofs], [rad, m]."""
         values = (value.cpu().double().numpy() for value in self.state.joint_positions)
         return dict(zip(self.arm_names, values, strict=True))
+
+    def joint_std(self) -> dict[str, np.ndarray]:
+        """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN where it is not known."""
+        known = {} if self.uncertainty is None else dict(zip(self.uncertainty.names, self.uncertainty.std, strict=True))
+        return {
+            arm: np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
+            for arm, joints in zip(self.arm_names, self.joint_names, strict=True)
+        }
 
 
 @dataclass(frozen=True)
@@ -94,6 +108,7 @@ class FrameOptimizer:
         self.settings = settings or OptimizerSettings()
         scene = scene.with_cameras(cameras)
         self._arm_names = tuple(arm.name for arm in scene.arms)
+        self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         state = scene.state(frame.measured if start is None else start, extractor.device)
         self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
         self._objective: Objective
@@ -112,6 +127,7 @@ class FrameOptimizer:
         self.history: list[Progress] = []
         self.best: Iterate | None = None
         self._epoch = 0
+        self._retried = False
         self.stop_reason: str | None = None
 
     def cancel(self) -> None:
@@ -135,8 +151,22 @@ class FrameOptimizer:
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._epoch = iterate, epoch
+        self._offsets = self._restarted(epoch, solver)
         self.stop_reason = solver.finished
         return iterate
+
+    def _restarted(self, epoch: int, solver: Solver) -> torch.Tensor:
+        """The next offsets; better ones, once, where a first look that ended badly says that the start was bad."""
+        settings, objective = self.settings, self._objective
+        first_look_over = epoch == 0 and solver.finished is None and objective.epoch(solver.stage) > 0
+        if not (first_look_over and isinstance(solver, GaussNewton) and isinstance(objective, SurfaceObjective)):
+            return self._offsets
+        assert self.best is not None
+        if self._retried or self.best.loss < settings.bad_loss or settings.candidates == 0:
+            return self._offsets
+        self._retried = True
+        solver.restart()
+        return objective.better_start(self._offsets, settings.candidates)
 
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""
@@ -153,8 +183,10 @@ class FrameOptimizer:
             gradient_norms=dict(zip(self._parameters.names, evaluation.gradient.abs().tolist(), strict=True)),
             seconds=seconds,
             arm_names=self._arm_names,
+            joint_names=self._joint_names,
             silhouette=evaluation.silhouette.cpu().numpy().copy(),
             image=image.cpu().numpy().copy(),
+            uncertainty=evaluation.uncertainty,
             attention=evaluation.attention.cpu().numpy(),
             similarity=evaluation.similarity.cpu().numpy(),
         )

@@ -132,9 +132,39 @@ class ParameterVector:
                 read += 3 * [radian] + 3 * [length]
         return [(name, *unit) for name, unit in zip(self.names, read, strict=True)]
 
-    def prior_precision(self, prior_deg: float) -> Float[Tensor, " n"]:
-        """Inverse variance of each unknown at the start, where its expected error is `prior_deg` [1/rad^2]."""
-        return torch.full_like(self.lower, math.radians(prior_deg) ** -2)
+    @property
+    def groups(self) -> list[range]:
+        """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
+        return [range(block.start, block.start + block.size) for block in self._blocks]
+
+    @property
+    def scales(self) -> Float[Tensor, " n"]:
+        """What an offset of 1 is in units of its unknown: 1 for angles and intrinsics, `lever` metres for lengths."""
+        scales = torch.ones_like(self.lower)
+        for block in self._blocks:
+            part = scales[block.start : block.start + block.size]
+            if block.kind == "joints":
+                part.copy_(self._joint_scales[block.start])
+            elif block.kind != "intrinsics":
+                part[3:] = self._lever
+        return scales
+
+    def prior_precision(
+        self, joints_deg: float, frames_deg: float = 0.5, intrinsics: float = 0.01
+    ) -> Float[Tensor, " n"]:
+        """Inverse variance of each unknown [1/rad^2].
+
+        Args:
+            joints_deg: expected error of joint positions at the start [deg]; `lever` makes it metres.
+            frames_deg: the same of base frames and camera extrinsics [deg].
+            intrinsics: the same of focal lengths and principal points, as a share of the focal length [1].
+        """
+        expected = torch.full_like(self.lower, intrinsics)
+        for block in self._blocks:
+            if block.kind != "intrinsics":
+                degrees = joints_deg if block.kind == "joints" else frames_deg
+                expected[block.start : block.start + block.size] = math.radians(degrees)
+        return expected**-2
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""

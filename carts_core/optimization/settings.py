@@ -1,6 +1,6 @@
 """What an optimization may change, and how it goes about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
 
@@ -41,20 +41,30 @@ class OptimizerSettings:
     """Which loss; see `carts_core.losses.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
-    blurs: tuple[float, ...] = (6.0, 3.0, 1.5, 0.8)
+    blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 2
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
-    noise: float = 0.25
+    candidates: int = 64
+    """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
+    bad_loss: float = 0.09
+    """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
+    noise: float = 0.7
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
-    normals_weight: float = 0.5
-    """`surface`: weight of normals beside coverage [1]."""
+    parts_weight: float = 0.1
+    """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
+    normals_weight: float = 0.05
+    """`surface`: weight of normals beside that [1]."""
     prior_deg: float = 3.0
-    """`surface`: expected error of an unknown at the start [deg]; `lever` turns it into metres."""
+    """`surface`: expected error of a joint position at the start [deg]; `lever` turns it into metres."""
+    frame_prior_deg: float = 0.5
+    """`surface`: the same of base frames and camera extrinsics [deg]."""
+    intrinsics_prior: float = 0.01
+    """`surface`: the same of focal lengths and principal points, as a share of the focal length [1]."""
     learning_rate: float = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `lever` times as many metres."""
     decay: float = 0.82
@@ -76,7 +86,7 @@ class OptimizerSettings:
     """The same during the first half of the steps [px of the working image]."""
     working_width: int = 320
     """Width of the images that are compared [px]."""
-    tolerance: float = 1e-3
+    tolerance: float = 1e-2
     """`gauss_newton`: a stage ends when no more than this share of the objective is to be gained [1]. Other solvers
     stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
     patience: int = 10
@@ -89,13 +99,18 @@ class OptimizerSettings:
         _require(self.loss in get_args(Loss), "loss", self.loss, f"one of {', '.join(get_args(Loss))}")
         _require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
         _require(1 <= self.stage_iterations <= 1000, "stage_iterations", self.stage_iterations, "1 to 1000")
+        _require(0 <= self.candidates <= 10_000, "candidates", self.candidates, "0 to 10000")
+        _require(0 <= self.bad_loss <= 10, "bad_loss", self.bad_loss, "0 to 10")
         _require(1 <= self.looks <= 10, "looks", self.looks, "1 to 10")
         blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
+        _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
         _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
+        _require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
+        _require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
         fits = self.solver != "gauss_newton" or self.loss == "surface"
         _require(fits, "solver", self.solver, f"adam or gradient_descent for the loss {self.loss}")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")
@@ -115,6 +130,18 @@ class OptimizerSettings:
         _require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         _require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
+
+    def with_loss(self, loss: Loss) -> "OptimizerSettings":
+        """These settings for another loss, with a solver that can descend it.
+
+        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`.
+        """
+        solver = self.solver
+        if loss == "surface" and solver != "none":
+            solver = "gauss_newton"
+        elif solver == "gauss_newton":
+            solver = "adam"
+        return replace(self, loss=loss, solver=solver)
 
     @staticmethod
     def acs(iterations: int = 60) -> "OptimizerSettings":

@@ -7,6 +7,7 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -17,11 +18,12 @@ from torch.nn import functional
 
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
-from ..rendering import Renderer, SurfaceRendering
+from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .evaluation import Evaluation
-from .inputs import smoothed, stacked_images, working_size
+from .inputs import kernel_radius, smoothed, stacked_images, working_size
+from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
 from .window import Window
@@ -29,7 +31,13 @@ from .window import Window
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
-_COARSEST = 4
+_SPREAD = 1.5
+"""Deviation of random starts, in expected errors."""
+
+_FINE = 2
+"""Number of stages that every look but the first one goes through."""
+
+_COARSEST = 8
 """Working pixels per side of a pixel in the coarsest stages."""
 
 _SMALLEST_BLUR = 1.2
@@ -42,8 +50,8 @@ _EPSILON = 1e-3
 class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
-    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. Each look
-    has the stages that `blurs` tell, a later one only its last two.
+    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
+    look serves the coarse stages, each later one the last two.
 
     Args:
         scene: with the cameras that take part.
@@ -67,9 +75,9 @@ class SurfaceObjective:
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
     ) -> None:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
-        later = settings.blurs[-2:]
-        self._plan = [(0, blur) for blur in settings.blurs]
-        self._plan += [(look, blur) for look in range(1, settings.looks) for blur in later]
+        coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
+        self._plan = [(0, blur) for blur in coarse]
+        self._plan += [(look, blur) for look in range(min(1, settings.looks - 1), settings.looks) for blur in fine]
         self.stages = len(self._plan)
         self._size = working_size(scene, settings.working_width, extractor.stride)
         device = extractor.device
@@ -77,7 +85,9 @@ class SurfaceObjective:
         self._weight = _weights(scene, ignore or {}, self._size).to(device)
         width, height = self._size
         self._whole = Renderer(scene, width=width, height=height, device=device)
-        self._prior = parameters.prior_precision(settings.prior_deg)
+        self._prior = parameters.prior_precision(
+            settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior
+        )
         self._look = -1
 
     def epoch(self, stage: int) -> int:
@@ -93,6 +103,33 @@ class SurfaceObjective:
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._stages[stage - first], gradient)
 
+    def better_start(self, offsets: Float[Tensor, " n"], candidates: int, seed: int = 0) -> Float[Tensor, " n"]:
+        """Offsets worth starting from again: the best of random ones, arm by arm, in the coarsest stage.
+
+        Args:
+            offsets: what has been found so far; it and the start are among the candidates.
+            candidates: number of random ones per arm, drawn from what the prior expects and half as much again.
+            seed: of the random numbers.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        spread = _SPREAD * self._prior.rsqrt().cpu()
+        best = offsets
+        with torch.no_grad():
+            best_cost = self._coarse_cost(best)
+            for group in self.parameters.groups:
+                for index in range(candidates + 1):
+                    drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
+                    trial = best.clone()
+                    trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
+                    cost = self._coarse_cost(self.parameters.clamp(trial))
+                    if cost < best_cost:
+                        best, best_cost = self.parameters.clamp(trial), cost
+        return best
+
+    def _coarse_cost(self, offsets: Tensor) -> float:
+        cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
+        return cost / self.settings.noise**2 + 0.5 * float((self._prior * offsets.square()).sum())
+
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
         believed = self._whole.surface(self.parameters.state(offsets)).maps
@@ -102,6 +139,8 @@ class SurfaceObjective:
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
         blurs = [blur for number, blur in self._plan if number == look]
+        if blurs[-1] != self.settings.blurs[-1]:
+            blurs.append(self.settings.blurs[-1])
         self._stages = [_Stage(self.scene, self._size, window, observed, weight, blur, self.settings) for blur in blurs]
 
     def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:
@@ -110,10 +149,11 @@ class SurfaceObjective:
         compared = stage.compare(state, neighbours)
         final = compared if stage is self._stages[-1] else self._stages[-1].compare(state, None)
         prior = 0.5 * float((self._prior * offsets.square()).sum())
-        slope, curvature = torch.zeros_like(offsets), None
+        slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None:
             slope = self._prior * offsets + compared.gradient
             curvature = torch.diag(self._prior) + compared.curvature
+            known = uncertainty(self.parameters.names, curvature, self._prior, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
         empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])
@@ -124,6 +164,7 @@ class SurfaceObjective:
             prior=prior,
             gradient=slope,
             curvature=curvature,
+            uncertainty=known,
             image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
             silhouette=paste(coverage, empty.clone()),
             similarity=paste(final.similarity, torch.ones_like(empty)),
@@ -162,7 +203,7 @@ class _Stage:
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
-        self._factor = max(f for f in (1, 2, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
         self._blur, self._robust = blur / self._factor, settings.robust
         # A pixel of a coarse stage stands for many of the last one.
         self._precision = self._factor**2 / settings.noise**2
@@ -176,27 +217,55 @@ class _Stage:
         )
         self._weight = functional.avg_pool2d(weight, self._factor)
         maps = functional.avg_pool2d(observed * weight, self._factor)
-        self._observed = smoothed(maps, self._blur)
+        self._observed = _compared(smoothed(maps, self._blur))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
+        self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
 
     def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "_Comparison":
         """Compare a state; with neighbours, also say how the cost changes."""
         tangents = self.renderer.tangents(*neighbours, 2 * _EPSILON) if neighbours else None
-        rendering = self.renderer.surface(state, tangents)
-        residual = self._observed - smoothed(rendering.maps * self._weight, self._blur)
+        rendering = self.renderer.surface(state, tangents, 1 + kernel_radius(self._blur))
+        residual = self._observed - _compared(smoothed(rendering.maps * self._weight, self._blur))
         squared = (residual.square() * self._channels).sum(1, keepdim=True)
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         ratio = 1.0 / (1.0 + squared / self._robust**2)
-        cost = 0.5 * self._factor**2 * float((squared * ratio).sum())
         comparison = _Comparison(
-            cost, rendering, (1.0 - squared[:, 0]).clamp(min=-1.0), (ratio.square() * self._weight)[:, 0]
+            0.5 * self._factor**2 * float((squared * ratio).sum()),
+            rendering,
+            (1.0 - squared[:, 0]).clamp(min=-1.0),
+            (ratio.square() * self._weight)[:, 0],
         )
-        if rendering.jacobian is None:
+        if tangents is None:
             return comparison
-        jacobian = smoothed(rendering.jacobian * self._weight, self._blur).flatten(1)
-        weighted = jacobian * (ratio.square() * self._channels * self._precision).flatten()
-        return replace(comparison, gradient=-weighted @ residual.flatten(), curvature=weighted @ jacobian.T)
+        weight = ratio.square() * self._channels * self._precision
+        gradient, curvature = self._normal_equations(rendering.jacobian, residual, weight, len(tangents.intrinsics))
+        return replace(comparison, gradient=gradient, curvature=curvature)
+
+    def _normal_equations(
+        self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, weight: Tensor, unknowns: int
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
+        """-J^T W r and J^T W J, under the blur."""
+        gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
+        windows, blocks = [], []
+        for block in jacobian:
+            rows, columns = block.values.shape[-2:]
+            window = Window(block.left, block.top, columns, rows)
+            values = _compared(smoothed(block.values * window.of(self._weight), self._blur))
+            weighted = (values * window.of(weight)).flatten(1)
+            gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
+            curvature[block.unknowns[:, None], block.unknowns] = weighted @ values.flatten(1).T
+            windows.append(window)
+            blocks.append((block.unknowns, values))
+        for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
+            common = a.common(b)
+            if common is None:
+                continue
+            ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
+            cross = ours @ common.inside(b).of(second).flatten(1).T
+            curvature[mine[:, None], others] = cross
+            curvature[others[:, None], mine] = cross.T
+        return gradient, curvature
 
 
 @dataclass(frozen=True)
@@ -210,6 +279,12 @@ class _Comparison:
     gradient: Float[Tensor, " n"] | None = None
     """Of the cost in units of the noise."""
     curvature: Float[Tensor, "n n"] | None = None
+
+
+def _compared(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
+    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
+    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
+    return maps
 
 
 def _neighbours(parameters: ParameterVector, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:

@@ -21,9 +21,9 @@ from carts_core.optimization.window import Window
 from carts_core.rendering import Renderer
 from carts_core.scene import Scene
 
-FRAMES, SIZE = 4, (320, 240)
+FRAMES, SIZE = 6, (320, 240)
 # Cameras that are given wrong ought to be found as wrong: a loose prior, and fewer stages than for real images.
-SETTINGS = replace(CALIBRATION_SETTINGS, prior_deg=10.0, blurs=(6.0, 2.0, 0.8), looks=1)
+SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, blurs=(6.0, 2.0, 0.8), looks=1)
 
 
 class PerfectSight:
