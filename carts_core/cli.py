@@ -7,6 +7,7 @@ import tyro
 from rich.console import Console
 
 from .commands.bench import Bench
+from .commands.calibrate import Calibrate
 from .commands.evaluate import Evaluate
 from .commands.export import Export
 from .commands.optimize import Optimize
@@ -24,6 +25,7 @@ Command = (
     Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]

@@ -1,5 +1,7 @@
 """Recordings: the sequence format and its loader."""
 
+from .background import spread as spread
+from .calibrated import calibrated_sequence_file as calibrated_sequence_file
 from .frame_reader import FrameReader as FrameReader
 from .sequence import Frame as Frame
 from .sequence import Sequence as Sequence

@@ -1,5 +1,10 @@
 """Metrics, and the evaluation of optimized frames against known masks and kinematics."""
 
+from .calibration import FrameResidual as FrameResidual
+from .calibration import calibration_json as calibration_json
+from .calibration import frame_residuals as frame_residuals
+from .calibration import mean_dice as mean_dice
+from .calibration_report import write_calibration as write_calibration
 from .evaluate import FrameScore as FrameScore
 from .evaluate import evaluate as evaluate
 from .evaluate import mean_score as mean_score
@@ -10,12 +15,17 @@ from .metrics import joint_mae_deg as joint_mae_deg
 from .metrics import normalized_surface_distance as normalized_surface_distance
 
 __all__ = [
+    "FrameResidual",
     "FrameScore",
+    "calibration_json",
     "dice",
     "evaluate",
+    "frame_residuals",
     "joint_mae_deg",
+    "mean_dice",
     "mean_score",
     "normalized_surface_distance",
     "start_positions",
     "to_json",
+    "write_calibration",
 ]

@@ -20,3 +20,5 @@ from .overlay import image_and_mask as image_and_mask
 from .overlay import overlay as overlay
 from .png import image_png as image_png
 from .png import mask_png as mask_png
+from .publish import MARKER as MARKER
+from .publish import published as published

@@ -1,9 +1,27 @@
 """The ACS optimizer: unknowns, settings, solvers, and one steppable object."""
 
+from .calibration import CALIBRATION as CALIBRATION
+from .calibration import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
+from .calibration import CalibrationIterate as CalibrationIterate
+from .calibration import CalibrationOptimizer as CalibrationOptimizer
+from .calibration import CalibrationResult as CalibrationResult
+from .calibration import UnknownChange as UnknownChange
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .settings import FreeParameters as FreeParameters
 from .settings import OptimizerSettings as OptimizerSettings
 
-__all__ = ["FrameOptimizer", "FreeParameters", "Iterate", "OptimizerSettings", "Progress"]
+__all__ = [
+    "CALIBRATION",
+    "CALIBRATION_SETTINGS",
+    "CalibrationIterate",
+    "CalibrationOptimizer",
+    "CalibrationResult",
+    "FrameOptimizer",
+    "FreeParameters",
+    "Iterate",
+    "OptimizerSettings",
+    "Progress",
+    "UnknownChange",
+]

@@ -41,7 +41,8 @@ class ParameterVector:
         lever: [m/rad].
 
     Raises:
-        SettingsError: nothing is free, or `free` names an arm or a joint that does not exist.
+        SettingsError: nothing is free, or `free` names a joint that does not exist.
+        RobotError: `free` names an arm or a camera that does not exist.
     """
 
     def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, lever: float) -> None:
@@ -58,7 +59,7 @@ class ParameterVector:
         for index in chosen if free.base_frames else ():
             self._add("base_frame", index, f"{scene.arms[index].name}/base", ("rx", "ry", "rz", "x", "y", "z"))
         for index, camera in enumerate(scene.cameras):
-            if free.extrinsics:
+            if free.extrinsics and camera.name not in free.locked_cameras:
                 self._add("extrinsics", index, f"{camera.name}/camera", ("rx", "ry", "rz", "x", "y", "z"))
             if free.intrinsics:
                 self._add("intrinsics", index, camera.name, ("fx", "fy", "cx", "cy"))
@@ -73,6 +74,8 @@ class ParameterVector:
     def _check_names(self, scene: Scene, free: FreeParameters) -> None:
         for name in free.arms:
             scene.arm(name)
+        for name in free.locked_cameras:
+            scene.camera(name)
         known = {j for arm in scene.arms for j in arm.robot.joint_names}
         known |= {f"{arm.name}/{j}" for arm in scene.arms for j in arm.robot.joint_names}
         for joint in free.locked_joints:
@@ -112,6 +115,22 @@ class ParameterVector:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def units(self) -> list[tuple[str, str, float]]:
+        """Per unknown its name, the unit that a person reads (deg, mm, px; % of a focal length), and that unit's number
+        per radian-like unit."""
+        radian, length, focal = ("deg", math.degrees(1.0)), ("mm", 1000.0 * self._lever), ("%", 100.0 * _FOCAL_SCALE)
+        read: list[tuple[str, float]] = []
+        for block in self._blocks:
+            if block.kind == "joints":
+                scales = self._joint_scales[block.start].tolist()
+                read += [radian if scale == 1.0 else length for scale in scales]
+            elif block.kind == "intrinsics":
+                fx, fy = self.start.intrinsics[block.index, :2].tolist()
+                read += [focal, focal, ("px", fx), ("px", fy)]
+            else:
+                read += 3 * [radian] + 3 * [length]
+        return [(name, *unit) for name, unit in zip(self.names, read, strict=True)]
 
     @property
     def groups(self) -> list[range]:

@@ -27,6 +27,8 @@ class FreeParameters:
     """Names of the free arms; none named means all."""
     locked_joints: tuple[str, ...] = ()
     """Joints that stay where they are, as `joint` for every arm or `arm/joint` for one."""
+    locked_cameras: tuple[str, ...] = ()
+    """Cameras whose extrinsics stay where they are."""
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,9 @@ class _Stage:
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
-        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        # The last stage is what losses and pictures are made of, so it is never reduced.
+        coarsest = 1 if blur == settings.blurs[-1] else _COARSEST
+        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or (f <= coarsest and blur / f >= _SMALLEST_BLUR))
         self._blur, self._robust = blur / self._factor, settings.robust
         # A pixel of a coarse stage stands for many of the last one.
         self._precision = self._factor**2 / settings.noise**2

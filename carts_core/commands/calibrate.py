@@ -1,0 +1,117 @@
+"""`carts calibrate`: base frames and cameras from many frames at once."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from ..data import Sequence, spread
+from ..errors import SettingsError
+from ..evaluation import frame_residuals, mean_dice, write_calibration
+from ..export import MARKER, file_name, published
+from ..features.extractor import FeatureExtractor
+from ..optimization import (
+    CALIBRATION,
+    CALIBRATION_SETTINGS,
+    CalibrationOptimizer,
+    CalibrationResult,
+    FreeParameters,
+    OptimizerSettings,
+)
+from .selection import Network, Selection, SequencePath
+
+_SPREAD = "spread:"
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find base frames and cameras that fit many frames at once; write a sequence file with them, and a report."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/calibration`."""
+    overwrite: bool = False
+    """Replace an earlier calibration there."""
+    frames: str = f"{_SPREAD}20"
+    """Positions of the frames to calibrate with: `spread:20` for 20, spread evenly over the sequence, or as in
+    `carts evaluate`: `all`, `0-9,15`, `::3`."""
+    camera: tuple[str, ...] = Selection.camera
+    """Cameras, by name; all take part at once."""
+    domain: str | None = None
+    """Domain, by name; the sequence's first one if none is named."""
+    joint_prior_deg: float = 0.1
+    """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
+    all that is written."""
+    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = CALIBRATION_SETTINGS
+
+    def run(self) -> None:
+        """Calibrate; on Ctrl-C or an error nothing is written."""
+        console = Console()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        cameras = Selection(camera=self.camera).camera_names(sequence.scene)
+        indices = frame_indices(self.frames, sequence)
+        output = self.output or Path("runs") / file_name(sequence.name) / "calibration"
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        with published(output, overwrite=self.overwrite) as folder:
+            frames = [sequence.frame(index, self.domain, cameras) for index in indices]
+            optimizer = CalibrationOptimizer(
+                sequence.scene,
+                frames,
+                extractor,
+                settings=self.optimizer,
+                free=self.free,
+                joint_prior_deg=self.joint_prior_deg,
+                cameras=cameras,
+            )
+            result = _optimized(optimizer, console)
+            residuals = frame_residuals(sequence, frames, result)
+            write_calibration(folder, output, sequence, result, residuals)
+            (folder / MARKER).write_text(json.dumps(self._summary(extractor, indices, cameras), indent=1))
+        for camera in cameras:
+            if (means := mean_dice(residuals, camera)) is not None:
+                console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
+        console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
+
+    def _summary(self, extractor: FeatureExtractor, indices: list[int], cameras: list[str]) -> dict:
+        """How the folder was made."""
+        return {
+            "format": "calibration",
+            "sequence": str(self.sequence),
+            "weights": extractor.sha256,
+            "frames": indices,
+            "cameras": cameras,
+            "domain": self.domain,
+            "joint_prior_deg": self.joint_prior_deg,
+            "free": asdict(self.free),
+            "optimizer": asdict(self.optimizer),
+        }
+
+
+def frame_indices(text: str, sequence: Sequence) -> list[int]:
+    """Positions that `--frames` means.
+
+    Raises:
+        SettingsError: the text is not readable, names no frame or leaves the sequence.
+    """
+    if not text.startswith(_SPREAD):
+        return Selection(frames=text).frame_indices(sequence)
+    count = text.removeprefix(_SPREAD)
+    if not (count.isdecimal() and int(count) >= 1):
+        raise SettingsError(f"--frames {text!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+    return spread(len(sequence), int(count))
+
+
+def _optimized(optimizer: CalibrationOptimizer, console: Console) -> CalibrationResult:
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("calibrating", total=None)
+        for iterate in optimizer:
+            text = f"stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
+            bar.update(task, description=text, total=iterate.stages, completed=iterate.stage)
+    return optimizer.result()

@@ -1,0 +1,137 @@
+"""The folder that a calibration leaves: sequence file, numbers, and a page with plots."""
+
+import json
+from collections.abc import Sequence as Frames
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..data import Sequence, calibrated_sequence_file
+from ..optimization import CalibrationResult
+from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames
+
+matplotlib.use("Agg")
+
+
+def write_calibration(
+    folder: Path, target: Path, sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]
+) -> None:
+    """Write `sequence.toml`, `calibration.json`, `frames.png`, `unknowns.png` and `README.md`.
+
+    Args:
+        folder: is made, and written to.
+        target: where the folder will lie in the end; paths in the sequence file are relative to it.
+        sequence: with the calibration as it was.
+        result: the new one.
+        residuals: of the frames that it was made from.
+    """
+    folder.mkdir(parents=True)
+    text = calibrated_sequence_file(sequence.path, target, sequence.scene, result.scene)
+    (folder / "sequence.toml").write_text(text, encoding="utf-8")
+    content = calibration_json(sequence.scene, result, residuals)
+    (folder / "calibration.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    _frames_figure(residuals).savefig(folder / "frames.png", dpi=110)
+    _unknowns_figure(result).savefig(folder / "unknowns.png", dpi=110)
+    (folder / "README.md").write_text(_page(sequence, result, residuals), encoding="utf-8")
+
+
+def _cameras(residuals: Frames[FrameResidual]) -> list[str]:
+    return list(dict.fromkeys(camera for residual in residuals for camera in residual.dice_before))
+
+
+def _frames_figure(residuals: Frames[FrameResidual]) -> Figure:
+    cameras = _cameras(residuals)
+    figure = Figure(figsize=(7.5, 2.3 * (1 + len(cameras))), layout="constrained")
+    axes = figure.subplots(1 + len(cameras), 1, squeeze=False, sharex=True)[:, 0]
+    names = [residual.frame for residual in residuals]
+    for label in ("before", "after"):
+        axes[0].plot(names, [getattr(residual, f"loss_{label}") for residual in residuals], ".-", label=label)
+        for panel, camera in zip(axes[1:], cameras, strict=True):
+            scores = [getattr(residual, f"dice_{label}").get(camera, np.nan) for residual in residuals]
+            panel.plot(names, scores, ".-", label=label)
+            panel.set(ylabel=f"Dice, {camera}")
+    axes[0].set(ylabel="loss")
+    axes[0].legend(fontsize=8)
+    axes[-1].set_xlabel("frame")
+    axes[-1].tick_params(axis="x", rotation=90, labelsize=7)
+    for panel in axes:
+        panel.grid(alpha=0.3)
+    return figure
+
+
+def _unknowns_figure(result: CalibrationResult) -> Figure:
+    units = list(dict.fromkeys(unknown.unit for unknown in result.unknowns))
+    figure = Figure(figsize=(3.6 * len(units), 0.8 + 0.3 * len(result.unknowns)), layout="constrained")
+    for panel, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
+        shown = [unknown for unknown in result.unknowns if unknown.unit == unit][::-1]
+        panel.errorbar(
+            [unknown.change for unknown in shown],
+            [unknown.name for unknown in shown],
+            xerr=[2 * unknown.deviation_between_frames for unknown in shown],
+            fmt="o",
+            capsize=3,
+        )
+        panel.axvline(0.0, color="black", linewidth=0.8)
+        panel.set_xlabel(f"change [{unit}]")
+        panel.grid(alpha=0.3)
+        panel.tick_params(labelsize=8)
+    return figure
+
+
+def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]) -> str:
+    cameras = _cameras(residuals)
+    lines = [
+        f"# Calibration of {sequence.name}",
+        "",
+        f"From {len(residuals)} frames, joints as measured in all figures below. The optimization ended: "
+        f"{result.stop_reason}. The new calibration is in `sequence.toml`, all numbers are in `calibration.json`.",
+        "",
+        "| mean over the frames | before | after |",
+        "|---|---|---|",
+        f"| loss | {result.frame_losses_before.mean():.4f} | {result.frame_losses_after.mean():.4f} |",
+    ]
+    for camera in cameras:
+        if (means := mean_dice(residuals, camera)) is not None:
+            lines.append(f"| Dice, {camera} | {means[0]:.4f} | {means[1]:.4f} |")
+    lines += ["", "| what moved | by [deg] | by [mm] |", "|---|---|---|"]
+    lines += [
+        f"| {name} | {angle:.3f} | {distance:.3f} |"
+        for name, angle, distance in moved_frames(sequence.scene, result.scene)
+    ]
+    lines += [
+        "",
+        "## Unknowns",
+        "",
+        "Base frames turn and shift in their own axes, cameras in theirs. The standard deviation *of the curvature*",
+        "takes pixels for independent and is too small; that *between frames* counts how much the frames contradict",
+        "each other. An unknown whose deviation of the curvature is close to the prior's was not seen and stays where",
+        "it was.",
+        "",
+        "![unknowns](unknowns.png)",
+        "",
+        "Bars are two standard deviations between frames.",
+        "",
+        "| unknown | change | of the curvature | between frames | prior | unit |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {unknown.name} | {unknown.change:.3f} | {unknown.deviation:.3f} | {unknown.deviation_between_frames:.3f} | "
+        f"{unknown.prior_deviation:.3f} | {unknown.unit} |"
+        for unknown in result.unknowns
+    ]
+    dice_columns = [f"Dice {camera} {label}" for camera in cameras for label in ("before", "after")]
+    columns = ["frame", "weight", "loss before", "loss after", *dice_columns]
+    lines += ["", "## Frames", "", "![frames](frames.png)", ""]
+    lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for residual in residuals:
+        scores = [
+            f"{scores[camera]:.4f}" if camera in scores else "-"
+            for camera in cameras
+            for scores in (residual.dice_before, residual.dice_after)
+        ]
+        values = [f"{residual.weight:.2f}", f"{residual.loss_before:.4f}", f"{residual.loss_after:.4f}", *scores]
+        lines.append(f"| {' | '.join([residual.frame, *values])} |")
+    lines += ["", "A frame whose loss stands out from the others' counts less; its weight says how much.", ""]
+    return "\n".join(lines)

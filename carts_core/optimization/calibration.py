@@ -1,0 +1,253 @@
+"""Hand-eye calibration: base frames and cameras that many frames share, one iterate at a time."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import roma
+import torch
+from jaxtyping import Float
+
+from ..data import Frame
+from ..errors import SettingsError
+from ..features.extractor import FeatureExtractor
+from ..scene import Scene, SceneState
+from .calibration_objective import CalibrationEvaluation, CalibrationObjective, Ignored
+from .frame import Progress
+from .gauss_newton import GaussNewton
+from .parameters import ParameterVector
+from .settings import FreeParameters, OptimizerSettings
+
+CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
+"""What a calibration frees unless told otherwise."""
+
+CALIBRATION_SETTINGS = OptimizerSettings(normals_weight=0.0, frame_prior_deg=3.0, intrinsics_prior=0.05)
+"""How a calibration goes about it unless told otherwise. Normals are left out: where they are wrong by the same angle
+in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""
+
+
+@dataclass(frozen=True)
+class CalibrationIterate:
+    """A calibration on the way. A copy: nothing later changes it."""
+
+    index: int
+    """Number of steps before it; 0 is the start."""
+    stage: int
+    stages: int
+    loss: float
+    """Weighted mean over the frames, comparable within one look of the network at the images."""
+    offsets: Float[torch.Tensor, " n"]
+    """From the start, in radian-like units."""
+    scene: Scene
+    """With this calibration."""
+    frame_losses: Float[np.ndarray, " frames"]
+    seconds: float
+    """Duration of this iteration [s]."""
+
+
+@dataclass(frozen=True)
+class UnknownChange:
+    """What became of one unknown."""
+
+    name: str
+    unit: str
+    """deg, mm, px or %, of all the other values."""
+    change: float
+    deviation: float
+    """Standard deviation that the curvature tells, pixels taken for independent."""
+    deviation_between_frames: float
+    """The same from how much the frames contradict each other, which also knows errors that pixels share."""
+    prior_deviation: float
+    """Before any image was looked at; an unknown whose `deviation` is close to this was not seen."""
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The best calibration, and what speaks for it."""
+
+    scene: Scene
+    """As given, with the new calibration."""
+    unknowns: tuple[UnknownChange, ...]
+    frame_losses_before: Float[np.ndarray, " frames"]
+    """With joints as measured, like `frame_losses_after`, and against what the network saw last."""
+    frame_losses_after: Float[np.ndarray, " frames"]
+    frame_weights: Float[np.ndarray, " frames"]
+    """How far each frame counted, in [0, 1]."""
+    stop_reason: str
+
+
+class CalibrationOptimizer:
+    """Calibration over many frames, one iterate at a time; the counterpart of `FrameOptimizer`.
+
+    Where cameras and the base frames of all arms are free, only their product can be seen. Then the first camera keeps
+    its extrinsics, and the base frames move.
+
+    Args:
+        scene: arms and cameras.
+        frames: observed images and measured joint positions.
+        extractor: the networks.
+        settings: solver `gauss_newton` and loss `surface`; `frame_prior_deg` and `intrinsics_prior` are its own.
+        free: what is unknown. Joints are so in every frame for itself.
+        joint_prior_deg: expected error of free joints [deg].
+        ignore: per frame, camera name -> pixels that show an occluder.
+        cameras: names of the cameras that take part, all by default.
+
+    Raises:
+        SettingsError: no frame, nothing of the calibration is free, another solver, or an image does not fit.
+        RobotError: there is no such camera or arm.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        frames: Sequence[Frame],
+        extractor: FeatureExtractor,
+        *,
+        settings: OptimizerSettings = CALIBRATION_SETTINGS,
+        free: FreeParameters = CALIBRATION,
+        joint_prior_deg: float = 0.1,
+        ignore: Ignored | None = None,
+        cameras: Sequence[str] | None = None,
+    ) -> None:
+        self.settings = settings
+        if self.settings.solver != "gauss_newton":
+            raise SettingsError(f"solver is {self.settings.solver!r}; a calibration needs gauss_newton.")
+        if not frames:
+            raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
+        if not 1e-3 <= joint_prior_deg <= 360:
+            raise SettingsError(f"joint_prior_deg is {joint_prior_deg!r}; allowed is 0.001 to 360 deg.")
+        if not (free.base_frames or free.extrinsics or free.intrinsics):
+            raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
+        self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
+        self.free = with_fixed_gauge(self._scene, free)
+        self._objective = CalibrationObjective(
+            self._scene, frames, extractor, self.free, self.settings, joint_prior_deg, ignore
+        )
+        self.parameters = self._objective.parameters
+        self._offsets = torch.zeros(len(self.parameters), device=extractor.device)
+        self._solver = GaussNewton(self.settings, self.parameters, self._objective.stages)
+        self._epoch = 0
+        self.history: list[Progress] = []
+        self.best: CalibrationIterate | None = None
+        self.stop_reason: str | None = None
+
+    def cancel(self) -> None:
+        """Stop; what was reached stays in `best` and `history`."""
+        self.stop_reason = self.stop_reason or "cancelled"
+
+    def step(self) -> CalibrationIterate | None:
+        """Evaluate the present calibration and move on; None once the optimization has stopped.
+
+        The first call gives iterate 0, the start.
+        """
+        if self.stop_reason is not None:
+            return None
+        began = time.perf_counter()
+        offsets, stage = self._offsets, self._solver.stage
+        epoch = self._objective.epoch(stage)
+        evaluation = self._objective(offsets, stage, gradient=True)
+        self._offsets = self._solver(offsets, evaluation)
+        iterate = CalibrationIterate(
+            index=len(self.history),
+            stage=stage,
+            stages=self._objective.stages,
+            loss=evaluation.loss,
+            offsets=offsets.clone(),
+            scene=_calibrated(self._whole_scene, self._scene, self.parameters, offsets),
+            frame_losses=evaluation.frame_losses.numpy().copy(),
+            seconds=time.perf_counter() - began,
+        )
+        self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
+        if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
+            self.best, self._epoch = iterate, epoch
+        self.stop_reason = self.stop_reason or self._solver.finished
+        return iterate
+
+    def __iter__(self) -> Iterator[CalibrationIterate]:
+        """Step until the optimization stops."""
+        while (iterate := self.step()) is not None:
+            yield iterate
+
+    def result(self) -> CalibrationResult:
+        """What the best iterate says; evaluates it once more, at the finest stage that was reached.
+
+        Raises:
+            SettingsError: no step was made yet.
+        """
+        if self.best is None:
+            raise SettingsError("no step was made yet. Call `step` first.")
+        offsets = self.best.offsets
+        evaluation = self._objective(offsets, self._solver.stage, gradient=True)
+        return CalibrationResult(
+            scene=self.best.scene,
+            unknowns=_changes(self.parameters, offsets, evaluation, self.settings),
+            frame_losses_before=self._objective.frame_losses(torch.zeros_like(offsets)),
+            frame_losses_after=self._objective.frame_losses(offsets),
+            frame_weights=evaluation.frame_weights.numpy().copy(),
+            stop_reason=self.stop_reason or "cancelled",
+        )
+
+
+def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
+    """`free`, with the first camera locked where otherwise moving all cameras and base frames together changed nothing.
+
+    With some base frame or camera fixed there is nothing to lock.
+    """
+    every_base = free.base_frames and (not free.arms or {arm.name for arm in scene.arms} <= set(free.arms))
+    names = [camera.name for camera in scene.cameras]
+    if not (every_base and free.extrinsics) or set(names) & set(free.locked_cameras):
+        return free
+    return replace(free, locked_cameras=(*free.locked_cameras, names[0]))
+
+
+def _calibrated(whole: Scene, part: Scene, parameters: ParameterVector, offsets: torch.Tensor) -> Scene:
+    """The whole scene with the calibration of its calibrated part; what did not move keeps its exact value."""
+    start, state = parameters.start, parameters.state(offsets)
+    arms = tuple(
+        replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
+        for index, arm in enumerate(whole.arms)
+    )
+    indices = {camera.name: index for index, camera in enumerate(part.cameras)}
+    cameras = []
+    for camera in whole.cameras:
+        if (index := indices.get(camera.name)) is not None:
+            T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
+            before, after = start.intrinsics[index], state.intrinsics[index]
+            fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
+            cameras.append(replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy)))
+        else:
+            cameras.append(camera)
+    return replace(whole, arms=arms, cameras=tuple(cameras))
+
+
+def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
+    before, after = getattr(start, name)[index], getattr(state, name)[index]
+    if torch.equal(before, after):
+        return given
+    result = after.cpu().double()
+    result[:3, :3] = roma.special_procrustes(result[:3, :3])
+    return result.numpy()
+
+
+def _changes(
+    parameters: ParameterVector,
+    offsets: torch.Tensor,
+    evaluation: CalibrationEvaluation,
+    settings: OptimizerSettings,
+) -> tuple[UnknownChange, ...]:
+    assert evaluation.curvature is not None and evaluation.frame_gradients is not None
+    covariance = torch.linalg.inv(evaluation.curvature.double().cpu())
+    # The sandwich estimator with frames as clusters: pixels of one frame share their errors, frames do not.
+    pulled = covariance @ evaluation.frame_gradients.T
+    between = pulled.square().sum(1).sqrt()
+    alone, prior = (
+        covariance.diagonal().sqrt(),
+        parameters.prior_precision(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
+        ** -0.5,
+    )
+    changes = []
+    for index, (name, unit, scale) in enumerate(parameters.units()):
+        values = (offsets[index].cpu(), alone[index], between[index], prior[index])
+        changes.append(UnknownChange(name, unit, *(scale * float(value) for value in values)))
+    return tuple(changes)

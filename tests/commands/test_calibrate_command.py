@@ -1,0 +1,122 @@
+"""`carts calibrate`, as a user types it, and the sequence file that it writes."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.cli import BAD_INPUT, main
+from carts_core.data import Sequence, calibrated_sequence_file
+
+QUICK = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=3, cameras=("left", "right"), width=160, height=128)
+
+
+def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(sequence: Path, tmp_path: Path) -> None:
+    output, scores = tmp_path / "a" / "b", tmp_path / "scores.json"
+    main(["calibrate", str(sequence), "--output", str(output), *QUICK])
+    names = {"sequence.toml", "calibration.json", "README.md", "frames.png", "unknowns.png", "export.json"}
+    assert {path.name for path in output.iterdir()} == names
+    before, after = Sequence.open(sequence), Sequence.open(output / "sequence.toml")
+    content = json.loads((output / "calibration.json").read_text())
+    assert [frame["frame"] for frame in content["frames"]] == ["001", "003"]
+    base = content["arms"]["PSM1"]["T_world_base"]
+    assert np.allclose(base["after"], after.scene.arms[0].T_world_base, atol=1e-9)
+    assert not np.allclose(base["before"], base["after"]) and base["rotation_deg"] > 0
+    assert np.array_equal(before.scene.cameras[0].T_camera_world, after.scene.cameras[0].T_camera_world)
+    assert {unknown["unit"] for unknown in content["unknowns"]} == {"deg", "mm"}
+    assert len(content["unknowns"]) == 12 and all(unknown["deviation"] > 0 for unknown in content["unknowns"])
+    arguments = ["--frames", "0,2", "--camera", "right", "--solver", "none", "--json", str(scores)]
+    main(["evaluate", str(output / "sequence.toml"), *arguments])
+    evaluated = [frame["dice_before"] for frame in json.loads(scores.read_text())["frames"]]
+    assert evaluated == pytest.approx([frame["dice_after"]["right"] for frame in content["frames"]], abs=1e-6)
+    page = (output / "README.md").read_text()
+    assert "| T_world_base of PSM1 |" in page and "| 003 |" in page
+
+
+def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    free = ["--no-base-frames", "--no-extrinsics", "--intrinsics", "--joints", "--camera", "left"]
+    main(["calibrate", str(sequence), "--output", str(output), *QUICK, *free])
+    before, after = Sequence.open(sequence), Sequence.open(output / "sequence.toml")
+    assert before.scene.cameras[0].intrinsics != after.scene.cameras[0].intrinsics
+    assert before.scene.cameras[1].intrinsics == after.scene.cameras[1].intrinsics
+    assert np.array_equal(before.measured["PSM1"], after.measured["PSM1"])
+    units = [unknown["unit"] for unknown in json.loads((output / "calibration.json").read_text())["unknowns"]]
+    assert units == ["%", "%", "px", "px"]
+
+
+def test_an_earlier_calibration_is_replaced_only_on_request(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--frames", "0"]
+    main(command)
+    with pytest.raises(SystemExit) as stop:
+        main(command)
+    assert stop.value.code == BAD_INPUT and "--overwrite" in capsys.readouterr().err
+    main([*command, "--overwrite"])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    with pytest.raises(SystemExit):
+        main([*command, "--overwrite", "--output", str(tmp_path / "mine")])
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frames", "spread:0"], "names no frame"),
+        (["--frames", "7"], "frame 7 is outside"),
+        (["--no-base-frames", "--no-extrinsics"], "nothing of the calibration is free"),
+        (["--solver", "adam"], "needs gauss_newton"),
+        (["--camera", "third"], "no camera is called 'third'"),
+        (["--domain", "fog"], "no domain 'fog'"),
+    ],
+)
+def test_bad_input_leaves_nothing_behind(
+    arguments: list[str], message: str, sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *arguments])
+    assert stop.value.code == BAD_INPUT and message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists() and not (tmp_path / ".out.part").exists()
+
+
+def test_a_moved_sequence_file_keeps_references_comments_and_absolute_paths(sequence: Path, tmp_path: Path) -> None:
+    text = sequence.read_text()
+    scene = Sequence.open(sequence).scene
+    matrices = {camera.name: camera.T_camera_world.tolist() for camera in scene.cameras}
+    (sequence.parent / "calibration.json").write_text(json.dumps(matrices))
+    absolute = sequence.parent / "elsewhere.csv"
+    shutil.copy(sequence.parent / "kinematics.csv", absolute)
+    lines = []
+    cameras = iter(matrices)
+    for line in text.splitlines():
+        if line.startswith("T_camera_world"):
+            lines.append(f'T_camera_world = "calibration.json#{next(cameras)}"  # by hand')
+        else:
+            lines.append(line.replace('"kinematics.csv"', f'"{absolute}"'))
+    sequence.write_text("\n".join(lines))
+    before = Sequence.open(sequence)
+    T = before.scene.cameras[0].T_camera_world.copy()
+    T[0, 3] += 0.001
+    left = replace(before.scene.cameras[0], T_camera_world=T, intrinsics=(190.0, 191.0, 80.0, 64.0))
+    after = replace(before.scene, cameras=(left, before.scene.cameras[1]))
+    folder = tmp_path / "deep" / "er"
+    folder.mkdir(parents=True)
+    written = calibrated_sequence_file(sequence, folder, before.scene, after)
+    (folder / "s.toml").write_text(written)
+    assert str(absolute) in written and '"../../calibration.json#right"  # by hand' in written
+    opened = Sequence.open(folder / "s.toml")
+    assert np.allclose(opened.scene.cameras[0].T_camera_world, T, atol=1e-11)
+    assert opened.scene.cameras[0].intrinsics == left.intrinsics
+    assert opened.scene.cameras[1].intrinsics == before.scene.cameras[1].intrinsics
+    assert np.array_equal(opened.frame(1).images["right"], before.frame(1).images["right"])

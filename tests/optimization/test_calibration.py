@@ -1,0 +1,244 @@
+"""Calibration over many frames, with a network that sees exactly what is there."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roma
+import torch
+from torch.nn import functional
+
+from carts_core.data import Frame, Sequence
+from carts_core.errors import RobotError, SettingsError
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import CALIBRATION, CALIBRATION_SETTINGS, CalibrationOptimizer, FreeParameters
+from carts_core.optimization.calibration import with_fixed_gauge
+from carts_core.optimization.calibration_objective import trust_of_frames
+from carts_core.optimization.elimination import eliminate
+from carts_core.optimization.window import Window
+from carts_core.rendering import Renderer
+from carts_core.scene import Scene
+
+FRAMES, SIZE = 6, (320, 240)
+# Cameras that are given wrong ought to be found as wrong: a loose prior, and fewer stages than for real images.
+SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, blurs=(6.0, 2.0, 0.8), looks=1)
+
+
+class PerfectSight:
+    """Stands in for the networks: knows a frame by its images' colour, and sees the surface map of its truth."""
+
+    device = torch.device("cpu")
+    stride = 16
+
+    def __init__(self, scene: Scene, frames: list[Frame]) -> None:
+        renderer = Renderer(scene, width=2 * SIZE[0], height=2 * SIZE[1])
+        self.maps = [
+            functional.avg_pool2d(renderer.surface(scene.state(frame.truth or {})).maps, 2) for frame in frames
+        ]
+        self.window = Window(0, 0, *SIZE)
+
+    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+        """The truth of the frame whose images these are."""
+        return self.window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=FRAMES, cameras=("left", "right"), width=SIZE[0], height=SIZE[1]))
+
+
+@pytest.fixture
+def frames(sequence: Sequence) -> list[Frame]:
+    """Frames whose joints are measured without an error; their images are as bright as their number."""
+    return [
+        replace(
+            frame, measured=frame.truth or {}, images={c: np.full_like(i, frame.index) for c, i in frame.images.items()}
+        )
+        for frame in map(sequence.frame, range(FRAMES))
+    ]
+
+
+@pytest.fixture
+def sight(sequence: Sequence, frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> FeatureExtractor:
+    seen = PerfectSight(sequence.scene, frames)
+    around = Window.around
+
+    def remembered(*arguments) -> Window:
+        seen.window = around(*arguments)
+        return seen.window
+
+    monkeypatch.setattr(Window, "around", staticmethod(remembered))
+    return seen  # pyright: ignore[reportReturnType]
+
+
+def rigid(degrees: list[float], millimetres: list[float]) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = roma.rotvec_to_rotmat(torch.tensor(degrees).double().deg2rad()).numpy()
+    T[:3, 3] = np.array(millimetres) / 1000
+    return T
+
+
+def with_wrong_base(scene: Scene) -> Scene:
+    arm = scene.arms[0]
+    return replace(
+        scene, arms=(replace(arm, T_world_base=arm.T_world_base @ rigid([1.0, -1.5, 1.0], [2.0, -1.0, 1.5])),)
+    )
+
+
+def with_wrong_right_camera(scene: Scene) -> Scene:
+    left, right = scene.cameras
+    T = rigid([0.5, -0.7, 0.6], [1.0, -1.0, 0.5]) @ right.T_camera_world
+    return replace(scene, cameras=(left, replace(right, T_camera_world=T)))
+
+
+def worst_error(scene: Scene, truth: Scene, joint_positions: np.ndarray) -> tuple[float, float]:
+    """Of where the instrument is seen, over all cameras: angle [deg] and distance of its last link [mm]."""
+    robot = scene.arms[0].robot
+    T_base_tip = robot.forward_kinematics(torch.tensor(joint_positions))[robot.meshes[-1].link].numpy()
+    angles, distances = [], []
+    for found, wanted in zip(scene.cameras, truth.cameras, strict=True):
+        T_found = found.T_camera_world @ scene.arms[0].T_world_base @ T_base_tip
+        T_wanted = wanted.T_camera_world @ truth.arms[0].T_world_base @ T_base_tip
+        turn = torch.tensor(T_found[:3, :3].T @ T_wanted[:3, :3])
+        angles.append(float(roma.rotmat_to_rotvec(turn).norm().rad2deg()))
+        distances.append(1000 * float(np.linalg.norm(T_found[:3, 3] - T_wanted[:3, 3])))
+    return max(angles), max(distances)
+
+
+def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+) -> None:
+    wrong = with_wrong_right_camera(with_wrong_base(sequence.scene))
+    optimizer = CalibrationOptimizer(wrong, frames, sight, settings=SETTINGS)
+    list(optimizer)
+    result = optimizer.result()
+    positions = frames[1].measured["PSM1"]
+    before = worst_error(wrong, sequence.scene, positions)
+    angle, distance = worst_error(result.scene, sequence.scene, positions)
+    assert before[0] > 1.5 and before[1] > 3.0
+    assert angle < 0.2 and distance < 0.5
+    assert result.frame_losses_after.max() < 0.2 * result.frame_losses_before.min()
+    assert np.array_equal(result.scene.cameras[0].T_camera_world, wrong.cameras[0].T_camera_world)
+    assert result.stop_reason == "converged" and len(optimizer.history) == optimizer.history[-1].index + 1
+    for unknown in result.unknowns:
+        assert 0 < unknown.deviation <= unknown.prior_deviation * (1 + 1e-6)
+
+
+def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+) -> None:
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], (FRAMES, 2))
+    shaken = [
+        replace(frame, measured={"PSM1": frame.measured["PSM1"] + np.deg2rad([*sign, 0, 0, 0, 0, 0])})
+        for frame, sign in zip(frames, signs, strict=True)
+    ]
+    wrong = with_wrong_base(sequence.scene)
+
+    def loss(free: FreeParameters) -> float:
+        optimizer = CalibrationOptimizer(
+            wrong, shaken, sight, settings=SETTINGS, free=free, joint_prior_deg=1.0, cameras=["left"]
+        )
+        list(optimizer)
+        assert optimizer.best is not None
+        return optimizer.best.loss
+
+    held = loss(FreeParameters(joints=False, base_frames=True))
+    assert loss(FreeParameters(joints=True, base_frames=True)) < 0.5 * held
+
+
+def test_a_frame_with_wrong_kinematics_hardly_matters(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+) -> None:
+    broken = {"PSM1": frames[0].measured["PSM1"] + np.deg2rad([4, -4, 0, 0, 0, 0, 0])}
+    mixed = [replace(frames[0], measured=broken), *frames[1:]]
+    free = FreeParameters(joints=False, base_frames=True)
+    settings = replace(SETTINGS, looks=2)
+    wrong = with_wrong_base(sequence.scene)
+    optimizer = CalibrationOptimizer(wrong, mixed, sight, settings=settings, free=free, cameras=["left"])
+    list(optimizer)
+    result = optimizer.result()
+    assert result.frame_weights[0] < 0.1 and result.frame_weights[1:].min() > 0.5
+    assert worst_error(result.scene, sequence.scene, frames[1].measured["PSM1"])[1] < 1.0
+
+
+def test_the_schur_complement_solves_what_the_whole_system_solves() -> None:
+    generator = torch.Generator().manual_seed(0)
+    own, shared, count = 3, 4, 5
+    factors = torch.randn(count, own + shared, own + shared, generator=generator, dtype=torch.float64)
+    curvatures = factors @ factors.transpose(1, 2) + torch.eye(own + shared)
+    gradients = torch.randn(count, own + shared, generator=generator, dtype=torch.float64)
+    size = shared + count * own
+    whole, right = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
+    for frame in range(count):
+        here = [*range(shared + frame * own, shared + (frame + 1) * own), *range(shared)]
+        whole[np.ix_(here, here)] += curvatures[frame]
+        right[here] += gradients[frame]
+    wanted = torch.linalg.solve(whole, -right)
+    models = [eliminate(g, c, own) for g, c in zip(gradients, curvatures, strict=True)]
+    curvature = torch.stack([model.curvature for model in models]).sum(0)
+    step = torch.linalg.solve(curvature, -torch.stack([model.gradient for model in models]).sum(0))
+    torch.testing.assert_close(step, wanted[:shared])
+    torch.testing.assert_close(torch.cat([model.own_step(step) for model in models]), wanted[shared:])
+    torch.testing.assert_close(torch.linalg.inv(curvature), torch.linalg.inv(whole)[:shared, :shared])
+
+
+def test_nothing_own_leaves_a_model_as_it_is() -> None:
+    gradient, curvature = torch.tensor([1.0, 2.0]), torch.tensor([[2.0, 0.5], [0.5, 3.0]])
+    model = eliminate(gradient, curvature, 0)
+    assert torch.equal(model.gradient, gradient.double()) and torch.equal(model.curvature, curvature.double())
+    assert model.own_step(gradient).shape == (0,)
+
+
+def test_frames_are_trusted_by_their_loss_beside_the_median() -> None:
+    weights = trust_of_frames(torch.tensor([0.1, 0.1, 0.12, 0.0, 1.5], dtype=torch.float64))
+    assert weights[:4].tolist() == [1.0] * 4 and float(weights[4]) == pytest.approx(0.01)
+    assert trust_of_frames(torch.zeros(2)).tolist() == [1.0, 1.0]
+
+
+def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequence) -> None:
+    scene = sequence.scene
+    assert with_fixed_gauge(scene, CALIBRATION).locked_cameras == ("left",)
+    for held in ({"base_frames": False}, {"extrinsics": False}, {"locked_cameras": ("right",)}):
+        free = replace(CALIBRATION, **held)
+        assert with_fixed_gauge(scene, free) == free
+
+
+def test_the_best_calibration_is_kept_when_it_is_cancelled(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+) -> None:
+    optimizer = CalibrationOptimizer(with_wrong_base(sequence.scene), frames[:1], sight, settings=SETTINGS)
+    first, second = optimizer.step(), optimizer.step()
+    optimizer.cancel()
+    assert optimizer.step() is None and optimizer.stop_reason == "cancelled"
+    assert first is not None and second is not None and second.loss < first.loss
+    assert optimizer.best is second and optimizer.result().scene is second.scene
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"free": FreeParameters()}, "nothing of the calibration is free"),
+        ({"settings": replace(CALIBRATION_SETTINGS, solver="adam")}, "needs gauss_newton"),
+        ({"joint_prior_deg": 0.0}, "joint_prior_deg is 0.0"),
+        ({"free": FreeParameters(joints=False, extrinsics=True, locked_cameras=("left", "right"))}, "nothing is free"),
+    ],
+)
+def test_what_makes_no_calibration_is_refused(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor, changes: dict, message: str
+) -> None:
+    with pytest.raises(SettingsError, match=message):
+        CalibrationOptimizer(sequence.scene, frames, sight, **changes)
+
+
+def test_no_frame_and_unknown_cameras_are_refused(
+    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+) -> None:
+    with pytest.raises(SettingsError, match="no frame was given"):
+        CalibrationOptimizer(sequence.scene, [], sight)
+    with pytest.raises(RobotError, match="no camera is called 'third'"):
+        CalibrationOptimizer(sequence.scene, frames, sight, free=replace(CALIBRATION, locked_cameras=("third",)))
+    optimizer = CalibrationOptimizer(sequence.scene, frames, sight)
+    with pytest.raises(SettingsError, match="no step was made"):
+        optimizer.result()
