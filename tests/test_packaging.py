@@ -131,7 +131,7 @@ for path in (*modules, sample_sequence(), shipped_robot(), *shipped_weights(), s
 """
     printed = _run(_python(environment), "-c", program, cwd=tmp_path).splitlines()
     paths = [Path(line.removeprefix("PATH ")) for line in printed if line.startswith("PATH ")]
-    assert len(paths) == 6
+    assert len(paths) == 7
     assert [path for path in paths if not path.is_relative_to(environment)] == []
 
 
