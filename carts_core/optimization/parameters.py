@@ -1,15 +1,19 @@
 """Between a scene's state and the vector of unknowns that a solver sees."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import roma
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import SettingsError
 from ..scene import Scene, SceneState
+from .prior import Prior
 from .settings import FreeParameters
 
 _FOCAL_SCALE = 1.0
@@ -40,12 +44,17 @@ class ParameterVector:
         free: what is unknown.
         lever: [m/rad].
 
+    Attributes:
+        names: what each unknown is.
+        prior: what is known of the unknowns, if it is other than that they are near 0.
+
     Raises:
         SettingsError: nothing is free, or `free` names an arm or a joint that does not exist.
     """
 
     def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, lever: float) -> None:
         self.start = start
+        self.prior: Prior | None = None
         self._lever = lever
         self.names: list[str] = []
         self._blocks: list[_Block] = []
@@ -113,9 +122,30 @@ class ParameterVector:
     def __len__(self) -> int:
         return len(self.names)
 
-    def prior_precision(self, prior_deg: float) -> Float[Tensor, " n"]:
-        """Inverse variance of each unknown at the start, where its expected error is `prior_deg` [1/rad^2]."""
-        return torch.full_like(self.lower, math.radians(prior_deg) ** -2)
+    def expected(self, prior_deg: float) -> Prior:
+        """`prior`, or if there is none, an error of `prior_deg` of each unknown at the start."""
+        precision = torch.full_like(self.lower, math.radians(prior_deg) ** -2)
+        return self.prior or Prior(torch.zeros_like(precision), torch.diag(precision))
+
+    def joint_offsets(self, joint_positions: Sequence[ArrayLike]) -> Float[np.ndarray, " n"]:
+        """Offsets that bring the arms to joint positions [rad, m]; NaN for unknowns that are no joints."""
+        offsets = np.full(len(self), math.nan)
+        for block in self._blocks:
+            if block.kind == "joints":
+                columns = list(block.columns)
+                start = self.start.joint_positions[block.index].cpu().double().numpy()
+                step = np.asarray(joint_positions[block.index], np.float64)[columns] - start[columns]
+                offsets[block.start : block.start + block.size] = step / self._joint_scales[block.start].numpy()
+        return offsets
+
+    def joint_std(self, std: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " dofs"]]:
+        """Standard deviation of each arm's joint positions [rad, m] from that of the unknowns; NaN where not free."""
+        result = [np.full(values.shape[-1], math.nan) for values in self.start.joint_positions]
+        for block in self._blocks:
+            if block.kind == "joints":
+                part = std[block.start : block.start + block.size]
+                result[block.index][list(block.columns)] = part * self._joint_scales[block.start].numpy()
+        return result
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""
