@@ -59,12 +59,18 @@ _EXACT = 1e14
 
 
 class ErrorModel:
-    """Beliefs about the parts of `n` corrections, [3 n]: all constants, all drifts, all noises."""
+    """Beliefs about the parts of n corrections, [3 n]: all constants, all drifts, all noises.
 
-    def __init__(self, settings: SequenceSettings, n: int) -> None:
-        self._n, self._drift_seconds = n, settings.drift_seconds
-        deviations = (settings.constant_deg, settings.drift_deg, settings.jitter_deg)
-        self._variance = np.repeat(np.radians(deviations) ** 2, n)
+    Args:
+        settings: of joints; other unknowns have as much less drift and noise as they have a smaller constant.
+        constant: deviation of each unknown's constant [rad].
+    """
+
+    def __init__(self, settings: SequenceSettings, constant: Float[np.ndarray, " n"]) -> None:
+        n = self._n = len(constant)
+        self._drift_seconds = settings.drift_seconds
+        shares = np.array([settings.constant_deg, settings.drift_deg, settings.jitter_deg]) / settings.constant_deg
+        self._variance = np.outer(shares, constant).ravel() ** 2
         self._sum = np.tile(np.eye(n), 3)
 
     def initial(self) -> Gaussian:

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .observability import Uncertainty
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -21,6 +23,8 @@ class Evaluation:
     """Of `value`; zero if it was not asked for."""
     curvature: Float[Tensor, "n n"] | None
     """Gauss-Newton's approximation of the second derivative of `value`; None where there is none."""
+    uncertainty: Uncertainty | None
+    """Standard deviations that follow from the curvature."""
     image: Float[Tensor, "cameras 3 h w"]
     """Rendered arms, RGB, black elsewhere."""
     silhouette: Float[Tensor, "cameras h w"]

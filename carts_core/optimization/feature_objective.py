@@ -98,6 +98,7 @@ class FeatureObjective:
             prior=float(prior.detach()),
             gradient=torch.nan_to_num(slope),
             curvature=None,
+            uncertainty=None,
             image=rendering.image.detach(),
             silhouette=rendering.silhouette.detach(),
             similarity=window.paste(similarity.detach(), torch.ones_like(rendering.silhouette)),

@@ -14,6 +14,7 @@ from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from .evaluation import Evaluation, Objective
 from .feature_objective import FeatureObjective
+from .observability import Uncertainty
 from .parameters import ParameterVector
 from .settings import FreeParameters, OptimizerSettings
 from .solvers import make_solver
@@ -36,10 +37,14 @@ class Iterate:
     seconds: float
     """Duration of this iteration [s]."""
     arm_names: tuple[str, ...]
+    joint_names: tuple[tuple[str, ...], ...]
+    """Per arm."""
     silhouette: Float[np.ndarray, "cameras h w"]
     """At the working resolution."""
     image: UInt8[np.ndarray, "cameras h w 3"]
     """Rendered arms at the working resolution, RGB."""
+    uncertainty: Uncertainty | None
+    """What the images determine; None for losses that cannot say."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
     """Of what is compared: cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
@@ -48,6 +53,11 @@ class Iterate:
         """Arm name -> joint positions [dofs], [rad, m]."""
         values = (value.cpu().double().numpy() for value in self.state.joint_positions)
         return dict(zip(self.arm_names, values, strict=True))
+
+    def joint_std(self) -> dict[str, np.ndarray]:
+        """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN where it is not known."""
+        known = self.uncertainty or Uncertainty((), (), ())
+        return {arm: known.joint_std(arm, joints) for arm, joints in zip(self.arm_names, self.joint_names, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -94,6 +104,7 @@ class FrameOptimizer:
         self.settings = settings or OptimizerSettings()
         scene = scene.with_cameras(cameras)
         self._arm_names = tuple(arm.name for arm in scene.arms)
+        self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         state = scene.state(frame.measured if start is None else start, extractor.device)
         self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
         self._objective: Objective
@@ -153,8 +164,10 @@ class FrameOptimizer:
             gradient_norms=dict(zip(self._parameters.names, evaluation.gradient.abs().tolist(), strict=True)),
             seconds=seconds,
             arm_names=self._arm_names,
+            joint_names=self._joint_names,
             silhouette=evaluation.silhouette.cpu().numpy().copy(),
             image=image.cpu().numpy().copy(),
+            uncertainty=evaluation.uncertainty,
             attention=evaluation.attention.cpu().numpy(),
             similarity=evaluation.similarity.cpu().numpy(),
         )

@@ -13,6 +13,9 @@ from torch import Tensor
 from ..errors import SettingsError
 from ..scene import Scene
 
+_CHANNELS = 96
+"""Channels that OpenCV filters at a time; it allows 128."""
+
 
 def stacked_images(
     scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
@@ -58,8 +61,11 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
         return blurred(flat[None], deviation).view(images.shape)
     kernel = cv2.getGaussianKernel(_kernel_size(deviation), deviation, cv2.CV_32F)
     planes = flat.permute(1, 2, 0).contiguous().numpy()
-    result = cv2.sepFilter2D(planes, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(result.reshape(planes.shape)).permute(2, 0, 1).reshape(images.shape)
+    for first in range(0, planes.shape[2], _CHANNELS):
+        part = np.ascontiguousarray(planes[:, :, first : first + _CHANNELS])
+        result = cv2.sepFilter2D(part, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+        planes[:, :, first : first + _CHANNELS] = result.reshape(part.shape)
+    return torch.from_numpy(planes).permute(2, 0, 1).reshape(images.shape)
 
 
 def _kernel_size(deviation: float) -> int:

@@ -122,11 +122,6 @@ class ParameterVector:
     def __len__(self) -> int:
         return len(self.names)
 
-    def expected(self, prior_deg: float) -> Prior:
-        """`prior`, or if there is none, an error of `prior_deg` of each unknown at the start."""
-        precision = torch.full_like(self.lower, math.radians(prior_deg) ** -2)
-        return self.prior or Prior(torch.zeros_like(precision), torch.diag(precision))
-
     def joint_offsets(self, joint_positions: Sequence[ArrayLike]) -> Float[np.ndarray, " n"]:
         """Offsets that bring the arms to joint positions [rad, m]; NaN for unknowns that are no joints."""
         offsets = np.full(len(self), math.nan)
@@ -138,14 +133,37 @@ class ParameterVector:
                 offsets[block.start : block.start + block.size] = step / self._joint_scales[block.start].numpy()
         return offsets
 
-    def joint_std(self, std: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " dofs"]]:
-        """Standard deviation of each arm's joint positions [rad, m] from that of the unknowns; NaN where not free."""
-        result = [np.full(values.shape[-1], math.nan) for values in self.start.joint_positions]
+    @property
+    def scales(self) -> Float[Tensor, " n"]:
+        """What an offset of 1 is in units of its unknown: 1 for angles and intrinsics, `lever` metres for lengths."""
+        scales = torch.ones_like(self.lower)
         for block in self._blocks:
+            part = scales[block.start : block.start + block.size]
             if block.kind == "joints":
-                part = std[block.start : block.start + block.size]
-                result[block.index][list(block.columns)] = part * self._joint_scales[block.start].numpy()
-        return result
+                part.copy_(self._joint_scales[block.start])
+            elif block.kind != "intrinsics":
+                part[3:] = self._lever
+        return scales
+
+    def prior_precision(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Float[Tensor, " n"]:
+        """Inverse variance of each unknown [1/rad^2].
+
+        Args:
+            joints_deg: expected error of joint positions at the start [deg]; `lever` makes it metres.
+            frames_deg: the same of base frames and camera extrinsics [deg].
+            intrinsics: the same of focal lengths and principal points, as a share of the focal length [1].
+        """
+        expected = torch.full_like(self.lower, intrinsics)
+        for block in self._blocks:
+            if block.kind != "intrinsics":
+                degrees = joints_deg if block.kind == "joints" else frames_deg
+                expected[block.start : block.start + block.size] = math.radians(degrees)
+        return expected**-2
+
+    def expected(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Prior:
+        """`prior`, or if there is none, errors around 0 as in `prior_precision`."""
+        precision = self.prior_precision(joints_deg, frames_deg, intrinsics)
+        return self.prior or Prior(torch.zeros_like(precision), torch.diag(precision))
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""

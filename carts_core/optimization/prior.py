@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,3 +23,8 @@ class Prior:
     def gradient(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Of `value` [1/rad]."""
         return self.precision @ (offsets - self.mean)
+
+    @property
+    def marginal(self) -> Float[Tensor, " n"]:
+        """Inverse variance of each unknown [1/rad^2]."""
+        return 1.0 / torch.linalg.inv(self.precision.double()).diagonal().to(self.precision)

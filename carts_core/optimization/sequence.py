@@ -18,6 +18,7 @@ from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from .error_model import ErrorModel, Gaussian, Information, combined, without
+from .observability import Uncertainty
 from .parameters import ParameterVector
 from .sequence_settings import SequenceSettings
 from .settings import FreeParameters, OptimizerSettings
@@ -42,6 +43,8 @@ class FrameEstimate:
     """Arm name -> [rad, m]."""
     joint_std: dict[str, Float[np.ndarray, " dofs"]]
     """Arm name -> standard deviation [rad, m]; 0 at a keyframe, NaN where a joint is not free."""
+    uncertainty: Uncertainty
+    """Of every unknown, with what was expected of it before any image."""
     loss: float
     """Of the surface objective, where the frame was last looked at; high where the image does not fit."""
     start: Start
@@ -119,7 +122,10 @@ class SequenceOptimizer:
         self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise)
         self._queue = list(self._gaps)
         _, parameters = self._open(self._queue[0])
-        self._errors = ErrorModel(self.model, len(parameters))
+        precision = parameters.prior_precision(
+            self.model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
+        )
+        self._errors = ErrorModel(self.model, precision.cpu().double().numpy() ** -0.5)
         self._visits: dict[int, _Visit] = {}
         self._beliefs: list[Gaussian] = []
         self._stale = False
@@ -264,8 +270,9 @@ class SequenceOptimizer:
         visit = self._visits[index]
         offsets = torch.from_numpy(correction.mean).to(visit.parameters.lower)
         state = visit.parameters.state(visit.parameters.clamp(offsets)).detached()
-        deviation = visit.parameters.joint_std(np.sqrt(correction.covariance.diagonal().clip(min=0.0)))
+        known = self._uncertainty(visit.parameters, correction)
         names = [arm.name for arm in self._scene.arms]
+        deviation = [known.joint_std(arm.name, arm.robot.joint_names) for arm in self._scene.arms]
         joints = [values.cpu().double().numpy() for values in state.joint_positions]
         if index in self._keyframes:
             joints = [self._keyframes[index][name] for name in names]
@@ -278,11 +285,18 @@ class SequenceOptimizer:
             state=state,
             joint_positions={name: values.copy() for name, values in zip(names, joints, strict=True)},
             joint_std=dict(zip(names, deviation, strict=True)),
+            uncertainty=known,
             loss=visit.sight.loss,
             start=visit.start,
             iterations=visit.sight.iterations,
             seconds=visit.seconds,
         )
+
+    def _uncertainty(self, parameters: ParameterVector, correction: Gaussian) -> Uncertainty:
+        scales = parameters.scales.cpu().double().numpy()
+        fresh = self._errors.correction(self._errors.initial())
+        std, expected = (np.sqrt(g.covariance.diagonal().clip(min=0.0)) * scales for g in (correction, fresh))
+        return Uncertainty(tuple(parameters.names), tuple(std.tolist()), tuple(expected.tolist()))
 
 
 def _gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:

@@ -45,14 +45,20 @@ class OptimizerSettings:
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
-    noise: float = 0.25
+    noise: float = 0.7
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
-    normals_weight: float = 0.5
-    """`surface`: weight of normals beside coverage [1]."""
+    parts_weight: float = 0.1
+    """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
+    normals_weight: float = 0.05
+    """`surface`: weight of normals beside that [1]."""
     prior_deg: float = 3.0
-    """`surface`: expected error of an unknown at the start [deg]; `lever` turns it into metres."""
+    """`surface`: expected error of a joint position at the start [deg]; `lever` turns it into metres."""
+    frame_prior_deg: float = 0.5
+    """`surface`: the same of base frames and camera extrinsics [deg]."""
+    intrinsics_prior: float = 0.01
+    """`surface`: the same of focal lengths and principal points, as a share of the focal length [1]."""
     learning_rate: float = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `lever` times as many metres."""
     decay: float = 0.82
@@ -74,7 +80,7 @@ class OptimizerSettings:
     """The same during the first half of the steps [px of the working image]."""
     working_width: int = 320
     """Width of the images that are compared [px]."""
-    tolerance: float = 1e-3
+    tolerance: float = 1e-2
     """`gauss_newton`: a stage ends when no more than this share of the objective is to be gained [1]. Other solvers
     stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
     patience: int = 10
@@ -92,8 +98,11 @@ class OptimizerSettings:
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
+        _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
         _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
+        _require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
+        _require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
         fits = self.solver != "gauss_newton" or self.loss == "surface"
         _require(fits, "solver", self.solver, f"adam or gradient_descent for the loss {self.loss}")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")

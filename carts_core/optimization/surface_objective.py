@@ -22,12 +22,16 @@ from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .evaluation import Evaluation
 from .inputs import smoothed, stacked_images, working_size
+from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
 from .window import Window
 
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
+
+_FINE = 2
+"""Number of stages that every look but the first one goes through."""
 
 _COARSEST = 4
 """Working pixels per side of a pixel in the coarsest stages."""
@@ -42,8 +46,8 @@ _EPSILON = 1e-3
 class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
-    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. Each look
-    has the stages that `blurs` tell, a later one only its last two.
+    The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
+    look serves the coarse stages, each later one the last two.
 
     Args:
         scene: with the cameras that take part.
@@ -67,9 +71,9 @@ class SurfaceObjective:
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
     ) -> None:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
-        later = settings.blurs[-2:]
-        self._plan = [(0, blur) for blur in settings.blurs]
-        self._plan += [(look, blur) for look in range(1, settings.looks) for blur in later]
+        coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
+        self._plan = [(0, blur) for blur in coarse]
+        self._plan += [(look, blur) for look in range(min(1, settings.looks - 1), settings.looks) for blur in fine]
         self.stages = len(self._plan)
         self._size = working_size(scene, settings.working_width, extractor.stride)
         device = extractor.device
@@ -77,7 +81,7 @@ class SurfaceObjective:
         self._weight = _weights(scene, ignore or {}, self._size).to(device)
         width, height = self._size
         self._whole = Renderer(scene, width=width, height=height, device=device)
-        self._prior = parameters.expected(settings.prior_deg)
+        self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._look = -1
 
     def epoch(self, stage: int) -> int:
@@ -102,6 +106,8 @@ class SurfaceObjective:
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
         blurs = [blur for number, blur in self._plan if number == look]
+        if blurs[-1] != self.settings.blurs[-1]:
+            blurs.append(self.settings.blurs[-1])
         self._stages = [_Stage(self.scene, self._size, window, observed, weight, blur, self.settings) for blur in blurs]
 
     def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:
@@ -110,10 +116,11 @@ class SurfaceObjective:
         compared = stage.compare(state, neighbours)
         final = compared if stage is self._stages[-1] else self._stages[-1].compare(state, None)
         prior = self._prior.value(offsets)
-        slope, curvature = torch.zeros_like(offsets), None
+        slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None:
             slope = self._prior.gradient(offsets) + compared.gradient
             curvature = self._prior.precision + compared.curvature
+            known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
         empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])
@@ -124,6 +131,7 @@ class SurfaceObjective:
             prior=prior,
             gradient=slope,
             curvature=curvature,
+            uncertainty=known,
             image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
             silhouette=paste(coverage, empty.clone()),
             similarity=paste(final.similarity, torch.ones_like(empty)),
@@ -176,15 +184,16 @@ class _Stage:
         )
         self._weight = functional.avg_pool2d(weight, self._factor)
         maps = functional.avg_pool2d(observed * weight, self._factor)
-        self._observed = smoothed(maps, self._blur)
+        self._observed = _compared(smoothed(maps, self._blur))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
+        self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
 
     def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "_Comparison":
         """Compare a state; with neighbours, also say how the cost changes."""
         tangents = self.renderer.tangents(*neighbours, 2 * _EPSILON) if neighbours else None
         rendering = self.renderer.surface(state, tangents)
-        residual = self._observed - smoothed(rendering.maps * self._weight, self._blur)
+        residual = self._observed - _compared(smoothed(rendering.maps * self._weight, self._blur))
         squared = (residual.square() * self._channels).sum(1, keepdim=True)
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         ratio = 1.0 / (1.0 + squared / self._robust**2)
@@ -194,7 +203,7 @@ class _Stage:
         )
         if rendering.jacobian is None:
             return comparison
-        jacobian = smoothed(rendering.jacobian * self._weight, self._blur).flatten(1)
+        jacobian = _compared(smoothed(rendering.jacobian * self._weight, self._blur)).flatten(1)
         weighted = jacobian * (ratio.square() * self._channels * self._precision).flatten()
         return replace(comparison, gradient=-weighted @ residual.flatten(), curvature=weighted @ jacobian.T)
 
@@ -210,6 +219,12 @@ class _Comparison:
     gradient: Float[Tensor, " n"] | None = None
     """Of the cost in units of the noise."""
     curvature: Float[Tensor, "n n"] | None = None
+
+
+def _compared(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
+    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
+    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
+    return maps
 
 
 def _neighbours(parameters: ParameterVector, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
