@@ -22,7 +22,7 @@ from .observability import Uncertainty
 from .parameters import ParameterVector
 from .sequence_settings import SequenceSettings
 from .settings import FreeParameters, OptimizerSettings
-from .sight import Eye, Sight
+from .sight import Eye, Ignore, Sight
 
 Start = Literal["warm", "cold", "keyframe", "carried"]
 """Where a frame's values come from: an optimization from the neighbour's correction or from the measured values, a
@@ -81,9 +81,11 @@ class SequenceOptimizer:
         model: of the measurement error, and the direction.
         free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] that a person set.
+        ignore: position -> camera name -> pixels that show an occluder; none by default.
         cameras: names of the cameras that take part, all by default.
 
     Raises:
+        RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
         SettingsError: there are no frames, a keyframe is none of them, times do not increase, nothing is free, or
             the settings are of another solver or loss.
     """
@@ -99,6 +101,7 @@ class SequenceOptimizer:
         model: SequenceSettings | None = None,
         free: FreeParameters | None = None,
         keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
+        ignore: Ignore | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
         self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
@@ -119,7 +122,7 @@ class SequenceOptimizer:
         strangers = set(self._keyframes) - set(self._gaps)
         if strangers:
             raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
-        self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise)
+        self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}))
         self._queue = list(self._gaps)
         _, parameters = self._open(self._queue[0])
         precision = parameters.prior_precision(
@@ -204,7 +207,7 @@ class SequenceOptimizer:
     def _look(
         self, frame: Frame, parameters: ParameterVector, expected: Gaussian, fresh: Gaussian
     ) -> tuple[Start, Sight, bool]:
-        """Look warm, and cold where there is no past or the loss is unusual; the last value says that it remains so."""
+        """Look warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
         if not self._beliefs:
             return "cold", self._eye.cold(frame, parameters, fresh), False
         losses = [visit.sight.loss for visit in self._visits.values() if visit.start != "carried"]
@@ -215,7 +218,8 @@ class SequenceOptimizer:
         cold = self._eye.cold(frame, parameters, fresh)
         best = min(warm, cold, key=lambda sight: sight.loss)
         best = replace(best, iterations=warm.iterations + cold.iterations)
-        return "warm" if best.loss == warm.loss else "cold", best, best.loss > usual
+        lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
+        return "warm" if best.loss == warm.loss else "cold", best, lost
 
     def _keyframe(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
         given = self._keyframes[frame.index]

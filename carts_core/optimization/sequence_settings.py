@@ -23,7 +23,7 @@ class SequenceSettings:
     """Deviation of the error that is new in every frame [deg]."""
     sight_noise: float = 4.0
     """As `noise`, for what a frame tells others; larger, since the errors of neighbouring pixels are alike [1]."""
-    cold_factor: float = 1.5
+    cold_factor: float = 2.0
     """A loss of that many times the usual one has a frame start cold [1]."""
     direction: Direction = "forward"
     """Where the first pass begins: at the first frame, or at the last one."""

@@ -1,10 +1,11 @@
 """What one frame's images say of its correction, near a place where it is looked for."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data import Frame
@@ -17,6 +18,8 @@ from .prior import Prior
 from .settings import OptimizerSettings
 from .solvers import make_solver
 from .surface_objective import SurfaceObjective
+
+Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _WARM_STEPS, _WARM_TOLERANCE = 3, 1e-2
 """As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
@@ -42,12 +45,13 @@ class Eye:
         extractor: the networks.
         settings: of a cold start; a warm one has its finest blur, one look and few steps.
         sight_noise: as `OptimizerSettings.noise`, for all but the search of a cold start.
+        ignore: position of a frame -> camera name -> pixels that show an occluder.
     """
 
     def __init__(
-        self, scene: Scene, extractor: FeatureExtractor, settings: OptimizerSettings, sight_noise: float
+        self, scene: Scene, extractor: FeatureExtractor, settings: OptimizerSettings, sight_noise: float, ignore: Ignore
     ) -> None:
-        self._scene, self._extractor, self._coarse = scene, extractor, settings
+        self._scene, self._extractor, self._coarse, self._ignore = scene, extractor, settings, ignore
         self._fine = replace(
             settings,
             blurs=settings.blurs[-1:],
@@ -79,7 +83,8 @@ class Eye:
         return Sight(correction, _information(offsets, evaluation, parameters), evaluation.loss, 0)
 
     def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
-        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings)
+        ignore = self._ignore(frame.index)
+        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings, ignore)
 
 
 def _prior(expected: Gaussian, parameters: ParameterVector) -> Prior:
