@@ -24,16 +24,21 @@ from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.panels.joints import JointsPanel
+from carts_viewer.panels.keypoints import KeypointsPanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.project import HistoryPanel, SavedPanel
+from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
+from carts_viewer.panels.timeline import TimelinePanel
 from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.picture import Painter
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
+from carts_viewer.storage import Storage, open_storage
 from carts_viewer.worker import Worker
 
 _PANEL_WIDTH = 312.0
@@ -52,6 +57,8 @@ class ViewerApp:
         sequence: The recording.
         scene: The recording's arms and cameras.
         stage: What is seen in 3D, frame and overlay included.
+        project: The sequence's corrections.
+        notice: Why they are not kept; None if they are.
         display: What puts states on the page.
         joints: The panel with the joints' sliders.
     """
@@ -59,6 +66,7 @@ class ViewerApp:
     def __init__(
         self,
         sequence: Sequence,
+        storage: Storage,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -66,12 +74,15 @@ class ViewerApp:
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
     ) -> None:
-        """Start serving an open sequence; arguments as in `open`."""
+        """Start serving an open sequence with its project, which is closed with the viewer; the rest as in `open`."""
         self._report = report
         self._closed = False
         self.sequence = sequence
         self.scene = sequence.scene
-        self._session = Session(sequence)
+        self.project = storage.project
+        self.notice = storage.notice
+        self._storage = storage
+        self._session = Session(sequence, storage.project)
         self._painter = Painter(sequence, device)
         state = self._first_state()
         self.mailbox = Mailbox()
@@ -88,6 +99,8 @@ class ViewerApp:
         self.display = PageDisplay(self.page, self._session, self._painter, self.stage, panels)
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.mailbox.put(ask.Released()))
+        self.page.on_pointed(self._on_pointed)
+        self.page.on_picked(lambda share: self.mailbox.put(ask.ShowFrame(int(_unit(share) * len(sequence)))))
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
 
@@ -96,6 +109,7 @@ class ViewerApp:
         cls,
         path: Path,
         *,
+        project: Path | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
@@ -106,6 +120,7 @@ class ViewerApp:
 
         Args:
             path: The sequence file.
+            project: The project file, begun if it is not there; None for the default place.
             host: A loopback address or `localhost`.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: Where to render and optimize, say `cpu` or `cuda`.
@@ -113,12 +128,18 @@ class ViewerApp:
             report: Told what takes long.
 
         Raises:
-            CartsError: the sequence, its robot or an option is not usable.
+            CartsError: the sequence, its robot, its project or an option is not usable.
         """
         check_loopback(host)
         report(f"Opening {path}")
         sequence = Sequence.open(path, progress=report)
-        return cls(sequence, host=host, port=port, device=device, weights=weights, report=report)
+        storage = open_storage(sequence, project)
+        report(f"Project {storage.project.path}" if storage.notice is None else storage.notice)
+        try:
+            return cls(sequence, storage, host=host, port=port, device=device, weights=weights, report=report)
+        except BaseException:
+            storage.close()
+            raise
 
     def __enter__(self) -> "ViewerApp":
         return self
@@ -132,13 +153,20 @@ class ViewerApp:
         return self._controller.state
 
     def close(self) -> None:
-        """Stop the worker and the server; closing again does nothing."""
+        """Save what is under way, stop the worker and the server; closing again does nothing.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
         if self._closed:
             return
         self._closed = True
         self._worker.stop()
-        self._session.close()
         self.page.close()
+        try:
+            self._session.close()
+        finally:
+            self._storage.close()
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
         """Wait until everything asked for so far has been done and sent to the page.
@@ -157,7 +185,7 @@ class ViewerApp:
         sequence = self._session.sequence
         domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
         frame = self._session.frame(0, domain, camera)
-        pose = self._session.measured(frame)
+        pose = self._session.pose(frame)
         return ViewState(
             index=0,
             frame=frame,
@@ -168,6 +196,7 @@ class ViewerApp:
             opacity=0.5,
             settings=OptimizerSettings(),
             free=FreeParameters(),
+            project=self.project.state,
         )
 
     def _build(self, state: ViewState) -> list[Panel]:
@@ -179,6 +208,7 @@ class ViewerApp:
         gui.main_panel.dock_left()
         gui.main_panel.set_width(_PANEL_WIDTH)
         panels: list[Panel] = [
+            SavedPanel(page, self._storage),
             MessagePanel(page, emit),
             BrowsePanel(page, session, emit, waits),
             OverlayPanel(page, session, state, emit, waits),
@@ -192,6 +222,13 @@ class ViewerApp:
                 CurvesPanel(gui),
                 SettingsPanel(page, state, emit),
                 FreePanel(page, session, state, emit),
+            ]
+        with right.add_tab("Review"):
+            panels += [
+                TimelinePanel(gui),
+                ReviewPanel(page, emit, waits),
+                KeypointsPanel(page, session, emit),
+                HistoryPanel(page, emit),
             ]
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
@@ -218,15 +255,24 @@ class ViewerApp:
         self.display.drawn(tab)
         self.mailbox.put(ask.Drawn())
 
+    def _on_pointed(self, u: float, v: float) -> None:
+        camera = self.scene.camera(self.state.camera)
+        self.mailbox.put(ask.PointAt(u * camera.width, v * camera.height))
+
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:
         client = self.page.server.get_clients().get(client_id)
         if client is not None:
             client.send_file_download(name, content, save_immediately=True)
 
 
+def _unit(share: float) -> float:
+    return min(max(share, 0.0), 1.0)
+
+
 def serve(
     sequence_path: Path,
     *,
+    project: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     device: str = "cpu",
@@ -237,6 +283,7 @@ def serve(
 
     Args:
         sequence_path: The sequence file.
+        project: The project file, begun if it is not there; None for the default place.
         host: A loopback address or `localhost`.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
@@ -250,7 +297,7 @@ def serve(
     began = time.monotonic()
     try:
         app = ViewerApp.open(
-            sequence_path, host=host, port=port, device=device, weights=weights, report=_print_progress
+            sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_print_progress
         )
     except CartsError as error:
         print(f"error: {error}", file=sys.stderr)

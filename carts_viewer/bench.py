@@ -8,6 +8,7 @@ The sliders are moved over a real websocket, as a browser moves them (at most 20
 import argparse
 import asyncio
 import dataclasses
+import tempfile
 import threading
 import time
 from dataclasses import dataclass
@@ -210,7 +211,12 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, nargs="*", default=())
     parser.add_argument("--iterations", type=int, default=_ITERATIONS)
     arguments = parser.parse_args()
-    with ViewerApp.open(arguments.sequence, port=0, weights=tuple(arguments.weights)) as app:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ViewerApp.open(
+            arguments.sequence, project=Path(folder) / "bench.carts", port=0, weights=tuple(arguments.weights)
+        ) as app,
+    ):
         app.wait_until_shown(120)
         camera = app.scene.camera(app.state.camera)
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from carts_viewer.marks import draw_keypoints, labelled_keypoints
 from carts_viewer.pace import Pace
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Panel
@@ -20,6 +21,7 @@ class PageDisplay:
         self._painter = painter
         self._stage = stage
         self._panels = panels
+        self._keypoints = tuple(labelled_keypoints(session.scene).values())
         self._pace = Pace()
         self._shown: ViewState | None = None
         self.drawn = self._pace.drawn
@@ -38,6 +40,10 @@ class PageDisplay:
             overlay = self._painter.overlay(
                 state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
             )
+            if state.keypoints.shown:
+                draw_keypoints(
+                    overlay, self._scene, state.pose.scene, state.camera, self._keypoints, state.keypoints.pins
+                )
             # Together, or a new frame would be seen for a moment under the old frame's overlay.
             with self._page.server.atomic():
                 if new_frame:
@@ -57,4 +63,4 @@ class PageDisplay:
 
 
 def _picture(state: ViewState) -> tuple:
-    return state.layer, state.opacity, id(state.maps)
+    return state.layer, state.opacity, id(state.maps), state.keypoints.shown, state.keypoints.pins

@@ -17,8 +17,7 @@ def frame_mask(painter: Painter, pose: Pose, camera: str) -> bytes:
 class ZipExport:
     """Masks of every frame and camera and the kinematics table, built one frame at a time.
 
-    A frame that was corrected in this session is written as corrected, every other one as measured; the table's
-    column `source` says which.
+    Corrected frames are written as corrected, the others as measured; the table's column `source` says which.
     """
 
     def __init__(self, session: Session, painter: Painter) -> None:
@@ -26,8 +25,8 @@ class ZipExport:
         self.done = 0
         self._session = session
         self._painter = painter
-        # Poses as they are now, so that an edit during the export cannot make files and table disagree.
-        self._corrected = session.corrected()
+        # The project as it is now, so that an edit during the export cannot make files and table disagree.
+        self._project = session.editor.view
         self._file = io.BytesIO()
         self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_DEFLATED)
         self._rows: list[KinematicsRow] = []
@@ -36,7 +35,7 @@ class ZipExport:
         """Add the next frame; False when there are no more after it."""
         sequence = self._session.sequence
         frame = sequence.frame(self.done, cameras=[])
-        pose = self._corrected.get(self.done) or self._session.measured(frame)
+        pose = self._session.pose(frame, self._project)
         for camera in sequence.scene.cameras:
             name = f"masks/{file_name(camera.name)}/{file_name(frame.frame_id)}.png"
             self._zip.writestr(name, frame_mask(self._painter, pose, camera.name), zipfile.ZIP_STORED)

@@ -13,6 +13,7 @@ import html
 import http
 import io
 import json
+import math
 import mimetypes
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -57,6 +58,10 @@ class Page:
         self._drawn = self.server.gui.add_text("drawn", "", visible=False)
         # And into this one when somebody lets go of a slider or leaves a field.
         self._released = self.server.gui.add_text("released", "", visible=False)
+        # Into this one which share of the timeline somebody clicked.
+        self._picked = self.server.gui.add_text("picked", "", visible=False)
+        # And into this one where somebody points in the picture.
+        self._pointed = self.server.gui.add_text("pointed", "", visible=False)
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -78,6 +83,18 @@ class Page:
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 callback()
+
+    def on_pointed(self, callback: Callable[[float, float], None]) -> None:
+        """Call `callback(u, v)` on the event loop whenever somebody points at a place of the image.
+
+        u and v are shares of its width and height, from its upper left corner; any numbers, if the tab is none of ours.
+        """
+
+        _on_numbers(self._pointed, 2, callback)
+
+    def on_picked(self, callback: Callable[[float], None]) -> None:
+        """Call `callback(share)` on the event loop whenever somebody clicks the timeline; any number, as above."""
+        _on_numbers(self._picked, 1, callback)
 
     def tell(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
         """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
@@ -162,7 +179,14 @@ class Page:
         return _response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
-        configuration = json.dumps({"drawn": self.drawn_id, "released": self._released._impl.uuid})
+        configuration = json.dumps(
+            {
+                "drawn": self.drawn_id,
+                "released": self._released._impl.uuid,
+                "picked": self._picked._impl.uuid,
+                "pointed": self._pointed._impl.uuid,
+            }
+        )
         return (
             _index_of_viser()
             .replace(
@@ -176,6 +200,19 @@ class Page:
             )
             .encode()
         )
+
+
+def _on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:
+    """Call back with the finite numbers that a tab has written into a field behind its own name and a counter."""
+
+    @field.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        try:
+            numbers = [float(part) for part in str(field.value).split()[2:]]
+        except ValueError:
+            return
+        if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
+            callback(*numbers)
 
 
 @functools.cache

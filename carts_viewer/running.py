@@ -1,7 +1,7 @@
 """The optimizer as the viewer drives it: made for one frame, stepped, and turned into poses of the whole scene."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -10,8 +10,9 @@ import torch
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters, Iterate, OptimizerSettings
+from carts_core.project import Provenance, Source
 from carts_core.scene import Scene, SceneState
-from carts_viewer.state import Pose, Source
+from carts_viewer.state import Pose
 
 
 class Optimizer(Protocol):
@@ -59,6 +60,15 @@ class OptimizerFactory:
             self._extractor = FeatureExtractor.load(*self._weights, device=self._device)
         return self._extractor
 
+    def provenance(self, cameras: Sequence[str], settings: OptimizerSettings, free: FreeParameters) -> Provenance:
+        """What a project keeps about a run with these settings.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        used = {**asdict(settings), "free": asdict(free), "cameras": list(cameras)}
+        return Provenance.made_by_optimizer(used, self.prepare().sha256)
+
     def make(
         self,
         index: int,
@@ -87,8 +97,11 @@ class OptimizerFactory:
 class ActiveRun:
     """One run on one frame: the optimizer, and where it started."""
 
-    def __init__(self, optimizer: Optimizer, scene: Scene, start: Pose, cameras: tuple[str, ...]) -> None:
+    def __init__(
+        self, optimizer: Optimizer, scene: Scene, start: Pose, cameras: tuple[str, ...], provenance: Provenance
+    ) -> None:
         self.start = start
+        self.provenance = provenance
         self.cameras = cameras
         self._optimizer = optimizer
         self._rows = [[camera.name for camera in scene.cameras].index(name) for name in cameras]
@@ -113,7 +126,7 @@ class ActiveRun:
         intrinsics = self.start.scene.intrinsics.clone()
         extrinsics[self._rows] = state.T_camera_world
         intrinsics[self._rows] = state.intrinsics
-        return Pose(replace(state, T_camera_world=extrinsics, intrinsics=intrinsics), Source.OPTIMIZED)
+        return Pose(replace(state, T_camera_world=extrinsics, intrinsics=intrinsics), Source.OPTIMIZER)
 
 
 def scene_at(scene: Scene, state: SceneState) -> Scene:

@@ -1,18 +1,31 @@
-"""The recording that is open, and the poses that the user has given to its frames. No widgets, no optimizer."""
+"""The recording that is open, and the poses that its project gives to its frames. No widgets, no optimizer."""
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from carts_core.data import Frame, FrameReader, Sequence
+from carts_core.errors import CartsError
 from carts_core.perturbation import perturb
+from carts_core.project import (
+    CorrectedIntrinsics,
+    CorrectedTransform,
+    Edits,
+    JointCorrection,
+    Key,
+    Project,
+    ProjectState,
+    Provenance,
+    Source,
+)
 from carts_core.scene import Arm, Scene, SceneState
-from carts_viewer.state import Pose, Source
-
-_KEPT_CHANGES = 200
+from carts_viewer.editing import Editor
+from carts_viewer.state import Pose
 
 
 @dataclass(frozen=True)
@@ -27,34 +40,26 @@ class JointRange:
     upper: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Change:
-    index: int
-    before: Pose | None
-    merges: object | None
-
-
 class Session:
-    """Frames of one sequence and this session's corrections of them.
+    """Frames of one sequence and its project's corrections of them.
 
-    A frame's pose is the measured one until somebody corrects it; corrections outlive a change of frame, and neither
-    camera nor domain touches them.
+    A frame's pose is the measured one until somebody corrects it; neither camera nor domain touches corrections.
+
+    Attributes:
+        sequence: the recording.
+        scene: its arms and cameras.
+        editor: its project, and what is on the way there.
+        ranges: what each joint may be set to, arm by arm.
     """
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: Sequence, project: Project) -> None:
         self.sequence = sequence
         self.scene: Scene = sequence.scene
+        self.editor = Editor(project)
         self.ranges = tuple(
             _range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
         )
         self._reader = FrameReader(sequence)
-        self._corrected: dict[int, Pose] = {}
-        self._changes: list[_Change] = []
-
-    @property
-    def undoable(self) -> int:
-        """How many changes `undo` can take back."""
-        return len(self._changes)
 
     def frame(self, index: int, domain: str, camera: str) -> Frame:
         """The frame with the image of that camera; those ahead of it are read in advance.
@@ -65,39 +70,80 @@ class Session:
         return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
-        """Stop reading frames in advance."""
-        self._reader.close()
+        """Stop reading frames in advance, and save what is under way.
 
-    def measured(self, frame: Frame) -> Pose:
-        """The pose that the kinematics table gives."""
-        return Pose(self.scene.state(frame.measured), Source.MEASURED)
-
-    def pose(self, frame: Frame) -> Pose:
-        """The frame's corrected pose, or the measured one."""
-        return self._corrected.get(frame.index) or self.measured(frame)
-
-    def correct(self, index: int, pose: Pose | None, *, merges: object | None = None) -> None:
-        """Remember a pose for a frame (None: the measured one again), as one step of undo.
-
-        Args:
-            index: The frame.
-            pose: Its new pose.
-            merges: Consecutive corrections of the same frame with an equal, not-None value here are one step; a drag
-                sends the same value with each of its events.
+        Raises:
+            ProjectError: it could not be saved.
         """
-        last = self._changes[-1] if self._changes else None
-        if last is None or merges is None or (last.index, last.merges) != (index, merges):
-            self._changes.append(_Change(index, self._corrected.get(index), merges))
-            del self._changes[:-_KEPT_CHANGES]
-        self._set(index, pose)
+        self._reader.close()
+        self.editor.save()
 
-    def undo(self) -> int | None:
-        """Take back the last correction; gives the index of its frame, or None when there is nothing to undo."""
-        if not self._changes:
-            return None
-        change = self._changes.pop()
-        self._set(change.index, change.before)
-        return change.index
+    def pose(self, frame: Frame, project: ProjectState | None = None) -> Pose:
+        """The frame's pose as a state of the project says, by default the present one with its draft."""
+        project = self.editor.view if project is None else project
+        corrections = project.joints(frame.index)
+        measured = {name: frame.measured[name] for name in project.identity.arms}
+        joints = {**measured, **{name: c.joint_positions for name, c in corrections.items()}}
+        state = _calibrated(self.scene, self.scene.state(joints), project)
+        sources = {correction.provenance.source for correction in corrections.values()}
+        return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
+
+    def measured(self, frame: Frame) -> SceneState:
+        """The state that the kinematics table gives, in the project's calibration."""
+        return _calibrated(self.scene, self.scene.state(frame.measured), self.editor.view)
+
+    def edits(self, frame: Frame, state: SceneState, provenance: Provenance) -> dict[Key[Any], Any]:
+        """What a project must change so that the frame's pose is this state.
+
+        What is as it was saved keeps its provenance, and what is as measured needs no correction.
+        """
+        saved = self.editor.project.state
+        before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured)
+        edits: dict[Key[Any], Any] = {}
+        for row, arm in enumerate(self.scene.arms):
+            key, values = Key.joints(frame.index, arm.name), state.joint_positions[row]
+            if torch.equal(values, before.joint_positions[row]):
+                edits[key] = saved.get(key)
+            elif torch.equal(values, measured.joint_positions[row]):
+                edits[key] = None
+            else:
+                edits[key] = JointCorrection(tuple(values.tolist()), provenance)
+            if not torch.equal(state.T_world_base[row], before.T_world_base[row]):
+                edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
+        for row, camera in enumerate(self.scene.cameras):
+            transform, intrinsics = state.T_camera_world[row], state.intrinsics[row]
+            if not torch.equal(transform, before.T_camera_world[row]):
+                edits[Key.extrinsics(camera.name)] = _transform(transform, provenance)
+            if not torch.equal(intrinsics, before.intrinsics[row]):
+                edits[Key.intrinsics(camera.name)] = CorrectedIntrinsics(tuple(intrinsics.tolist()), provenance)
+        return edits
+
+    def saved(self, index: int) -> Edits:
+        """What brings joint positions and review of a frame, and the calibration, back to as they are saved now."""
+        arms = [arm.name for arm in self.scene.arms]
+        cameras = [camera.name for camera in self.scene.cameras]
+        keys: list[Key[Any]] = [make(name) for make in (Key.extrinsics, Key.intrinsics) for name in cameras]
+        keys += [Key.base_frame(arm) for arm in arms] + [Key.joints(index, arm) for arm in arms] + [Key.review(index)]
+        return {key: self.editor.project.state.get(key) for key in keys}
+
+    def copied(self, frame: Frame, source: Frame) -> SceneState:
+        """The frame's measured state, corrected by as much as the source frame is; joint limits hold.
+
+        Raises:
+            CartsError: the source frame has no correction.
+        """
+        corrections = self.editor.view.joints(source.index)
+        if not corrections:
+            raise CartsError(
+                f"Frame {source.frame_id} is as measured, so there is no correction to copy. Correct it first."
+            )
+        values = {}
+        for name, correction in corrections.items():
+            here = np.asarray(frame.measured[name], np.float64)
+            low, high = self.scene.arm(name).robot.joint_limits.numpy().T
+            moved = here + np.array(correction.joint_positions) - source.measured[name]
+            values[name] = np.clip(moved, np.minimum(low, here), np.maximum(high, here))
+        return self.with_joints(self.measured(frame), values)
 
     def joint_range(self, arm: str, joint: int) -> JointRange:
         """What the joint with this index of this arm may be set to.
@@ -141,15 +187,33 @@ class Session:
             for arm, values in zip(self.scene.arms, state.joint_positions, strict=True)
         }
 
-    def corrected(self) -> dict[int, Pose]:
-        """The corrected frames so far, by index."""
-        return dict(self._corrected)
 
-    def _set(self, index: int, pose: Pose | None) -> None:
-        if pose is None or pose.source is Source.MEASURED:
-            self._corrected.pop(index, None)
-        else:
-            self._corrected[index] = pose
+_TELLING_FIRST = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
+"""Of a frame whose arms come from different sources, the one to tell people."""
+
+
+def _calibrated(scene: Scene, state: SceneState, project: ProjectState) -> SceneState:
+    """The state with base frames, extrinsics and intrinsics as the project corrects them."""
+
+    def corrected(stack: Tensor, values: list[Any]) -> Tensor:
+        rows = [
+            old if new is None else torch.tensor(new, dtype=old.dtype) for old, new in zip(stack, values, strict=True)
+        ]
+        return torch.stack(rows)
+
+    bases = [project.get(Key.base_frame(arm.name)) for arm in scene.arms]
+    extrinsics = [project.get(Key.extrinsics(camera.name)) for camera in scene.cameras]
+    intrinsics = [project.get(Key.intrinsics(camera.name)) for camera in scene.cameras]
+    return replace(
+        state,
+        T_world_base=corrected(state.T_world_base, [value and value.transform for value in bases]),
+        T_camera_world=corrected(state.T_camera_world, [value and value.transform for value in extrinsics]),
+        intrinsics=corrected(state.intrinsics, [value and value.intrinsics for value in intrinsics]),
+    )
+
+
+def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> CorrectedTransform:
+    return CorrectedTransform(tuple(tuple(row) for row in matrix.tolist()), provenance)
 
 
 def _range(arm: Arm, joint: int) -> JointRange:

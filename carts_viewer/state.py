@@ -5,16 +5,10 @@ from enum import StrEnum
 
 from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
+from carts_core.optimization.keypoints import Pin
+from carts_core.project import ProjectState, Review, Source
 from carts_core.scene import SceneState
 from carts_viewer.layers import Layer
-
-
-class Source(StrEnum):
-    """Where the shown joint positions of a frame come from."""
-
-    MEASURED = "measured"
-    EDITED = "edited"
-    OPTIMIZED = "optimized"
 
 
 class Phase(StrEnum):
@@ -81,6 +75,19 @@ class ExportState:
     total: int
 
 
+@dataclass(frozen=True)
+class KeypointState:
+    """Keypoints, and where a person has found some of them in the shown frame."""
+
+    shown: bool = False
+    """Whether they are marked in the picture."""
+    chosen: str | None = None
+    """Label of the one that is moved; None: the nearest."""
+    pins: tuple[Pin, ...] = ()
+    residuals: tuple[float, ...] = ()
+    """Distance of each pin from its keypoint in the shown pose [px]."""
+
+
 @dataclass(frozen=True, eq=False)
 class ViewState:
     """Everything the page shows."""
@@ -95,6 +102,10 @@ class ViewState:
     opacity: float
     settings: OptimizerSettings
     free: FreeParameters
+    project: ProjectState
+    """What is saved, and `unsaved` what is not."""
+    unsaved: bool = False
+    """Whether the last step of `project` is a gesture that is not saved yet."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
     every_camera: bool = False
@@ -102,13 +113,24 @@ class ViewState:
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
+    joint: tuple[str, int] | None = None
+    """The joint that keys nudge: arm, index of the joint; None: the first."""
+    keypoints: KeypointState = field(default_factory=KeypointState)
     maps: Maps | None = None
     """Of the shown pose, frame and domain; None while nobody needs them."""
     scores: Scores | None = None
     """Of the shown pose; None until they are computed, which is after its picture has been sent."""
-    undoable: int = 0
-    """How many changes can be taken back."""
     busy: str | None = None
     """What the worker is preparing, for people."""
     export: ExportState | None = None
     error: str | None = None
+
+    @property
+    def undoable(self) -> int:
+        """How many steps can be taken back."""
+        return self.project.position
+
+    @property
+    def review(self) -> Review:
+        """Of the shown frame."""
+        return self.project.review(self.index)

@@ -78,7 +78,8 @@ class Worker:
     def _round(self) -> None:
         patience = self._patience()
         self._set_resting(patience is None and self._mailbox.empty())
-        intents = self._mailbox.take(patience)
+        waits = [wait for wait in (patience, self._controller.overdue_in()) if wait is not None]
+        intents = self._mailbox.take(min(waits, default=None))
         self._set_resting(False)
         for intent in intents:
             self._attempt(lambda intent=intent: self._controller.handle(intent))

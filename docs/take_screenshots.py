@@ -7,6 +7,7 @@ Needs the development tools and Chromium (`CARTS_CHROMIUM` or on the path).
 
 import os
 import shutil
+import tempfile
 import time
 from pathlib import Path
 
@@ -28,7 +29,11 @@ def main() -> None:
     """Write docs/images/viewer.png."""
     leave_a_core_free()
     chromium = os.environ.get("CARTS_CHROMIUM") or shutil.which("chromium")
-    with ViewerApp.open(sample_sequence(), port=0) as app, sync_playwright() as playwright:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ViewerApp.open(sample_sequence(), project=Path(folder) / "pictured.carts", port=0) as app,
+        sync_playwright() as playwright,
+    ):
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         page = browser.new_page(viewport={"width": 1440, "height": 860})
         page.goto(app.url)

@@ -167,6 +167,20 @@
       return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     };
     let last = null;
+    let pointing = false;
+    let place = null;
+    /** Say where in the image the pointer is, at most 30 times a second, the last place always. */
+    const point = (event) => {
+      const image = imageRectangle();
+      if (!image) return;
+      const shown = visibleRectangle(image, viser().camera.aspect);
+      const [u, v] = share(event);
+      if (!place) setTimeout(() => { report("pointed", place.join(" ")); place = null; }, 33);
+      place = [
+        (shown.left + u * shown.width - image.left) / image.width,
+        (shown.top + v * shown.height - image.top) / image.height,
+      ];
+    };
     window.addEventListener("wheel", (event) => {
       if (!inPicture(event)) return;
       event.preventDefault();
@@ -174,9 +188,13 @@
       zoomAt(Math.exp(-event.deltaY * (event.deltaMode === 1 ? 0.05 : 0.0015)), ...share(event));
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
-      if (inPicture(event)) last = share(event);
+      if (!inPicture(event)) return;
+      pointing = event.shiftKey && event.button === 0;
+      if (pointing) point(event);
+      else last = share(event);
     }, { capture: true });
     window.addEventListener("pointermove", (event) => {
+      if (pointing) point(event);
       const image = imageRectangle();
       if (!last || !view.endoscope || !image) return;
       const now = share(event);
@@ -186,7 +204,17 @@
       last = now;
       refresh();
     }, { capture: true });
-    window.addEventListener("pointerup", () => { last = null; }, { capture: true });
+    window.addEventListener("pointerup", () => {
+      if (pointing) { grabbed = true; letGo(); }
+      last = null;
+      pointing = false;
+    }, { capture: true });
+    window.addEventListener("click", (event) => {
+      const timeline = event.target instanceof Element && event.target.closest(".carts-timeline");
+      if (!timeline) return;
+      const box = timeline.getBoundingClientRect();
+      report("picked", String((event.clientX - box.left) / box.width));
+    }, { capture: true });
     window.addEventListener("dblclick", (event) => { if (inPicture(event)) showEndoscope(); }, { capture: true });
   }
 
@@ -196,10 +224,11 @@
   let reports = 0;
 
   /** Put a new text into one of the invisible fields that the server listens to. */
-  function report(field) {
+  function report(field, text = "") {
     reports += 1;
     viser()?.sendMessage({
-      type: "GuiUpdateMessage", uuid: window.cartsConfiguration[field], updates: { value: `${tab} ${reports}` },
+      type: "GuiUpdateMessage", uuid: window.cartsConfiguration[field],
+      updates: { value: `${tab} ${reports} ${text}`.trim() },
     });
   }
 
@@ -211,6 +240,11 @@
     grabbed ||= event.target instanceof Element && event.target.closest(".mantine-Slider-root") !== null;
   }, { capture: true });
   window.addEventListener("pointerup", letGo, { capture: true });
+  // With the keyboard, a slider is let go of with its key and a field with Enter.
+  window.addEventListener("keyup", (event) => {
+    const slider = event.target instanceof Element && event.target.closest("[role=slider]");
+    if (slider || (event.key === "Enter" && isControl(event))) { grabbed = true; letGo(); }
+  }, { capture: true });
   window.addEventListener("focusout", (event) => { if (isControl(event)) { grabbed = true; letGo(); } });
   let drawnTexture = null;
 

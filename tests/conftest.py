@@ -29,6 +29,11 @@ def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def _projects_of_the_shipped_sequence_beside_the_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "data"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _as_many_threads_as_the_command_uses() -> None:
     leave_a_core_free()

@@ -16,6 +16,8 @@ class View:
 
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file."""
+    project: Path | None = None
+    """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
     """Address to listen on; only this machine by default."""
     port: int = 8080
@@ -30,6 +32,7 @@ class View:
 
         serve(
             self.sequence or sample_sequence(),
+            project=self.project,
             host=self.host,
             port=self.port,
             device=self.network.device,

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
-from .evaluation import Evaluation, Objective
+from .evaluation import Evaluation, Objective, Solver
 from .feature_objective import FeatureObjective
+from .gauss_newton import GaussNewton
 from .observability import Uncertainty
 from .parameters import ParameterVector
 from .settings import FreeParameters, OptimizerSettings
@@ -123,6 +124,7 @@ class FrameOptimizer:
         self.history: list[Progress] = []
         self.best: Iterate | None = None
         self._epoch = 0
+        self._retried = False
         self.stop_reason: str | None = None
 
     def cancel(self) -> None:
@@ -146,8 +148,22 @@ class FrameOptimizer:
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._epoch = iterate, epoch
+        self._offsets = self._restarted(epoch, solver)
         self.stop_reason = solver.finished
         return iterate
+
+    def _restarted(self, epoch: int, solver: Solver) -> torch.Tensor:
+        """The next offsets; better ones, once, where a first look that ended badly says that the start was bad."""
+        settings, objective = self.settings, self._objective
+        first_look_over = epoch == 0 and solver.finished is None and objective.epoch(solver.stage) > 0
+        if not (first_look_over and isinstance(solver, GaussNewton) and isinstance(objective, SurfaceObjective)):
+            return self._offsets
+        assert self.best is not None
+        if self._retried or self.best.loss < settings.bad_loss or settings.candidates == 0:
+            return self._offsets
+        self._retried = True
+        solver.restart()
+        return objective.better_start(self._offsets, settings.candidates)
 
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""

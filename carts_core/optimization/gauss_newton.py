@@ -29,6 +29,11 @@ class GaussNewton:
         self._iterations = 0
         self._begin_stage()
 
+    def restart(self) -> None:
+        """Begin again with the first stage; iterations go on counting."""
+        self.stage, self.finished, self._damping = 0, None, _FIRST_DAMPING
+        self._begin_stage()
+
     def _begin_stage(self) -> None:
         self._accepted: tuple[Tensor, Evaluation] | None = None
         self._evaluations = self._rejections = 0

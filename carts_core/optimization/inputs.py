@@ -50,7 +50,7 @@ def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[
     """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
     if deviation == 0:
         return images
-    size = _kernel_size(deviation)
+    size = 2 * kernel_radius(deviation) + 1
     return gaussian_blur2d(images, (size, size), (deviation, deviation), border_type="replicate")
 
 
@@ -59,7 +59,7 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
     flat = images.reshape(-1, *images.shape[-2:])
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
-    kernel = cv2.getGaussianKernel(_kernel_size(deviation), deviation, cv2.CV_32F)
+    kernel = cv2.getGaussianKernel(2 * kernel_radius(deviation) + 1, deviation, cv2.CV_32F)
     planes = flat.permute(1, 2, 0).contiguous().numpy()
     for first in range(0, planes.shape[2], _CHANNELS):
         part = np.ascontiguousarray(planes[:, :, first : first + _CHANNELS])
@@ -68,5 +68,6 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
     return torch.from_numpy(planes).permute(2, 0, 1).reshape(images.shape)
 
 
-def _kernel_size(deviation: float) -> int:
-    return 2 * math.ceil(2.5 * deviation) + 1
+def kernel_radius(deviation: float) -> int:
+    """How far a blur of that deviation [px] reaches [px]."""
+    return math.ceil(2.5 * deviation)

@@ -134,6 +134,11 @@ class ParameterVector:
         return offsets
 
     @property
+    def groups(self) -> list[range]:
+        """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
+        return [range(block.start, block.start + block.size) for block in self._blocks]
+
+    @property
     def scales(self) -> Float[Tensor, " n"]:
         """What an offset of 1 is in units of its unknown: 1 for angles and intrinsics, `lever` metres for lengths."""
         scales = torch.ones_like(self.lower)
@@ -145,7 +150,9 @@ class ParameterVector:
                 part[3:] = self._lever
         return scales
 
-    def prior_precision(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Float[Tensor, " n"]:
+    def prior_precision(
+        self, joints_deg: float, frames_deg: float = 0.5, intrinsics: float = 0.01
+    ) -> Float[Tensor, " n"]:
         """Inverse variance of each unknown [1/rad^2].
 
         Args:

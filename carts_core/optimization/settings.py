@@ -1,6 +1,6 @@
 """What an optimization may change, and how it goes about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
 
@@ -39,12 +39,16 @@ class OptimizerSettings:
     """Which loss; see `carts_core.losses.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
-    blurs: tuple[float, ...] = (6.0, 3.0, 1.5, 0.8)
+    blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 2
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
+    candidates: int = 64
+    """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
+    bad_loss: float = 0.09
+    """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
     noise: float = 0.7
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
@@ -93,6 +97,8 @@ class OptimizerSettings:
         _require(self.loss in get_args(Loss), "loss", self.loss, f"one of {', '.join(get_args(Loss))}")
         _require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
         _require(1 <= self.stage_iterations <= 1000, "stage_iterations", self.stage_iterations, "1 to 1000")
+        _require(0 <= self.candidates <= 10_000, "candidates", self.candidates, "0 to 10000")
+        _require(0 <= self.bad_loss <= 10, "bad_loss", self.bad_loss, "0 to 10")
         _require(1 <= self.looks <= 10, "looks", self.looks, "1 to 10")
         blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
@@ -122,6 +128,18 @@ class OptimizerSettings:
         _require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         _require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
+
+    def with_loss(self, loss: Loss) -> "OptimizerSettings":
+        """These settings for another loss, with a solver that can descend it.
+
+        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`.
+        """
+        solver = self.solver
+        if loss == "surface" and solver != "none":
+            solver = "gauss_newton"
+        elif solver == "gauss_newton":
+            solver = "adam"
+        return replace(self, loss=loss, solver=solver)
 
     @staticmethod
     def acs(iterations: int = 60) -> "OptimizerSettings":

@@ -7,6 +7,7 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -17,11 +18,11 @@ from torch.nn import functional
 
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
-from ..rendering import Renderer, SurfaceRendering
+from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .evaluation import Evaluation
-from .inputs import smoothed, stacked_images, working_size
+from .inputs import kernel_radius, smoothed, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
@@ -30,10 +31,13 @@ from .window import Window
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
+_SPREAD = 1.5
+"""Deviation of random starts, in expected errors."""
+
 _FINE = 2
 """Number of stages that every look but the first one goes through."""
 
-_COARSEST = 4
+_COARSEST = 8
 """Working pixels per side of a pixel in the coarsest stages."""
 
 _SMALLEST_BLUR = 1.2
@@ -96,6 +100,33 @@ class SurfaceObjective:
                 self._look_at(offsets, look)
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._stages[stage - first], gradient)
+
+    def better_start(self, offsets: Float[Tensor, " n"], candidates: int, seed: int = 0) -> Float[Tensor, " n"]:
+        """Offsets worth starting from again: the best of random ones, arm by arm, in the coarsest stage.
+
+        Args:
+            offsets: what has been found so far; it and the start are among the candidates.
+            candidates: number of random ones per arm, drawn from what the prior expects and half as much again.
+            seed: of the random numbers.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        spread = _SPREAD * self._prior.rsqrt().cpu()
+        best = offsets
+        with torch.no_grad():
+            best_cost = self._coarse_cost(best)
+            for group in self.parameters.groups:
+                for index in range(candidates + 1):
+                    drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
+                    trial = best.clone()
+                    trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
+                    cost = self._coarse_cost(self.parameters.clamp(trial))
+                    if cost < best_cost:
+                        best, best_cost = self.parameters.clamp(trial), cost
+        return best
+
+    def _coarse_cost(self, offsets: Tensor) -> float:
+        cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
+        return cost / self.settings.noise**2 + 0.5 * float((self._prior * offsets.square()).sum())
 
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
@@ -170,7 +201,7 @@ class _Stage:
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
-        self._factor = max(f for f in (1, 2, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
         self._blur, self._robust = blur / self._factor, settings.robust
         # A pixel of a coarse stage stands for many of the last one.
         self._precision = self._factor**2 / settings.noise**2
@@ -192,20 +223,47 @@ class _Stage:
     def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "_Comparison":
         """Compare a state; with neighbours, also say how the cost changes."""
         tangents = self.renderer.tangents(*neighbours, 2 * _EPSILON) if neighbours else None
-        rendering = self.renderer.surface(state, tangents)
+        rendering = self.renderer.surface(state, tangents, 1 + kernel_radius(self._blur))
         residual = self._observed - _compared(smoothed(rendering.maps * self._weight, self._blur))
         squared = (residual.square() * self._channels).sum(1, keepdim=True)
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         ratio = 1.0 / (1.0 + squared / self._robust**2)
-        cost = 0.5 * self._factor**2 * float((squared * ratio).sum())
         comparison = _Comparison(
-            cost, rendering, (1.0 - squared[:, 0]).clamp(min=-1.0), (ratio.square() * self._weight)[:, 0]
+            0.5 * self._factor**2 * float((squared * ratio).sum()),
+            rendering,
+            (1.0 - squared[:, 0]).clamp(min=-1.0),
+            (ratio.square() * self._weight)[:, 0],
         )
-        if rendering.jacobian is None:
+        if tangents is None:
             return comparison
-        jacobian = _compared(smoothed(rendering.jacobian * self._weight, self._blur)).flatten(1)
-        weighted = jacobian * (ratio.square() * self._channels * self._precision).flatten()
-        return replace(comparison, gradient=-weighted @ residual.flatten(), curvature=weighted @ jacobian.T)
+        weight = ratio.square() * self._channels * self._precision
+        gradient, curvature = self._normal_equations(rendering.jacobian, residual, weight, len(tangents.intrinsics))
+        return replace(comparison, gradient=gradient, curvature=curvature)
+
+    def _normal_equations(
+        self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, weight: Tensor, unknowns: int
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
+        """-J^T W r and J^T W J, under the blur."""
+        gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
+        windows, blocks = [], []
+        for block in jacobian:
+            rows, columns = block.values.shape[-2:]
+            window = Window(block.left, block.top, columns, rows)
+            values = _compared(smoothed(block.values * window.of(self._weight), self._blur))
+            weighted = (values * window.of(weight)).flatten(1)
+            gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
+            curvature[block.unknowns[:, None], block.unknowns] = weighted @ values.flatten(1).T
+            windows.append(window)
+            blocks.append((block.unknowns, values))
+        for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
+            common = a.common(b)
+            if common is None:
+                continue
+            ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
+            cross = ours @ common.inside(b).of(second).flatten(1).T
+            curvature[mine[:, None], others] = cross
+            curvature[others[:, None], mine] = cross.T
+        return gradient, curvature
 
 
 @dataclass(frozen=True)

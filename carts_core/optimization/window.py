@@ -43,6 +43,17 @@ class Window:
             and self.top + self.height >= other.top + other.height
         )
 
+    def common(self, other: "Window") -> "Window | None":
+        """What lies in both; None if nothing does."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right = min(self.left + self.width, other.left + other.width)
+        bottom = min(self.top + self.height, other.top + other.height)
+        return Window(left, top, right - left, bottom - top) if left < right and top < bottom else None
+
+    def inside(self, outer: "Window") -> "Window":
+        """This window as a part of one that holds it."""
+        return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
+
     def of(self, image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch {self.height} {self.width}"]:
         """This part of an image."""
         return image[..., self.top : self.top + self.height, self.left : self.left + self.width]

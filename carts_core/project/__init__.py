@@ -6,6 +6,7 @@ from .keys import Key as Key
 from .keys import Kind as Kind
 from .layers import IgnoreRegion as IgnoreRegion
 from .layers import MaskCorrection as MaskCorrection
+from .place import default_path as default_path
 from .project import Change as Change
 from .project import Project as Project
 from .queries import frames_in as frames_in

@@ -16,6 +16,7 @@ from . import database, journal
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
 from .lock import WriterLock
+from .place import default_path
 from .state import ExportRecord, ProjectState, Step
 from .values import Figures
 
@@ -77,15 +78,19 @@ class Project:
 
     @classmethod
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
-        """The project of a sequence, begun if there is none: by default `NAME.carts` beside `NAME.toml`.
+        """The project of a sequence, begun if there is none; by default at `default_path`.
 
         While another process has it open for writing, it opens read-only; see `writable` and `read_only_reason`.
 
         Raises:
             ProjectError: see the class.
         """
-        default = Path(sequence.path).with_suffix(".carts")
-        return cls(SequenceIdentity.of(sequence), path or default, read_only=read_only)
+        if path is None:
+            path = default_path(Path(sequence.path))
+            if not read_only:
+                with database.errors_explained(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+        return cls(SequenceIdentity.of(sequence), path, read_only=read_only)
 
     @property
     def writable(self) -> bool:

@@ -2,9 +2,10 @@
 
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
+from .surface import JacobianBlock as JacobianBlock
 from .surface import SurfaceRendering as SurfaceRendering
 from .surface import Tangents as Tangents
 from .visibility_numba import visibility_numba as visibility
 from .visibility_torch import visibility_torch as visibility_torch
 
-__all__ = ["Renderer", "Rendering", "SurfaceRendering", "Tangents", "visibility", "visibility_torch"]
+__all__ = ["JacobianBlock", "Renderer", "Rendering", "SurfaceRendering", "Tangents", "visibility", "visibility_torch"]

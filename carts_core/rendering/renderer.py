@@ -127,14 +127,14 @@ class Renderer:
         return labels.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
 
     @torch.no_grad()
-    def surface(self, state: SceneState, tangents: Tangents | None = None) -> SurfaceRendering:
-        """Surface maps of one state (no batch), with their Jacobian if tangents are given."""
+    def surface(self, state: SceneState, tangents: Tangents | None = None, margin: int = 1) -> SurfaceRendering:
+        """Surface maps of one state (no batch), with their Jacobian if tangents are given; see `surface_maps`."""
         Ts, intrinsics = self._views(state)
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
         points = visible_points(self.geometry, face_ids, inverse_depth, Ts, intrinsics)
         parts = self.geometry.face_parts[points.face]
         colors = self.geometry.face_colors[:, points.face]
-        return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents)
+        return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents, margin)
 
     @torch.no_grad()
     def tangents(self, low: SceneState, high: SceneState, distance: float) -> Tangents:

@@ -25,6 +25,25 @@ class Tangents:
 
 
 @dataclass(frozen=True)
+class JacobianBlock:
+    """Derivatives by the unknowns that move the same arms, around what they move; zero elsewhere."""
+
+    unknowns: Int[Tensor, " g"]
+    """Which they are."""
+    left: int
+    top: int
+    """Where the values lie in the maps [px]."""
+    values: Float[Tensor, "g cameras 6 rows columns"]
+
+    def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
+        """The derivative of whole maps by all unknowns, [unknowns, cameras, 6, height, width]."""
+        whole = like.new_zeros(unknowns, *like.shape)
+        rows, columns = self.values.shape[-2:]
+        whole[self.unknowns, :, :, self.top : self.top + rows, self.left : self.left + columns] = self.values
+        return whole
+
+
+@dataclass(frozen=True)
 class SurfaceRendering:
     """Surface maps of all cameras, without autograd."""
 
@@ -32,8 +51,8 @@ class SurfaceRendering:
     """See `carts_core.surface`."""
     image: Float[Tensor, "cameras 3 height width"]
     """Shaded, linear RGB in [0, 1]."""
-    jacobian: Float[Tensor, "unknowns cameras 6 height width"] | None
-    """Derivative of the maps by each unknown, if asked for."""
+    jacobian: tuple[JacobianBlock, ...]
+    """Derivative of the maps by the unknowns; empty if it was not asked for."""
 
 
 def surface_maps(
@@ -45,6 +64,7 @@ def surface_maps(
     intrinsics: Float[Tensor, "cameras 4"],
     inverse_depth: Float[Tensor, "cameras height width"],
     tangents: Tangents | None = None,
+    margin: int = 1,
 ) -> SurfaceRendering:
     """Surface maps of visible points.
 
@@ -55,6 +75,7 @@ def surface_maps(
         Ts_camera_link, intrinsics: where links are, and the cameras.
         inverse_depth: 1 / depth [1/m], 0 for background.
         tangents: of the unknowns; without them there is no Jacobian.
+        margin: what the Jacobian's blocks hold around what is moved [px].
     """
     position, normal = points.transformed(Ts_camera_link)
     side = torch.where((position * normal).sum(0) > 0, -1.0, 1.0)
@@ -67,11 +88,69 @@ def surface_maps(
     dense = dense.view(len(values), *inverse_depth.shape).transpose(0, 1).contiguous()
     maps, image = dense[:, :SURFACE_CHANNELS].contiguous(), dense[:, SURFACE_CHANNELS:]
     if tangents is None:
-        return SurfaceRendering(maps, image, None)
-    velocity, turning = _motion(points, position, side, intrinsics, inverse_depth, tangents)
-    jacobian = _carried(maps, velocity, inverse_depth)
-    jacobian[:, :, NORMALS] += turning
-    return SurfaceRendering(maps, image, jacobian)
+        return SurfaceRendering(maps, image, ())
+    blocks = []
+    for unknowns, runs in _families(points, tangents):
+        box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
+        velocity, turning = _motion(points, position, side, intrinsics, inverse_depth, tangents, unknowns, runs, box)
+        values = _carried(box.of(maps), velocity, box.of(inverse_depth))
+        values[:, :, NORMALS] += turning
+        blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
+    return SurfaceRendering(maps, image, tuple(blocks))
+
+
+_Run = tuple[int, int, slice]
+"""View, link, and where its points are."""
+
+
+def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
+    """Unknowns that move common links, with all the visible links that they move."""
+    moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
+    moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
+    runs: list[_Run] = []
+    begin = 0
+    for view, link, count in points.groups:
+        runs.append((view, link, slice(begin, begin + count)))
+        begin += count
+    families: list[tuple[list[int], set[int]]] = []
+    for unknown, moved in enumerate(moves.cpu().numpy()):
+        mine = {index for index, (view, link, _) in enumerate(runs) if moved[view, link]}
+        if not mine:
+            continue
+        related = [family for family in families if family[1] & mine]
+        families = [family for family in families if not family[1] & mine]
+        unknowns = sorted([unknown, *(other for family in related for other in family[0])])
+        families.append((unknowns, mine.union(*(family[1] for family in related))))
+    return [(unknowns, [runs[index] for index in sorted(indices)]) for unknowns, indices in families]
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A rectangle of all cameras' maps [px]."""
+
+    left: int
+    top: int
+    columns: int
+    rows: int
+
+    @staticmethod
+    def around(pixels: list[Tensor], inverse_depth: Float[Tensor, "cameras height width"], margin: int) -> "_Box":
+        """What holds these pixels of the flattened maps, with a margin."""
+        height, width = inverse_depth.shape[1:]
+        pixel = torch.cat(pixels)
+        column, row = pixel % width, pixel // width % height
+        left, top = max(int(column.min()) - margin, 0), max(int(row.min()) - margin, 0)
+        right, bottom = min(int(column.max()) + margin + 1, width), min(int(row.max()) + margin + 1, height)
+        return _Box(left, top, right - left, bottom - top)
+
+    def of(self, maps: Tensor) -> Tensor:
+        """This part of maps [..., height, width]."""
+        return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
+
+    def index(self, pixel: Int[Tensor, " K"], height: int, width: int) -> Int[Tensor, " K"]:
+        """Where pixels of the flattened maps are in the flattened box."""
+        column, row, camera = pixel % width, pixel // width % height, pixel // (width * height)
+        return (camera * self.rows + row - self.top) * self.columns + column - self.left
 
 
 def _motion(
@@ -81,17 +160,16 @@ def _motion(
     intrinsics: Float[Tensor, "cameras 4"],
     inverse_depth: Float[Tensor, "cameras height width"],
     tangents: Tangents,
-) -> tuple[Float[Tensor, "unknowns cameras 2 height width"], Float[Tensor, "unknowns cameras 3 height width"]]:
+    unknowns: list[int],
+    runs: list[_Run],
+    box: _Box,
+) -> tuple[Float[Tensor, "g cameras 2 rows columns"], Float[Tensor, "g cameras 3 rows columns"]]:
     """Velocity of what each pixel sees [px per unit of each unknown], and the change of its normal."""
-    unknowns = len(tangents.Ts_camera_link)
-    flat = position.new_zeros(unknowns, 5, inverse_depth.numel())
-    begin = 0
-    for view, link, count in points.groups:
-        here = slice(begin, begin + count)
-        begin += count
-        dT, dK, K = tangents.Ts_camera_link[:, view, link], tangents.intrinsics[:, view], intrinsics[view]
-        moving = ((dT.abs().amax((1, 2)) > 0) | (dK.abs().amax(1) > 0)).nonzero()[:, 0]
-        dT, dK = dT[moving], dK[moving]
+    cameras, height, width = inverse_depth.shape
+    flat = position.new_zeros(len(unknowns), 5, cameras * box.rows * box.columns)
+    for view, link, here in runs:
+        dT, dK = tangents.Ts_camera_link[unknowns, view, link], tangents.intrinsics[unknowns, view]
+        K = intrinsics[view]
         dX = dT[:, :3, :3] @ points.point_link[:, here] + dT[:, :3, 3:]
         X, Y, Z = position[:, here]
         motion = torch.cat(
@@ -102,18 +180,16 @@ def _motion(
             ],
             1,
         )
-        pixel = points.pixel[here]
-        for unknown, value in zip(moving.tolist(), motion, strict=True):
-            flat[unknown][:, pixel] = value
-    shaped = flat.view(unknowns, 5, *inverse_depth.shape).transpose(1, 2)
+        flat[:, :, box.index(points.pixel[here], height, width)] = motion
+    shaped = flat.view(len(unknowns), 5, cameras, box.rows, box.columns).transpose(1, 2)
     return shaped[:, :, :2], shaped[:, :, 2:]
 
 
 def _carried(
     maps: Float[Tensor, "cameras 6 height width"],
-    velocity: Float[Tensor, "unknowns cameras 2 height width"],
+    velocity: Float[Tensor, "g cameras 2 height width"],
     inverse_depth: Float[Tensor, "cameras height width"],
-) -> Float[Tensor, "unknowns cameras 6 height width"]:
+) -> Float[Tensor, "g cameras 6 height width"]:
     """Change of the maps as adjacent pixels are carried by the nearer one's point; see `motion.py`."""
     jacobian = maps.new_zeros(len(velocity), *maps.shape)
     size = maps.shape[2:]

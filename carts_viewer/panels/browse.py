@@ -2,17 +2,19 @@
 
 import viser
 
+from carts_core.project import Source
 from carts_viewer import intents as ask
 from carts_viewer.controller import SPEEDS
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
-from carts_viewer.state import Scores, Source, ViewState
+from carts_viewer.state import Scores, ViewState
 
 _SOURCES = {
     Source.MEASURED: "joints as measured",
-    Source.EDITED: "joints moved by hand",
-    Source.OPTIMIZED: "joints optimized",
+    Source.HAND: "joints moved by hand",
+    Source.OPTIMIZER: "joints optimized",
+    Source.PROPAGATED: "joints taken from other frames",
 }
 
 

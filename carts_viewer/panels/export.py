@@ -20,7 +20,7 @@ class ExportPanel:
         gui.add_markdown(
             f"**All {len(session.sequence)} frames**: a zip with the masks of "
             f"{'all cameras' if cameras > 1 else 'every frame'} and `kinematics.csv`. Frames that you optimized or "
-            "edited here are written as corrected, the others as measured; column `source` says which."
+            "edited are written as corrected, the others as measured; column `source` says which."
         )
         self._all = gui.add_button("Export all", icon=viser.Icon.FILE_ZIP)
         self._progress = gui.add_progress_bar(0.0, visible=False)

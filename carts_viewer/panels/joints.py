@@ -8,7 +8,7 @@ import viser
 from carts_viewer import intents as ask
 from carts_viewer.controller import LARGEST_PERTURBATION
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid
+from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
 from carts_viewer.session import JointRange, Session
 from carts_viewer.state import ViewState
 
@@ -45,12 +45,21 @@ class JointsPanel:
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
         page.columns([self._degrees, self._seed], narrow_labels=True)
         perturb = gui.add_button("Perturb all joints", color="gray")
-        self._undo = gui.add_button("Undo", color="gray")
-        page.row(perturb, self._undo, weights=(5, 3))
         measured = gui.add_button("Back to measured", icon=viser.Icon.HISTORY, color="gray")
+        before = gui.add_button("Copy previous", color="gray", hint="Correct by as much as the previous frame is")
+        after = gui.add_button("Copy next", color="gray", hint="Correct by as much as the next frame is")
+        page.row(before, after)
+        self._names = {
+            f"{limits.arm} {humanized(limits.joint)}": (limits.arm, number)
+            for arm in session.scene.arms
+            for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
+        }
+        self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="The joint that the keys I and O move")
         on_click(perturb, lambda _: self.perturb(), emit)
         on_click(measured, lambda _: ask.BackToMeasured(), emit)
-        on_click(self._undo, lambda _: ask.Undo(), emit)
+        on_click(before, lambda _: ask.CopyCorrection(-1), emit)
+        on_click(after, lambda _: ask.CopyCorrection(1), emit)
+        on_input(self._nudged, lambda name: ask.ChooseJoint(self._names[name]), emit)
 
         @window.on_update
         async def _(event: viser.GuiEvent) -> None:
@@ -82,7 +91,8 @@ class JointsPanel:
                 if not near and not self._waits((ask.SetJoint, arm, joint)):
                     self._widen(slider, shown)
                     slider.value = round(shown, 2)
-        self._undo.disabled = state.undoable == 0
+        if state.joint is not None:
+            write(self._nudged, next(name for name, joint in self._names.items() if joint == state.joint))
 
     def _add_arm(self, page: Page, arm: str, state: ViewState, emit: Emit) -> None:
         gui = page.server.gui

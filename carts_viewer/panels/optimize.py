@@ -12,6 +12,7 @@ from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
 
 LOSS_LABELS = {
+    "surface": "Surface, Gauss-Newton",
     "acs": "ACS, per attended area",
     "acs_paper": "ACS as in the paper",
     "acs_reference": "ACS as in the paper's code",

@@ -33,7 +33,7 @@ class SettingsPanel:
             for field in fields(OptimizerSettings):
                 if field.name not in _ELSEWHERE:
                     self._widgets[field.name] = _widget(gui, field.name, getattr(state.settings, field.name), hints)
-                    on_input(self._widgets[field.name], _setter(field.name), emit)
+                    on_input(self._widgets[field.name], _setter(field.name, getattr(state.settings, field.name)), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
@@ -41,7 +41,8 @@ class SettingsPanel:
         self._error.content = f'<p class="carts-error">{escaped(state.settings_error or "")}</p>'
         if state.settings_error is None:
             for name, widget in self._widgets.items():
-                write(widget, getattr(state.settings, name))
+                value = getattr(state.settings, name)
+                write(widget, _listed(value) if isinstance(value, tuple) else value)
 
 
 class FreePanel:
@@ -100,6 +101,8 @@ def _widget(gui: Any, name: str, value: Any, hints: dict[str, str]) -> Any:
     # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
     short = unit.group(1).split()[0] if unit else "1"
     label = humanized(name) if short == "1" else f"{humanized(name)} [{short}]"
+    if isinstance(value, tuple):
+        return gui.add_text(label, _listed(value), hint=hint)
     if choices:
         return gui.add_dropdown(label, list(choices), initial_value=value, hint=hint)
     if isinstance(value, bool):
@@ -108,8 +111,22 @@ def _widget(gui: Any, name: str, value: Any, hints: dict[str, str]) -> Any:
     return gui.add_number(label, value, step=step, hint=hint)
 
 
-def _setter(name: str):
+def _setter(name: str, example: Any):
+    if isinstance(example, tuple):
+        return lambda text: ask.SetSetting(name, _numbers(text))
     return lambda value: ask.SetSetting(name, value)
+
+
+def _listed(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers from a text field; none at all, which no setting takes, when it is not a list of them."""
+    try:
+        return tuple(float(part) for part in text.replace(",", " ").split())
+    except ValueError:
+        return ()
 
 
 def _free_joint(arm: str, joint: str):

@@ -35,10 +35,10 @@ def test_evaluate_writes_scores_of_every_frame_and_their_means(sequence: str, tm
     ]
     assert all(set(score) == SCORE_KEYS for score in [*scores["frames"], scores["mean"]])
     first = scores["frames"][0]
-    assert first["camera"] == "left" and first["iterations"] == 2 and first["stopped"] == "iterations"
+    assert first["camera"] == "left" and first["iterations"] <= 2 and first["stopped"] in ("iterations", "converged")
     assert first["joint_mae_deg_before"] == pytest.approx(0.573, abs=0.001)
     assert 0.5 < first["dice_before"] < 1 and 0.5 < first["dice_after"] <= 1
-    assert scores["mean"]["iterations"] == 2 and scores["mean"]["frame"] is None
+    assert 0 < scores["mean"]["iterations"] <= 2 and scores["mean"]["frame"] is None
 
 
 def test_evaluate_without_truth_gives_null(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:

@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 from playwright.sync_api import Browser, sync_playwright
+from viewer_desk import Desk
 
+from carts_core.data import Sequence
 from carts_core.features.network import Architecture, FeatureNetwork
 from carts_core.features.weights import save_weights
+from carts_core.project import Project
 from carts_viewer.app import ViewerApp
+from carts_viewer.running import OptimizerFactory
 
 FLAGS = (
     "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
@@ -39,11 +43,19 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
         def make(prepare: Callable[[Path], None] = lambda folder: None, **options) -> ViewerApp:
             path = tiny_sequence(**options)
             prepare(path.parent)
-            app = stack.enter_context(ViewerApp.open(path, port=0, weights=untrained_weights))
+            app = stack.enter_context(ViewerApp.open(path, port=0, weights=(untrained_weights,)))
             app.wait_until_shown(60)
             return app
 
         yield make
+
+
+@pytest.fixture
+def desk(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Desk:
+    """A controller with three frames of two cameras in two domains."""
+    sequence = Sequence.open(tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke")))
+    factory = OptimizerFactory(sequence, weights=(untrained_weights,), report=lambda line: None)
+    return Desk(sequence, Project.open(sequence), factory)
 
 
 @pytest.fixture(scope="session")

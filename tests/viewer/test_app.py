@@ -17,7 +17,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from carts_core.errors import SequenceError, SettingsError
+from carts_core.data import Sequence
+from carts_core.errors import ProjectError, SequenceError, SettingsError
+from carts_core.project import Project, ProjectState
+from carts_core.resources import sample_sequence
+from carts_viewer import editing
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp, serve
 from carts_viewer.bench import RawTab
@@ -25,6 +29,7 @@ from carts_viewer.layers import Layer, mask
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.picture import Painter
 from carts_viewer.stage import FRAME, OVERLAY
+from carts_viewer.storage import open_storage
 
 
 def _get(app: ViewerApp, path: str, **headers: str) -> http.client.HTTPResponse:
@@ -155,7 +160,7 @@ def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[...
 
 
 def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
-    with ViewerApp.open(tiny_sequence(), port=0, weights=tmp_path / "none.safetensors") as app:
+    with ViewerApp.open(tiny_sequence(), port=0, weights=(tmp_path / "none.safetensors",)) as app:
         app.mailbox.put(ask.Run())
         state = app.wait_until_shown(60)
         assert "none.safetensors" in (state.error or "") and state.busy is None
@@ -166,7 +171,7 @@ def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callab
 def test_a_layer_that_cannot_be_computed_is_an_error_once_and_not_for_ever(
     tiny_sequence: Callable[..., Path], tmp_path: Path
 ) -> None:
-    with ViewerApp.open(tiny_sequence(), port=0, weights=tmp_path / "none.safetensors") as app:
+    with ViewerApp.open(tiny_sequence(), port=0, weights=(tmp_path / "none.safetensors",)) as app:
         app.mailbox.put(ask.ShowLayer(Layer.ATTENTION))
         state = app.wait_until_shown(60)
         assert "none.safetensors" in (state.error or "") and state.layer is Layer.MASK
@@ -256,3 +261,74 @@ def test_closing_twice_and_closing_while_running_do_no_harm(open_viewer: Callabl
     app.mailbox.put(ask.Run())
     app.close()
     app.close()
+
+
+def _reopened(app: ViewerApp) -> ProjectState:
+    app.close()
+    with Project.open(app.sequence, app.project.path) as project:
+        return project.state
+
+
+def test_what_is_done_in_the_page_is_in_the_project_beside_the_sequence(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    assert app.project.path == app.sequence.path.with_suffix(".carts").resolve()
+    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    assert app.wait_until_shown().unsaved and not app.project.state.steps
+    app.mailbox.put(ask.Released())
+    assert not app.wait_until_shown().unsaved
+    assert _reopened(app).joints(0)["PSM1"].joint_positions[0] == pytest.approx(0.1)
+
+
+def test_closing_saves_the_gesture_under_way(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    app.wait_until_shown()
+    assert [step.name for step in _reopened(app).steps] == ["Move PSM1 yaw, frame 001"]
+
+
+def test_a_gesture_that_nobody_ends_is_saved_all_the_same(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(editing, "LONGEST_DRAFT", 0.2)
+    app = open_viewer()
+    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    _wait_for(lambda: len(app.project.state.steps) == 1 and not app.state.unsaved)
+
+
+def test_a_second_viewer_of_the_same_project_saves_nothing_and_says_so(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    with ViewerApp.open(app.sequence.path, port=0) as second:
+        assert "open for writing elsewhere" in (second.notice or "") and app.notice is None
+        second.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+        second.mailbox.put(ask.Released())
+        state = second.wait_until_shown()
+        assert state.unsaved and state.pose.scene.joint_positions[0][0] == pytest.approx(0.1)
+        second.mailbox.put(ask.MoveFrame(1))
+        second.mailbox.put(ask.MoveFrame(-1))
+        state = second.wait_until_shown()
+        assert not state.unsaved and not state.project.joints(0) and state.error is None
+    assert not app.project.state.steps
+
+
+def test_the_shipped_sequence_has_its_project_among_the_users_data(tmp_path: Path) -> None:
+    storage = open_storage(Sequence.open(sample_sequence()))
+    storage.close()
+    assert storage.notice is None and storage.project.path.parent == tmp_path / "data"
+
+
+def test_without_a_place_for_a_project_nothing_is_kept_and_the_page_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "file" / "data"))
+    storage = open_storage(Sequence.open(sample_sequence()))
+    assert "Nothing is kept" in (storage.notice or "") and storage.project.writable
+    path = storage.project.path
+    storage.close()
+    assert not path.parent.exists()
+
+
+def test_a_project_of_another_sequence_is_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    Project.open(Sequence.open(tiny_sequence(frames=2)), tmp_path / "other.carts").close()
+    with pytest.raises(ProjectError, match="belongs to another sequence"):
+        ViewerApp.open(tiny_sequence(frames=3), project=tmp_path / "other.carts", port=0)

@@ -196,22 +196,15 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_viewer(width=160, height=120)
-    for name, value in (
-        ("iterations", 8),
-        ("working_width", 96),
-        ("attention_radius", 4),
-        ("wide_attention_radius", 8),
-    ):
-        app.mailbox.put(ask.SetSetting(name, value))
     tab = open_tab(app)
     tab.button("Perturb all joints")
     eventually(lambda: app.state.undoable, lambda count: count == 1)
     start = app.stage.sent("/overlay")
     tab.button("Run")
-    eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and len(run.curves.loss) == 9, timeout=90)
+    eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
     loss = app.state.run.curves.loss
     assert min(loss[1:]) < loss[0]
-    expect(tab.page.get_by_text("Done, best iterate kept")).to_be_visible()
+    expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
     expect(tab.page.get_by_text(f"iteration {int(np.argmin(loss))}").first).to_be_visible()
     app.wait_until_shown()
     assert app.stage.sent("/overlay") != start
@@ -241,7 +234,7 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
         again = cv2.imdecode(np.frombuffer(archive.read("masks/left/001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
         table = archive.read("kinematics.csv").decode().splitlines()
     assert np.array_equal(again, mask)
-    assert [line.split(",")[1] for line in table] == ["source", "edited", "measured", "measured"]
+    assert [line.split(",")[1] for line in table] == ["source", "hand", "measured", "measured"]
 
 
 def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
@@ -275,12 +268,18 @@ def test_keys_do_what_the_help_says(open_viewer: Callable[..., ViewerApp], open_
     app = open_viewer(masks=False)
     tab = open_tab(app)
     tab.page.get_by_text("Help", exact=True).click()
-    expect(tab.page.get_by_text("Next frame")).to_be_visible()
+    expect(tab.page.get_by_text("Next frame", exact=True)).to_be_visible()
     for key, check in (
         ("n", lambda: app.state.index == 1),
         ("b", lambda: app.state.index == 0),
         ("p", lambda: app.state.undoable == 1),
         ("Control+z", lambda: app.state.undoable == 0),
+        ("Control+Shift+z", lambda: app.state.undoable == 1),
+        ("c", lambda: app.state.error is not None),
+        ("o", lambda: app.state.undoable == 2),
+        ("Shift+i", lambda: app.state.undoable == 3),
+        ("g", lambda: app.state.index == 1),
+        ("b", lambda: app.state.index == 0 and app.state.review.state == "accepted"),
         ("3", lambda: app.state.layer == "Contour"),
         ("t", lambda: len(app.state.run.curves.loss) == 2),
         ("v", lambda: not tab.page.evaluate("carts.view.endoscope")),
@@ -288,6 +287,67 @@ def test_keys_do_what_the_help_says(open_viewer: Callable[..., ViewerApp], open_
     ):
         tab.page.keyboard.press(key)
         eventually(check, bool)
+
+
+def test_a_shift_click_places_a_keypoint_there_and_a_shift_drag_takes_it_along(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_marked()
+    tab = open_tab(app)
+    before = tab.canvas.where()
+    box = tab.page.locator("canvas").first.bounding_box()
+    assert box is not None
+
+    def on_screen(u: float, v: float) -> tuple[float, float]:
+        x, y = before @ [u, v, 1.0]
+        return box["x"] + x, box["y"] + y
+
+    tab.page.keyboard.down("Shift")
+    tab.page.mouse.click(*on_screen(150.0, 110.0))
+    eventually(lambda: app.state, lambda state: bool(state.keypoints.pins) and not state.unsaved)
+    (pin,) = app.state.keypoints.pins
+    # A screen pixel is less than half an image pixel here.
+    assert pin.pixel == pytest.approx((150.0, 110.0), abs=1.0)
+    assert app.state.keypoints.residuals[0] < 1.0 and app.state.undoable == 1
+    tab.page.mouse.down()
+    for step in range(8):
+        tab.page.mouse.move(*on_screen(150.0 + 2 * step, 110.0 + step))
+    tab.page.mouse.up()
+    tab.page.keyboard.up("Shift")
+    eventually(lambda: app.state, lambda state: state.undoable == 2 and not state.unsaved)
+    assert app.state.keypoints.pins[-1].pixel == pytest.approx((164.0, 117.0), abs=1.0)
+    # The picture has stayed where it was.
+    assert tab.canvas.where() == pytest.approx(before, abs=0.5)
+
+
+def test_reviewing_is_saved_as_the_page_says_and_is_there_in_another_server(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    tab = open_tab(app)
+    tab.page.get_by_text("Review", exact=True).first.click()
+    note = tab.page.locator(".mantine-TextInput-input:visible")
+    note.click()
+    note.press_sequentially("smoke on the left", delay=20)
+    expect(tab.page.get_by_text("Not saved yet")).to_be_visible()
+    note.press("Tab")
+    expect(tab.page.get_by_text("in sequence.carts")).to_be_visible()
+    tab.button("Needs work")
+    tab.button("Next unreviewed")
+    eventually(lambda: app.state.index, lambda index: index == 1)
+    tab.button("Accept + next")
+    eventually(lambda: app.state.index, lambda index: index == 2)
+    expect(tab.page.get_by_text("1 accepted")).to_be_visible()
+    timeline = tab.page.locator("svg.carts-timeline")
+    box = timeline.bounding_box()
+    assert box is not None
+    timeline.click(position={"x": 0.1 * box["width"], "y": 20})
+    eventually(lambda: app.state.index, lambda index: index == 0)
+    app.close()
+    with ViewerApp.open(app.sequence.path, port=0) as again:
+        project = again.wait_until_shown(60).project
+    assert (project.review(0).state, project.review(0).note) == ("needs work", "smoke on the left")
+    assert project.review(1).state == "accepted" and len(project.steps) == 3
 
 
 def test_the_page_asks_no_other_host_for_anything(open_viewer: Callable[..., ViewerApp], browser: Browser) -> None:

@@ -2,65 +2,20 @@
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from viewer_desk import Desk
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError, SettingsError
 from carts_core.export import read_kinematics_csv
-from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_core.optimization import FreeParameters
+from carts_core.project import Source
 from carts_viewer import intents as ask
-from carts_viewer.controller import Controller
 from carts_viewer.layers import Layer
-from carts_viewer.picture import Painter
-from carts_viewer.running import OptimizerFactory
-from carts_viewer.session import Session
-from carts_viewer.state import Phase, Source, ViewState
-
-
-@dataclass
-class Desk:
-    """A controller and what it delivered."""
-
-    controller: Controller
-    session: Session
-    painter: Painter
-    delivered: list[tuple[int, str, bytes]] = field(default_factory=list)
-
-    @property
-    def state(self) -> ViewState:
-        return self.controller.state
-
-    def do(self, *intents: ask.Intent) -> ViewState:
-        for intent in intents:
-            self.controller.handle(intent)
-        return self.state
-
-    def finish(self) -> ViewState:
-        while self.controller.patience() == 0.0:
-            self.controller.advance()
-        return self.state
-
-    def joint(self, index: int = 0) -> float:
-        return float(self.session.joints(self.state.pose.scene)["PSM1"][index])
-
-
-@pytest.fixture
-def desk(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[Desk]:
-    sequence = Sequence.open(tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke")))
-    session, painter = Session(sequence), Painter(sequence)
-    frame = session.frame(0, "regular", "left")
-    settings = OptimizerSettings(iterations=4, working_width=96, attention_radius=4, wide_attention_radius=8)
-    state = ViewState(0, frame, "regular", "left", session.measured(frame), Layer.MASK, 0.5, settings, FreeParameters())
-    factory = OptimizerFactory(sequence, weights=untrained_weights, report=lambda line: None)
-    delivered: list[tuple[int, str, bytes]] = []
-    controller = Controller(state, session, painter, factory, lambda *file: delivered.append(file))
-    yield Desk(controller, session, painter, delivered)
+from carts_viewer.state import Phase
 
 
 def test_frames_beyond_the_ends_are_the_ends(desk: Desk) -> None:
@@ -98,13 +53,13 @@ def test_a_correction_survives_a_visit_to_other_frames_cameras_and_domains(desk:
     desk.do(ask.MoveFrame(1))
     assert desk.state.pose.source is Source.MEASURED
     desk.do(ask.MoveFrame(-1))
-    assert desk.joint() == pytest.approx(0.2) and desk.state.pose.source is Source.EDITED
+    assert desk.joint() == pytest.approx(0.2) and desk.state.pose.source is Source.HAND
 
 
 def test_back_to_measured_forgets_the_correction(desk: Desk) -> None:
     before = desk.joint()
     desk.do(ask.Perturb(3.0, 1), ask.BackToMeasured())
-    assert desk.joint() == pytest.approx(before) and not desk.session.corrected()
+    assert desk.joint() == pytest.approx(before) and not desk.state.project.joints(0)
 
 
 def test_moving_a_joint_until_it_is_let_go_of_is_one_step_of_undo(desk: Desk) -> None:
@@ -133,7 +88,8 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     assert len(state.run.curves.loss) == 5 and len(state.run.curves.scores) == 5
     assert min(state.run.curves.loss) < state.run.curves.loss[0]
     assert state.maps is not None and state.maps.iterate.loss == min(state.run.curves.loss)
-    assert state.pose.source is Source.OPTIMIZED and desk.session.corrected()[0] is state.pose
+    assert state.pose.source is Source.OPTIMIZER
+    assert desk.saved.joints(0)["PSM1"].joint_positions == tuple(state.pose.scene.joint_positions[0].tolist())
 
 
 def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:
@@ -255,7 +211,7 @@ def test_export_all_holds_every_mask_and_says_where_each_row_comes_from(desk: De
         archive.extract("kinematics.csv", tmp_path)
         mask = cv2.imdecode(np.frombuffer(archive.read("masks/right/002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
     rows = read_kinematics_csv(tmp_path / "kinematics.csv", desk.session.scene)
-    assert [row.source for row in rows] == ["edited", "optimized", "measured"]
+    assert [row.source for row in rows] == ["hand", "optimizer", "measured"]
     assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
     assert rows[2].joint_positions["PSM1"] == pytest.approx(desk.session.sequence.measured["PSM1"][2], abs=1e-6)
     assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)

@@ -84,6 +84,8 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
     image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
     for _ in range(rng.integers(0, 8)):
         image = _vessel(rng, image)
+    for _ in range(rng.choice([0, 1, 2, 4], p=[0.35, 0.25, 0.25, 0.15])):
+        image = _glare(rng, image)
     if rng.random() < 0.5:
         image = _wet_relief(rng, image)
     elif rng.random() < 0.5:  # wet spots mirror the light
@@ -118,6 +120,20 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
         highlight = highlight * np.clip(1 + smooth_noise(rng, width, height, width / rng.uniform(3, 10), 1), 0, 3)
     shade = 1 + rng.uniform(0.2, 0.8) * (facing - facing.mean())
     return image * shade[..., None] + highlight[..., None]
+
+
+def _glare(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """A wet bulge that mirrors the lamp: a bright patch, smooth or broken up by a rough surface, up to white."""
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    centre = rng.uniform(0, 1, 2) * (width, height)
+    angle, radius = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(4), np.log(35)))
+    u = ((x - centre[0]) * np.cos(angle) + (y - centre[1]) * np.sin(angle)) / radius
+    v = ((y - centre[1]) * np.cos(angle) - (x - centre[0]) * np.sin(angle)) / (radius * rng.uniform(0.4, 1))
+    bulge = np.exp(-((u * u + v * v) ** rng.uniform(0.7, 2.0)))
+    rough = smooth_noise(rng, width, height, width / np.exp(rng.uniform(np.log(2), np.log(12))), 2)
+    shine = np.clip(rng.uniform(0.6, 2.5) * bulge * (1 + rng.uniform(0, 1.2) * rough), 0, 1.2)
+    return image + shine[..., None] * np.clip(rng.normal(0.9, 0.1, 3), 0.7, 1).astype(np.float32)
 
 
 def _vessel(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:

@@ -1,0 +1,104 @@
+"""Every key, in one table: the page's shortcuts and palette, its help and the README are made from it.
+
+    python -m carts_viewer.keys README.md
+
+brings the table in a text file up to date, between the lines that say where it begins and ends.
+"""
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from carts_core.project import ReviewState
+from carts_viewer import intents as ask
+from carts_viewer.layers import Layer
+
+FINE, COARSE = 0.1, 1.0
+"""Steps of nudging [deg or mm]."""
+_BEGIN, _END = "<!-- keys: written by python -m carts_viewer.keys -->", "<!-- end of keys -->"
+
+Special = Literal["perturb", "view"]
+"""What is more than an intent: `perturb` depends on fields of the page, `view` happens in the tab alone."""
+
+
+@dataclass(frozen=True)
+class Shortcut:
+    """A key and what it does."""
+
+    hotkey: str
+    label: str
+    action: ask.Intent | Special
+    modifier: str | None = None
+
+    @property
+    def key(self) -> str:
+        """As people read it."""
+        held = {None: "", "cmd/ctrl": "Ctrl+", "shift": "Shift+", "cmd/ctrl+shift": "Ctrl+Shift+"}[self.modifier]
+        return held + self.hotkey.capitalize()
+
+
+def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
+    """All of them, for these layers.
+
+    Letters that viser uses to fly the camera (W A S D Q E) are left alone, and so are the arrow keys, which move a
+    slider that has the focus.
+    """
+    return [
+        Shortcut("space", "Play or stop", ask.Play()),
+        Shortcut("N", "Next frame", ask.MoveFrame(1)),
+        Shortcut("B", "Previous frame (back)", ask.MoveFrame(-1)),
+        Shortcut("R", "Run or pause the optimizer", ask.RunOrPause()),
+        Shortcut("T", "One step of the optimizer", ask.Step()),
+        Shortcut("X", "Reset to the start of the run", ask.Reset()),
+        Shortcut("G", "Accept, and go to the next unreviewed frame", ask.AcceptAndNext()),
+        Shortcut("F", "Mark as needing work", ask.SetReview(ReviewState.NEEDS_WORK)),
+        Shortcut("J", "Reject", ask.SetReview(ReviewState.REJECTED)),
+        Shortcut("G", "Clear the review", ask.SetReview(ReviewState.UNTOUCHED), "shift"),
+        Shortcut("Y", "Next unreviewed frame", ask.ShowUnreviewed()),
+        Shortcut("Y", "Previous unreviewed frame", ask.ShowUnreviewed(-1), "shift"),
+        Shortcut("L", "Next worst frame that is not settled", ask.ShowWorse()),
+        Shortcut("L", "Previous worst frame", ask.ShowWorse(-1), "shift"),
+        Shortcut("O", f"Nudge the joint by {FINE:g}° or mm", ask.Nudge(FINE)),
+        Shortcut("I", f"Nudge the joint by -{FINE:g}° or mm", ask.Nudge(-FINE)),
+        Shortcut("O", f"Nudge the joint by {COARSE:g}° or mm", ask.Nudge(COARSE), "shift"),
+        Shortcut("I", f"Nudge the joint by -{COARSE:g}° or mm", ask.Nudge(-COARSE), "shift"),
+        Shortcut("U", "Choose the next joint to nudge", ask.ChooseJoint()),
+        Shortcut("C", "Copy the correction of the previous frame", ask.CopyCorrection(-1)),
+        Shortcut("C", "Copy the correction of the next frame", ask.CopyCorrection(1), "shift"),
+        Shortcut("H", "Show or hide the keypoints", ask.ShowKeypoints()),
+        Shortcut("P", "Perturb all joints", "perturb"),
+        Shortcut("M", "Back to measured joints", ask.BackToMeasured()),
+        Shortcut("Z", "Undo", ask.Undo(), "cmd/ctrl"),
+        Shortcut("Z", "Redo", ask.Redo(), "cmd/ctrl+shift"),
+        Shortcut("V", "Endoscope view or 3D view", "view"),
+        *(
+            Shortcut(str(number), f"Overlay: {layer.lower()}", ask.ShowLayer(layer))
+            for number, layer in enumerate(layers, start=1)
+        ),
+    ]
+
+
+def key_table(layers: Iterable[Layer]) -> str:
+    """The shortcuts as a Markdown table."""
+    rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
+    return "\n".join(["| Key | What it does |", "|---|---|", *rows])
+
+
+def with_keys(text: str) -> str:
+    """A text with the table of keys between its two marks.
+
+    Raises:
+        ValueError: the text has no such marks.
+    """
+    before, begin, rest = text.partition(_BEGIN)
+    _, end, after = rest.partition(_END)
+    if not (begin and end):
+        raise ValueError(f"the text has no lines {_BEGIN!r} and {_END!r} that say where the table of keys belongs.")
+    return f"{before}{begin}\n{key_table(Layer)}\n{end}{after}"
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        Path(name).write_text(with_keys(Path(name).read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,65 @@
+"""Where everything is saved, whether it is, and the history: undo, redo, and going to any step."""
+
+import viser
+
+from carts_viewer import intents as ask
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.state import ViewState
+from carts_viewer.storage import Storage
+
+_LISTED = 60
+"""Steps in the list, around the present one."""
+
+
+class SavedPanel:
+    """One line that says whether everything is saved, and a banner where nothing is."""
+
+    def __init__(self, page: Page, storage: Storage) -> None:
+        self._storage = storage
+        if storage.notice is not None:
+            page.server.gui.add_html(f'<p class="carts-notice" role="status">{escaped(storage.notice)}</p>')
+        self._text = page.server.gui.add_html("")
+
+    def show(self, state: ViewState) -> None:
+        """Bring the line up to date."""
+        path = self._storage.project.path
+        if self._storage.notice is not None:
+            text = "Not saved" if state.unsaved else escaped(path.name)
+        elif state.unsaved:
+            text = "Not saved yet …"
+        else:
+            text = f"<b>Saved</b> in {escaped(path.name)}"
+        self._text.content = f'<p class="carts-caption" title="{escaped(str(path))}">{text}</p>'
+
+
+class HistoryPanel:
+    """Undo, redo and the list of steps."""
+
+    def __init__(self, page: Page, emit: Emit) -> None:
+        gui = page.server.gui
+        self._positions: dict[str, int] = {}
+        with gui.add_folder("History"):
+            self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
+            self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
+            page.row(self._undo, self._redo)
+            self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")
+            self._next = gui.add_html("")
+        on_click(self._undo, lambda _: ask.Undo(), emit)
+        on_click(self._redo, lambda _: ask.Redo(), emit)
+        on_input(self._steps, lambda label: ask.GoToStep(self._positions[label]), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the list up to date."""
+        project = state.project
+        self._undo.disabled, self._redo.disabled = project.undoable is None, project.redoable is None
+        first = max(project.position - _LISTED // 2, 0)
+        positions = {"Start": 0} | {
+            f"{step.number}. {step.name}{' (undone)' if step.number > project.position else ''}": step.number
+            for step in project.steps[first : first + _LISTED]
+        }
+        if positions != self._positions:
+            # Before the widget offers them: whoever chooses one must find it here.
+            self._positions = positions
+            self._steps.options = tuple(positions)
+        write(self._steps, next(label for label, number in positions.items() if number == project.position))

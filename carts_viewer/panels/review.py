@@ -1,0 +1,79 @@
+"""What people say about frames, and which one to look at next."""
+
+from collections import Counter
+
+import viser
+
+from carts_core.project import Kind, ProjectState, ReviewState
+from carts_viewer import intents as ask
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
+from carts_viewer.state import ViewState
+
+STATE_COLORS = {
+    ReviewState.UNTOUCHED: "#6b7280",
+    ReviewState.OPTIMIZED: "#60a5fa",
+    ReviewState.NEEDS_WORK: "#fb923c",
+    ReviewState.ACCEPTED: "#2dd4a7",
+    ReviewState.REJECTED: "#ef4444",
+}
+
+
+class ReviewPanel:
+    """Review state and note of the shown frame, where to go next, and how many frames are in which state."""
+
+    def __init__(self, page: Page, emit: Emit, waits: Waits) -> None:
+        gui = page.server.gui
+        self._waits = waits
+        self._counted: ProjectState | None = None
+        with gui.add_folder("Review"):
+            self._state = gui.add_html("")
+            accept = gui.add_button("Accept + next", icon=viser.Icon.CHECK, color="teal")
+            keep = gui.add_button("Accept", color="gray")
+            page.row(accept, keep, weights=(3, 2))
+            work = gui.add_button("Needs work", color="gray")
+            reject = gui.add_button("Reject", color="gray")
+            clear = gui.add_button("Clear", color="gray")
+            page.row(work, reject, clear, weights=(4, 3, 3))
+            self._note = gui.add_text("Note", "")
+            worse = gui.add_button("Worse", icon=viser.Icon.CHEVRON_LEFT, color="gray")
+            better = gui.add_button("Next worst", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            page.row(worse, better)
+            unreviewed = gui.add_button("Next unreviewed", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            self._counts = gui.add_html("")
+        on_click(accept, lambda _: ask.AcceptAndNext(), emit)
+        for button, state in (
+            (keep, ReviewState.ACCEPTED),
+            (work, ReviewState.NEEDS_WORK),
+            (reject, ReviewState.REJECTED),
+            (clear, ReviewState.UNTOUCHED),
+        ):
+            on_click(button, lambda _, state=state: ask.SetReview(state), emit)
+        on_click(worse, lambda _: ask.ShowWorse(-1), emit)
+        on_click(better, lambda _: ask.ShowWorse(1), emit)
+        on_click(unreviewed, lambda _: ask.ShowUnreviewed(1), emit)
+        on_input(self._note, ask.SetNote, emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        review = state.review
+        keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
+        self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{review.state}</b>{keyframe}</p>'
+        if not self._waits(ask.SetNote):
+            write(self._note, review.note)
+        if self._counted is None or not (state.unsaved or state.project is self._counted):
+            self._counted = state.project
+            self._count(state.project)
+
+    def _count(self, project: ProjectState) -> None:
+        reviews = project.values(Kind.REVIEW).values()
+        counts = Counter(review.state for review in reviews)
+        counts[ReviewState.UNTOUCHED] += len(project.identity.frame_ids) - len(reviews)
+        known = " ".join(
+            f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>' for name in ReviewState if counts[name]
+        )
+        self._counts.content = f'<p class="carts-caption">{known}</p>'
+
+
+def _dot(state: ReviewState) -> str:
+    return f'<span class="carts-swatch" style="background: {STATE_COLORS[state]}"></span>'

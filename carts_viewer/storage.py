@@ -1,0 +1,52 @@
+"""Which project the viewer works on, and what people must know about it."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from carts_core.data import Sequence
+from carts_core.errors import ProjectError
+from carts_core.project import Project, default_path
+
+
+@dataclass(frozen=True)
+class Storage:
+    """An open project."""
+
+    project: Project
+    notice: str | None
+    """Why what people do is not kept; None if it is."""
+    scratch: tempfile.TemporaryDirectory | None = None
+    """The folder of a project that ends with the viewer."""
+
+    def close(self) -> None:
+        """Let others write."""
+        self.project.close()
+        if self.scratch is not None:
+            self.scratch.cleanup()
+
+
+def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
+    """Open, or begin, a sequence's project for the viewer.
+
+    A project that may not be written to opens read-only. Where none can be begun, one is made that nothing keeps.
+
+    Args:
+        sequence: the recording.
+        path: of the project; None for the default place.
+
+    Raises:
+        ProjectError: the file is of another sequence, of a newer version or no project, or `path` cannot be made.
+    """
+    try:
+        project = Project.open(sequence, path)
+    except ProjectError as error:
+        if (path or default_path(Path(sequence.path))).exists():
+            project = Project.open(sequence, path, read_only=True)
+            return Storage(project, f"Read-only: {error}")
+        if path is not None:
+            raise
+        scratch = tempfile.TemporaryDirectory(prefix="carts-")
+        project = Project.open(sequence, Path(scratch.name) / "scratch.carts")
+        return Storage(project, f"Nothing is kept after the viewer is closed: {error}", scratch)
+    return Storage(project, None if project.writable else f"Read-only: {project.read_only_reason}")

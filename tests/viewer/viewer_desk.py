@@ -1,0 +1,79 @@
+"""A controller at work without threads or a page, with the real optimizer."""
+
+from carts_core.data import Sequence
+from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_core.project import Project, ProjectState
+from carts_viewer import intents as ask
+from carts_viewer.controller import Controller
+from carts_viewer.layers import Layer
+from carts_viewer.picture import Painter
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+
+
+class Desk:
+    """A controller and what it delivered."""
+
+    def __init__(self, sequence: Sequence, project: Project, factory: OptimizerFactory) -> None:
+        self.session, self.painter = Session(sequence, project), Painter(sequence)
+        self.delivered: list[tuple[int, str, bytes]] = []
+        self._factory = factory
+        frame = self.session.frame(0, "regular", "left")
+        state = ViewState(
+            index=0,
+            frame=frame,
+            domain="regular",
+            camera="left",
+            pose=self.session.pose(frame),
+            layer=Layer.MASK,
+            opacity=0.5,
+            settings=OptimizerSettings(
+                solver="adam",
+                loss="acs",
+                iterations=4,
+                working_width=96,
+                attention_radius=4,
+                wide_attention_radius=8,
+                tolerance=0.0,
+            ),
+            free=FreeParameters(),
+            project=self.session.editor.view,
+        )
+        self.controller = Controller(
+            state, self.session, self.painter, factory, lambda *file: self.delivered.append(file)
+        )
+
+    def reopened(self, *, read_only: bool = False) -> "Desk":
+        """Another desk for the same project, after this one is closed."""
+        project = self.session.editor.project
+        self.session.close()
+        project.close()
+        sequence = self.session.sequence
+        return Desk(sequence, Project.open(sequence, project.path, read_only=read_only), self._factory)
+
+    @property
+    def state(self) -> ViewState:
+        """What the page would show."""
+        return self.controller.state
+
+    def do(self, *intents: ask.Intent) -> ViewState:
+        """Handle intents, one after the other."""
+        for intent in intents:
+            self.controller.handle(intent)
+        return self.state
+
+    def finish(self) -> ViewState:
+        """Advance until nothing is going on."""
+        while self.controller.patience() == 0.0:
+            self.controller.advance()
+        return self.state
+
+    @property
+    def saved(self) -> ProjectState:
+        """What is in the project, without the draft."""
+        return self.session.editor.project.state
+
+    def joint(self, index: int = 0) -> float:
+        """A joint of the shown pose [rad, m]."""
+        return float(self.session.joints(self.state.pose.scene)["PSM1"][index])
