@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,29 +12,32 @@ from rich.progress import track
 from rich.table import Table
 
 from ..data import Sequence
-from ..evaluation import FrameScore, evaluate, mean_score, to_json
+from ..evaluation import FrameScore, evaluate, evaluate_sequence, mean_score, to_json
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
-from ..optimization import FreeParameters, OptimizerSettings
-from .selection import Network, Selection, SequencePath
+from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
+from .selection import Mode, Network, Selection, SequencePath
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Optimize frames, each alone, and compare masks and joints with the truth."""
+    """Optimize frames and compare masks and joints with the truth."""
 
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
     """Write the scores of all frames and their means to this file."""
+    mode: Mode = "frame"
+    """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
     perturb_deg: float = 0.0
     """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
     seed: int = 0
-    """Seed of the perturbation's signs."""
+    """Seed of the perturbation's signs; these are the same in all frames in sequence mode."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
+    model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""
@@ -42,24 +46,21 @@ class Evaluate:
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
-        scores = list(
-            track(
-                evaluate(
-                    sequence,
-                    FeatureExtractor.load(*self.network.weights, device=self.network.device),
-                    frames=frames,
-                    cameras=cameras,
-                    domains=domains,
-                    settings=self.optimizer,
-                    free=self.free,
-                    perturb_deg=self.perturb_deg,
-                    seed=self.seed,
-                ),
-                "optimizing",
-                total=len(frames) * len(cameras) * len(domains),
-                console=console,
-            )
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
+        found = run(
+            sequence,
+            extractor,
+            frames=frames,
+            cameras=cameras,
+            domains=domains,
+            settings=self.optimizer,
+            free=self.free,
+            perturb_deg=self.perturb_deg,
+            seed=self.seed,
         )
+        total = len(frames) * len(cameras) * len(domains)
+        scores = list(track(found, "optimizing", total=total, console=console))
         console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
         if self.json is not None:
             write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
@@ -67,7 +68,7 @@ class Evaluate:
 
 
 def _table(scores: list[FrameScore], title: str) -> Table:
-    table = Table(title=title, caption="MAE: of measured revolute joints. s: wall time per frame.")
+    table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
     for column in (
         "domain",
         "camera",
@@ -76,6 +77,7 @@ def _table(scores: list[FrameScore], title: str) -> Table:
         "worst\nchange",
         "MAE [deg]\nbefore",
         "\nafter",
+        "std",
         "steps",
         "s",
     ):
@@ -94,6 +96,7 @@ def _table(scores: list[FrameScore], title: str) -> Table:
             _number(min(change, default=None), 4),
             _number(mean["joint_mae_deg_before"], 2),
             _number(mean["joint_mae_deg_after"], 2),
+            _number(mean["joint_std_deg"], 2),
             _number(mean["iterations"], 1),
             _number(mean["seconds"], 2),
         )

@@ -1,22 +1,25 @@
 """`carts optimize`: correct the kinematics of frames and write masks and kinematics."""
 
+import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
 
 from ..data import Sequence
 from ..errors import SettingsError
-from ..evaluation import start_positions
-from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv, write_bytes
+from ..evaluation import Starts, start_positions
+from ..export import KinematicsRow, read_kinematics_csv, write_bytes
 from ..features.extractor import FeatureExtractor
-from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings
-from ..rendering import Renderer
-from .selection import Network, Selection, SequencePath
+from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
+from .frame_folder import FrameFolder
+from .selection import Mode, Network, Selection, SequencePath
 
 
 @dataclass(frozen=True)
@@ -29,17 +32,24 @@ class Optimize:
     """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`."""
     overwrite: bool = False
     """Start over, although the folder holds results of other settings."""
+    mode: Mode = "frame"
+    """Correct each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+    keyframes: Path | None = None
+    """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
     perturb_deg: float = 0.0
     """Start that many degrees (and millimetres) off on every joint; see `carts evaluate`."""
     seed: int = 0
-    """Seed of the perturbation's signs."""
+    """Seed of the perturbation's signs; these are the same in all frames in sequence mode."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
+    model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
 
     def run(self) -> None:
         """Optimize what is not there yet."""
+        if self.keyframes is not None and self.mode != "sequence":
+            raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
@@ -64,8 +74,25 @@ class Optimize:
         todo = [index for index in frames if sequence.frame_ids[index] not in done]
         if len(todo) < len(frames):
             console.print(f"{folder}: {len(frames) - len(todo)} of {len(frames)} frames are there already")
-        renderer = Renderer(sequence.scene, cameras=[camera])
-        scene = sequence.scene.with_cameras([camera])
+        if self.mode == "sequence":
+            # Every frame depends on all others, so one that is missing has all of them done again.
+            run, todo = self._together, frames if todo else []
+        else:
+            run = self._alone
+        output = FrameFolder(sequence, camera, folder, rows)
+        run(sequence, extractor, todo, domain, camera, output, console)
+        console.print(f"wrote {len(output.rows)} masks and kinematics.csv to {folder}")
+
+    def _alone(
+        self,
+        sequence: Sequence,
+        extractor: FeatureExtractor,
+        todo: list[int],
+        domain: str,
+        camera: str,
+        output: FrameFolder,
+        console: Console,
+    ) -> None:
         background = {camera: sequence.background(camera, domain)} if todo else {}
         for index in track(todo, f"{domain}, {camera}", console=console, disable=not todo):
             frame = sequence.frame(index, domain, [camera])
@@ -81,15 +108,66 @@ class Optimize:
             )
             for _ in optimizer:
                 pass
-            assert optimizer.best is not None
-            mask = renderer.segment(optimizer.best.state.to("cpu"))[0] >= 0
-            write_bytes(folder / "masks" / f"{frame.frame_id}.png", mask_png(mask))
-            rows = [row for row in rows if row.frame_id != frame.frame_id]
-            rows.append(KinematicsRow(frame.frame_id, "optimized", optimizer.best.joint_positions()))
-            rows.sort(key=lambda row: sequence.frame_ids.index(row.frame_id))
-            # The table is written after the mask, so a frame in the table always has one.
-            write_bytes(folder / "kinematics.csv", kinematics_csv(scene, rows).encode())
-        console.print(f"wrote {len(rows)} masks and kinematics.csv to {folder}")
+            best = optimizer.best
+            assert best is not None
+            row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
+            output.write([(row, best.state)])
+
+    def _together(
+        self,
+        sequence: Sequence,
+        extractor: FeatureExtractor,
+        todo: list[int],
+        domain: str,
+        camera: str,
+        output: FrameFolder,
+        console: Console,
+    ) -> None:
+        if not todo:
+            return
+        starts = Starts(sequence, domain, camera, self.perturb_deg, self.seed)
+        optimizer = SequenceOptimizer(
+            sequence.scene,
+            starts.frame,
+            starts.times(todo),
+            extractor,
+            settings=self.optimizer,
+            model=self.model,
+            free=self.free,
+            keyframes=self._keyframes(sequence, todo),
+            cameras=[camera],
+        )
+        try:
+            for _ in track(optimizer, f"{domain}, {camera}", total=len(todo), console=console):
+                pass
+        finally:
+            # Ctrl-C keeps what is there.
+            output.write(
+                [
+                    (
+                        KinematicsRow(
+                            estimate.frame_id,
+                            "edited" if estimate.start == "keyframe" else "optimized",
+                            estimate.joint_positions,
+                            estimate.joint_std,
+                        ),
+                        estimate.state,
+                    )
+                    for estimate in optimizer.estimates.values()
+                ]
+            )
+        console.print(f"{optimizer.frames_per_second:.1f} frames/s")
+
+    def _keyframes(self, sequence: Sequence, chosen: list[int]) -> dict[int, Mapping[str, np.ndarray]]:
+        """Position -> joint positions of the chosen frames that a person set."""
+        if self.keyframes is None:
+            return {}
+        rows = {
+            row.frame_id: row.joint_positions
+            for row in read_kinematics_csv(self.keyframes, sequence.scene)
+            if row.source == "edited"
+        }
+        return {index: rows[sequence.frame_ids[index]] for index in chosen if sequence.frame_ids[index] in rows}
 
     def _earlier_rows(self, sequence: Sequence, extractor: FeatureExtractor, folder: Path) -> list[KinematicsRow]:
         """Rows of an earlier, interrupted run with the same settings.
@@ -105,6 +183,8 @@ class Optimize:
             "free": asdict(self.free),
             "optimizer": asdict(self.optimizer),
         }
+        if self.mode == "sequence":
+            settings |= {"mode": self.mode, "model": asdict(self.model), "keyframes": self._keyframes_sha256()}
         text = json.dumps(settings, indent=1)
         file, table = folder / "settings.json", folder / "kinematics.csv"
         same = file.is_file() and file.read_text(encoding="utf-8") == text
@@ -118,3 +198,13 @@ class Optimize:
         table.unlink(missing_ok=True)
         write_bytes(file, text.encode())
         return []
+
+    def _keyframes_sha256(self) -> str | None:
+        if self.keyframes is None:
+            return None
+        try:
+            return hashlib.sha256(self.keyframes.read_bytes()).hexdigest()
+        except OSError as error:
+            raise SettingsError(
+                f"--keyframes {self.keyframes} cannot be read: {error.strerror}. Name a file."
+            ) from error

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -11,6 +11,9 @@ from ..errors import SettingsError
 from ..scene import Scene
 
 ALL = "all"
+
+Mode = Literal["frame", "sequence"]
+"""Each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
 
 
 @dataclass(frozen=True)

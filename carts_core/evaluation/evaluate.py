@@ -13,7 +13,8 @@ from ..features.extractor import FeatureExtractor
 from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings
 from ..perturbation import perturb
 from ..rendering import Renderer
-from .metrics import dice, joint_mae_deg
+from ..scene import SceneState
+from .metrics import dice, joint_mae_deg, joint_std_deg
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class FrameScore:
     iterations: int
     seconds: float
     stopped: str
+    """Why the optimization ended, or in sequence mode where the frame's values come from."""
+    joint_std_deg: float | None = None
+    """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
 
 
 def evaluate(
@@ -78,31 +82,60 @@ def evaluate(
                 for _ in optimizer:
                     pass
                 seconds = time.perf_counter() - began
-                yield _score(sequence, frame, camera, renderer, start, optimizer, seconds)
+                best = optimizer.best
+                assert best is not None and optimizer.stop_reason is not None
+                yield frame_score(
+                    sequence,
+                    frame,
+                    camera,
+                    renderer,
+                    start,
+                    best.state,
+                    best.joint_positions(),
+                    best.joint_std(),
+                    len(optimizer.history) - 1,
+                    seconds,
+                    optimizer.stop_reason,
+                )
 
 
-def start_positions(sequence: Sequence, frame: Frame, perturb_deg: float, seed: int) -> dict[str, np.ndarray]:
-    """Where the optimization of a frame starts; see `evaluate`."""
+def start_positions(
+    sequence: Sequence, frame: Frame, perturb_deg: float, seed: int | tuple[int, ...]
+) -> dict[str, np.ndarray]:
+    """Where the optimization of a frame starts; see `evaluate`. A seed in a tuple gives all frames the same signs."""
     if perturb_deg == 0:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
-    return perturb(sequence.scene, origin, perturb_deg, (seed, frame.index), sequence.measured_joints)
+    seed = seed if isinstance(seed, tuple) else (seed, frame.index)
+    return perturb(sequence.scene, origin, perturb_deg, seed, sequence.measured_joints)
 
 
-def _score(
+def frame_score(
     sequence: Sequence,
     frame: Frame,
     camera: str,
     renderer: Renderer,
     start: dict[str, np.ndarray],
-    optimizer: FrameOptimizer,
+    state: SceneState,
+    joint_positions: dict[str, np.ndarray],
+    joint_std: dict[str, np.ndarray],
+    iterations: int,
     seconds: float,
+    stopped: str,
 ) -> FrameScore:
-    assert optimizer.best is not None and optimizer.stop_reason is not None
+    """Compare an estimate of a frame with the truth.
+
+    Args:
+        sequence, frame, camera: what was optimized.
+        renderer: of that camera in full size.
+        start: arm name -> joint positions before [rad, m].
+        state, joint_positions, joint_std: after.
+        iterations, seconds, stopped: as in the score.
+    """
     mask = (frame.masks or {}).get(camera)
     truth = frame.truth or {}
 
-    def overlap(state) -> float | None:
+    def overlap(state: SceneState) -> float | None:
         return None if mask is None else dice(renderer.segment(state)[0] >= 0, mask)
 
     def mae(estimate: dict[str, np.ndarray]) -> float | None:
@@ -113,12 +146,13 @@ def _score(
         camera=camera,
         domain=frame.domain,
         dice_before=overlap(sequence.scene.with_cameras([camera]).state(start)),
-        dice_after=overlap(optimizer.best.state.to("cpu")),
+        dice_after=overlap(state.to("cpu")),
         joint_mae_deg_before=mae(start),
-        joint_mae_deg_after=mae(optimizer.best.joint_positions()),
-        iterations=len(optimizer.history) - 1,
+        joint_mae_deg_after=mae(joint_positions),
+        iterations=iterations,
         seconds=round(seconds, 4),
-        stopped=optimizer.stop_reason,
+        stopped=stopped,
+        joint_std_deg=joint_std_deg(sequence.scene, joint_std, sequence.measured_joints),
     )
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..scene import Scene
+from ..scene import Arm, Scene
 
 
 def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -55,10 +55,28 @@ def joint_mae_deg(
     """
     errors = []
     for arm in scene.arms:
-        if arm.name not in truth:
-            continue
-        difference = np.abs(np.asarray(estimate[arm.name]) - np.asarray(truth[arm.name]))
-        for index, (name, kind) in enumerate(zip(arm.robot.joint_names, arm.robot.joint_types, strict=True)):
-            if kind == "revolute" and name in joints.get(arm.name, ()):
-                errors.append(difference[index])
+        if arm.name in truth:
+            difference = np.abs(np.asarray(estimate[arm.name]) - np.asarray(truth[arm.name]))
+            errors += _revolute(arm, difference, joints)
     return float(np.rad2deg(np.mean(errors))) if errors else None
+
+
+def joint_std_deg(
+    scene: Scene, joint_std: Mapping[str, Float[np.ndarray, " dofs"]], joints: Mapping[str, tuple[str, ...]]
+) -> float | None:
+    """Mean standard deviation [deg] of the named revolute joints over all arms; None where none is known.
+
+    Args:
+        scene: whose arms these are.
+        joint_std: arm name -> standard deviations [rad, m]; NaN ones do not count.
+        joints: arm name -> joints that count.
+    """
+    values = [
+        value for arm in scene.arms for value in _revolute(arm, joint_std[arm.name], joints) if np.isfinite(value)
+    ]
+    return float(np.rad2deg(np.mean(values))) if values else None
+
+
+def _revolute(arm: Arm, values: Float[np.ndarray, " dofs"], joints: Mapping[str, tuple[str, ...]]) -> list[float]:
+    named = zip(arm.robot.joint_names, arm.robot.joint_types, values, strict=True)
+    return [float(v) for name, kind, v in named if kind == "revolute" and name in joints.get(arm.name, ())]

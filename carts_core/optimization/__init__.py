@@ -9,6 +9,9 @@ from .calibration import UnknownChange as UnknownChange
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
+from .sequence import FrameEstimate as FrameEstimate
+from .sequence import SequenceOptimizer as SequenceOptimizer
+from .sequence_settings import SequenceSettings as SequenceSettings
 from .settings import FreeParameters as FreeParameters
 from .settings import OptimizerSettings as OptimizerSettings
 
@@ -18,10 +21,13 @@ __all__ = [
     "CalibrationIterate",
     "CalibrationOptimizer",
     "CalibrationResult",
+    "FrameEstimate",
     "FrameOptimizer",
     "FreeParameters",
     "Iterate",
     "OptimizerSettings",
     "Progress",
+    "SequenceOptimizer",
+    "SequenceSettings",
     "UnknownChange",
 ]

@@ -57,11 +57,8 @@ class Iterate:
 
     def joint_std(self) -> dict[str, np.ndarray]:
         """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN where it is not known."""
-        known = {} if self.uncertainty is None else dict(zip(self.uncertainty.names, self.uncertainty.std, strict=True))
-        return {
-            arm: np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
-            for arm, joints in zip(self.arm_names, self.joint_names, strict=True)
-        }
+        known = self.uncertainty or Uncertainty((), (), ())
+        return {arm: known.joint_std(arm, joints) for arm, joints in zip(self.arm_names, self.joint_names, strict=True)}
 
 
 @dataclass(frozen=True)

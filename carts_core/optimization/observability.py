@@ -4,9 +4,11 @@ Gauss-Newton's curvature is the inverse covariance of the unknowns, given what w
 adds. Where the image adds nothing the deviation stays the expected one, and so does the value.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -32,6 +34,11 @@ class Uncertainty:
         index = self.names.index(name)
         share = self.std[index] / self.expected[index]
         return "determined" if share < _DETERMINED else "weak" if share < _VISIBLE else "not visible"
+
+    def joint_std(self, arm: str, joints: Sequence[str]) -> Float[np.ndarray, " dofs"]:
+        """Standard deviation of joint positions of an arm [rad, m]; NaN where a joint was not free."""
+        known = dict(zip(self.names, self.std, strict=True))
+        return np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
 
 
 def uncertainty(

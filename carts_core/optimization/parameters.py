@@ -1,15 +1,19 @@
 """Between a scene's state and the vector of unknowns that a solver sees."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import roma
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import SettingsError
 from ..scene import Scene, SceneState
+from .prior import Prior
 from .settings import FreeParameters
 
 _FOCAL_SCALE = 1.0
@@ -40,6 +44,10 @@ class ParameterVector:
         free: what is unknown.
         lever: [m/rad].
 
+    Attributes:
+        names: what each unknown is.
+        prior: what is known of the unknowns, if it is other than that they are near 0.
+
     Raises:
         SettingsError: nothing is free, or `free` names a joint that does not exist.
         RobotError: `free` names an arm or a camera that does not exist.
@@ -47,6 +55,7 @@ class ParameterVector:
 
     def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, lever: float) -> None:
         self.start = start
+        self.prior: Prior | None = None
         self._lever = lever
         self.names: list[str] = []
         self._blocks: list[_Block] = []
@@ -132,6 +141,17 @@ class ParameterVector:
                 read += 3 * [radian] + 3 * [length]
         return [(name, *unit) for name, unit in zip(self.names, read, strict=True)]
 
+    def joint_offsets(self, joint_positions: Sequence[ArrayLike]) -> Float[np.ndarray, " n"]:
+        """Offsets that bring the arms to joint positions [rad, m]; NaN for unknowns that are no joints."""
+        offsets = np.full(len(self), math.nan)
+        for block in self._blocks:
+            if block.kind == "joints":
+                columns = list(block.columns)
+                start = self.start.joint_positions[block.index].cpu().double().numpy()
+                step = np.asarray(joint_positions[block.index], np.float64)[columns] - start[columns]
+                offsets[block.start : block.start + block.size] = step / self._joint_scales[block.start].numpy()
+        return offsets
+
     @property
     def groups(self) -> list[range]:
         """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
@@ -165,6 +185,11 @@ class ParameterVector:
                 degrees = joints_deg if block.kind == "joints" else frames_deg
                 expected[block.start : block.start + block.size] = math.radians(degrees)
         return expected**-2
+
+    def expected(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Prior:
+        """`prior`, or if there is none, errors around 0 as in `prior_precision`."""
+        precision = self.prior_precision(joints_deg, frames_deg, intrinsics)
+        return self.prior or Prior(torch.zeros_like(precision), torch.diag(precision))
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""

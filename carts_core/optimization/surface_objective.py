@@ -85,9 +85,7 @@ class SurfaceObjective:
         self._weight = _weights(scene, ignore or {}, self._size).to(device)
         width, height = self._size
         self._whole = Renderer(scene, width=width, height=height, device=device)
-        self._prior = parameters.prior_precision(
-            settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior
-        )
+        self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._look = -1
 
     def epoch(self, stage: int) -> int:
@@ -148,12 +146,12 @@ class SurfaceObjective:
         neighbours = _neighbours(self.parameters, offsets) if gradient else None
         compared = stage.compare(state, neighbours)
         final = compared if stage is self._stages[-1] else self._stages[-1].compare(state, None)
-        prior = 0.5 * float((self._prior * offsets.square()).sum())
+        prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None:
-            slope = self._prior * offsets + compared.gradient
-            curvature = torch.diag(self._prior) + compared.curvature
-            known = uncertainty(self.parameters.names, curvature, self._prior, self.parameters.scales)
+            slope = self._prior.gradient(offsets) + compared.gradient
+            curvature = self._prior.precision + compared.curvature
+            known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
         empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])

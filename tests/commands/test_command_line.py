@@ -14,7 +14,7 @@ from carts_core.errors import SettingsError
 
 SCORE_KEYS = {
     *("frame", "camera", "domain", "dice_before", "dice_after", "joint_mae_deg_before", "joint_mae_deg_after"),
-    *("iterations", "seconds", "stopped"),
+    *("iterations", "seconds", "stopped", "joint_std_deg"),
 }
 
 
@@ -71,6 +71,44 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     mask = cv2.imread(str(folder / "masks" / "003.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None and mask.shape == (128, 160) and set(mask.flatten().tolist()) == {0, 255}
     assert not list(folder.rglob("*.part"))
+
+
+def test_evaluate_corrects_frames_together_in_sequence_mode(sequence: str, tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    main(["evaluate", sequence, "--mode", "sequence", "--perturb-deg", "1", "--json", str(file)])
+    scores = json.loads(file.read_text())["frames"]
+    assert [score["frame"] for score in scores] == ["001", "002", "003"]
+    assert scores[0]["stopped"] == "cold" and scores[1]["stopped"] in ("warm", "cold", "carried")
+    assert all(score["joint_mae_deg_before"] == pytest.approx(1.0, abs=1e-3) for score in scores)
+    assert all(0 < score["joint_std_deg"] < 3 for score in scores)
+
+
+def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ["--output", str(tmp_path / "out")]
+    command = ["optimize", sequence, "--mode", "sequence", *output]
+    table = tmp_path / "out" / "regular" / "left" / "kinematics.csv"
+    main(command)
+    rows = list(csv.DictReader(table.open()))
+    assert [row["source"] for row in rows] == ["optimized"] * 3
+    assert all(0 < float(row["PSM1.yaw.std"]) < 0.1 for row in rows)
+
+    given = tmp_path / "keyframes.csv"
+    columns = [name for name in rows[0] if not name.endswith(".std")]
+    values = ["0.01", "-0.02", "0.151", "0.03", "0.02", "0.01", "0.1"]
+    given.write_text(",".join(columns) + "\n" + ",".join(["002", "edited", *values]) + "\n")
+    main([*command, "--keyframes", str(given), "--overwrite"])
+    rows = list(csv.DictReader(table.open()))
+    assert [row["source"] for row in rows] == ["optimized", "edited", "optimized"]
+    assert [float(rows[1][name]) for name in columns[2:]] == [float(value) for value in values]
+    assert float(rows[1]["PSM1.yaw.std"]) == 0
+    main([*command, "--keyframes", str(given)])
+    assert "3 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+
+    with pytest.raises(SystemExit) as stop:
+        main(["optimize", sequence, *output, "--keyframes", str(given)])
+    assert stop.value.code == BAD_INPUT and "needs --mode sequence" in capsys.readouterr().err
 
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,37 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional
+from perfect_sight import PerfectSight
 
 from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.surface_objective import SurfaceObjective
-from carts_core.optimization.window import Window
-from carts_core.rendering import Renderer
-from carts_core.scene import SceneState
-
-
-class PerfectSight:
-    """Stands in for the networks: sees the surface map of the truth, whatever it is shown."""
-
-    device = torch.device("cpu")
-    stride = 16
-
-    def __init__(self, sequence: Sequence, truth: SceneState) -> None:
-        fine = Renderer(sequence.scene, width=640, height=480).surface(truth).maps
-        self.maps = functional.avg_pool2d(fine, 2)
-
-    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
-        """The truth, cut to the window that `believed` lies in."""
-        state = Window(0, 0, self.maps.shape[3], self.maps.shape[2])
-        left, top = self.where
-        window = Window(left, top, images.shape[3], images.shape[2])
-        assert state.holds(window)
-        return window.of(self.maps)
-
-    where = (0, 0)
 
 
 @pytest.fixture
@@ -47,14 +23,7 @@ def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
 @pytest.fixture
 def sight(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> FeatureExtractor:
     seen = PerfectSight(sequence, sequence.scene.state(sequence.frame(0).truth or {}))
-    around = Window.around
-
-    def remembered(*arguments) -> Window:
-        window = around(*arguments)
-        seen.where = (window.left, window.top)
-        return window
-
-    monkeypatch.setattr(Window, "around", staticmethod(remembered))
+    seen.follow_windows(monkeypatch)
     return seen  # pyright: ignore[reportReturnType]
 
 

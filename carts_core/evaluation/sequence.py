@@ -1,0 +1,83 @@
+"""Optimize the frames of a sequence together, and say how well it went."""
+
+from collections.abc import Iterator
+from collections.abc import Sequence as Names
+from dataclasses import dataclass, replace
+
+from ..data import Frame, Sequence
+from ..features.extractor import FeatureExtractor
+from ..optimization import FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
+from ..rendering import Renderer
+from .evaluate import FrameScore, frame_score, start_positions
+
+
+def evaluate_sequence(
+    sequence: Sequence,
+    extractor: FeatureExtractor,
+    *,
+    frames: Names[int],
+    cameras: Names[str],
+    domains: Names[str],
+    settings: OptimizerSettings,
+    model: SequenceSettings,
+    free: FreeParameters,
+    perturb_deg: float = 0.0,
+    seed: int = 0,
+) -> Iterator[FrameScore]:
+    """As `evaluate`, but the frames of a camera and domain are corrected together; see `SequenceOptimizer`.
+
+    A perturbation is the same in all frames, as an error of calibration is.
+    """
+    for domain in domains:
+        for camera in cameras:
+            renderer = Renderer(sequence.scene, cameras=[camera])
+            starts = Starts(sequence, domain, camera, perturb_deg, seed)
+            optimizer = SequenceOptimizer(
+                sequence.scene,
+                starts.frame,
+                starts.times(frames),
+                extractor,
+                settings=settings,
+                model=model,
+                free=free,
+                cameras=[camera],
+            )
+            for _ in optimizer:
+                pass
+            for index, estimate in sorted(optimizer.estimates.items()):
+                frame = starts.frame(index)
+                yield frame_score(
+                    sequence,
+                    frame,
+                    camera,
+                    renderer,
+                    frame.measured,
+                    estimate.state,
+                    estimate.joint_positions,
+                    estimate.joint_std,
+                    estimate.iterations,
+                    estimate.seconds,
+                    estimate.start,
+                )
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Frames of one camera and domain as sequence mode takes them: what is called measured is where it starts."""
+
+    sequence: Sequence
+    domain: str
+    camera: str
+    perturb_deg: float
+    seed: int
+    """Of the perturbation, which is the same in all frames."""
+
+    def frame(self, index: int) -> Frame:
+        """The frame at a position of the sequence."""
+        frame = self.sequence.frame(index, self.domain, [self.camera])
+        return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, (self.seed,)))
+
+    def times(self, frames: Names[int]) -> dict[int, float | None]:
+        """Position -> time of chosen frames [s]."""
+        stamps = self.sequence.timestamps
+        return {index: None if stamps is None else float(stamps[index]) for index in frames}

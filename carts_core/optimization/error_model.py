@@ -1,0 +1,134 @@
+"""The error of measured kinematics over time: constant + slow drift + noise, for every unknown, as a Kalman smoother.
+
+A correction is what is added to a measured value. Of each unknown it is the sum of three parts: a constant, a drift
+that forgets itself over `drift_seconds` (an Ornstein-Uhlenbeck process), and noise that is new in every frame. All are
+Gaussian around 0. The images tell of the sum only, and often of a few directions of it only; the parts are what
+carries knowledge to other frames.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from .sequence_settings import SequenceSettings
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Mean [rad] and covariance [rad^2] of corrections, or of their parts."""
+
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+@dataclass(frozen=True)
+class Information:
+    """What one frame says of its correction x: a log likelihood of -x.precision.x / 2 + vector.x."""
+
+    precision: Float[np.ndarray, "n n"]
+    """[1/rad^2]; may be singular: what the image does not show."""
+    vector: Float[np.ndarray, " n"]
+    """[1/rad]"""
+
+    @staticmethod
+    def nothing(n: int) -> "Information":
+        """Of a frame that is not believed."""
+        return Information(np.zeros((n, n)), np.zeros(n))
+
+    @staticmethod
+    def exact(correction: Float[np.ndarray, " n"]) -> "Information":
+        """Of a known correction; entries that are NaN are not known."""
+        known = np.isfinite(correction)
+        precision = np.where(known, _EXACT, 0.0)
+        return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
+
+    def surprise(self, expected: Gaussian) -> float:
+        """Squared distance from what was expected, in standard deviations, mean over the unknowns [1]; about 1."""
+        n = len(self.vector)
+        residual = self.vector - self.precision @ expected.mean
+        difference = np.linalg.solve(self.precision + np.eye(n), residual)
+        spread = np.eye(n) + expected.covariance @ self.precision
+        return float(residual @ np.linalg.solve(spread, difference)) / n
+
+
+_EXACT = 1e14
+"""Precision of what is known for certain [1/rad^2]."""
+
+
+class ErrorModel:
+    """Beliefs about the parts of n corrections, [3 n]: all constants, all drifts, all noises.
+
+    Args:
+        settings: of joints; other unknowns have as much less drift and noise as they have a smaller constant.
+        constant: deviation of each unknown's constant [rad].
+    """
+
+    def __init__(self, settings: SequenceSettings, constant: Float[np.ndarray, " n"]) -> None:
+        n = self._n = len(constant)
+        self._drift_seconds = settings.drift_seconds
+        shares = np.array([settings.constant_deg, settings.drift_deg, settings.jitter_deg]) / settings.constant_deg
+        self._variance = np.outer(shares, constant).ravel() ** 2
+        self._sum = np.tile(np.eye(n), 3)
+
+    def initial(self) -> Gaussian:
+        """Before any frame."""
+        return Gaussian(np.zeros(3 * self._n), np.diag(self._variance))
+
+    def predicted(self, belief: Gaussian, seconds: float) -> Gaussian:
+        """The belief about a frame that many seconds later (infinitely many: as if nothing was known)."""
+        kept = self._kept(seconds)
+        noise = np.diag(self._variance * (1.0 - kept**2))
+        return Gaussian(kept * belief.mean, kept[:, None] * belief.covariance * kept + noise)
+
+    def _kept(self, seconds: float) -> Float[np.ndarray, " 3n"]:
+        constant = 1.0 if math.isfinite(seconds) else 0.0
+        return np.repeat([constant, math.exp(-seconds / self._drift_seconds), 0.0], self._n)
+
+    def correction(self, belief: Gaussian) -> Gaussian:
+        """The sum of the parts."""
+        return Gaussian(self._sum @ belief.mean, self._sum @ belief.covariance @ self._sum.T)
+
+    def updated(self, belief: Gaussian, information: Information) -> Gaussian:
+        """The belief after what a frame says."""
+        return combined(belief, information, self._sum)
+
+    def smoothed(self, beliefs: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
+        """Corrections of all frames, each in the light of all others (Rauch, Tung and Striebel, 1965).
+
+        Args:
+            beliefs: after each frame, from what it and those before it say.
+            seconds: from the frame before to each frame [s].
+        """
+        if not beliefs:
+            return []
+        result = [beliefs[-1]]
+        for belief, later in zip(reversed(beliefs[:-1]), reversed(seconds[1:]), strict=True):
+            ahead = self.predicted(belief, later)
+            gain = np.linalg.solve(ahead.covariance, self._kept(later)[:, None] * belief.covariance).T
+            mean = belief.mean + gain @ (result[-1].mean - ahead.mean)
+            covariance = belief.covariance + gain @ (result[-1].covariance - ahead.covariance) @ gain.T
+            result.append(Gaussian(mean, 0.5 * (covariance + covariance.T)))
+        return [self.correction(belief) for belief in reversed(result)]
+
+
+def combined(belief: Gaussian, information: Information, C: Float[np.ndarray, "m n"] | None = None) -> Gaussian:
+    """The belief about x after what is said of C x (of x itself by default)."""
+    C = np.eye(len(belief.mean)) if C is None else C
+    precision, cross = information.precision, belief.covariance @ C.T
+    # K = P C^T (1 + L C P C^T)^-1 L needs no inverse of L, which may be singular.
+    gain = cross @ np.linalg.inv(np.eye(len(C)) + precision @ C @ cross)
+    covariance = belief.covariance - gain @ precision @ cross.T
+    mean = belief.mean + gain @ (information.vector - precision @ C @ belief.mean)
+    return Gaussian(mean, 0.5 * (covariance + covariance.T))
+
+
+def without(smoothed: Gaussian, own: Information) -> Gaussian:
+    """What the other frames say of a correction, from what all say and what its own frame says."""
+    precision = np.linalg.inv(smoothed.covariance)
+    values, vectors = np.linalg.eigh(precision - own.precision)
+    # Rounding must not make a direction less certain than nothing.
+    covariance = vectors @ np.diag(1.0 / np.maximum(values, 1.0)) @ vectors.T
+    return Gaussian(covariance @ (precision @ smoothed.mean - own.vector), covariance)

@@ -1,0 +1,320 @@
+"""A sequence, corrected frame by frame, each frame knowing what the others found."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..data import Frame
+from ..errors import SettingsError
+from ..features.extractor import FeatureExtractor
+from ..scene import Scene, SceneState
+from .error_model import ErrorModel, Gaussian, Information, combined, without
+from .observability import Uncertainty
+from .parameters import ParameterVector
+from .sequence_settings import SequenceSettings
+from .settings import FreeParameters, OptimizerSettings
+from .sight import Eye, Ignore, Sight
+
+Start = Literal["warm", "cold", "keyframe", "carried"]
+"""Where a frame's values come from: an optimization from the neighbour's correction or from the measured values, a
+person, or the other frames alone, because the image contradicts them and is not to be believed."""
+
+_SURPRISE = 9.0
+"""A correction three deviations off what was expected, on average, contradicts it."""
+
+
+@dataclass(frozen=True)
+class FrameEstimate:
+    """One frame of a sequence, in the light of the others that were seen."""
+
+    index: int
+    frame_id: str
+    state: SceneState
+    joint_positions: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> [rad, m]."""
+    joint_std: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> standard deviation [rad, m]; 0 at a keyframe, NaN where a joint is not free."""
+    uncertainty: Uncertainty
+    """Of every unknown, with what was expected of it before any image."""
+    loss: float
+    """Of the surface objective, where the frame was last looked at; high where the image does not fit."""
+    start: Start
+    iterations: int
+    """Steps of the optimization, over all visits."""
+    seconds: float
+    """Time spent on the frame, reading included, over all visits [s]."""
+
+
+@dataclass(frozen=True)
+class _Visit:
+    """What is kept of a frame that was seen."""
+
+    frame_id: str
+    parameters: ParameterVector
+    sight: Sight
+    start: Start
+    seconds: float
+
+
+class SequenceOptimizer:
+    """Corrects the frames of a sequence one after another.
+
+    A frame starts at the correction that the frames before it let expect, and is held there as firmly as they know it.
+    After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what came of it is
+    visited again. Frames in `keyframes` stay exactly as given, and everything else follows them.
+
+    Args:
+        scene: arms and cameras.
+        load: the frame at a position of the sequence; its `measured` is what is corrected.
+        times: position of each frame to be corrected -> its time [s], or None where times are not known.
+        extractor: the networks.
+        settings: of a cold start; a warm one uses its fine stages. The loss is `surface`.
+        model: of the measurement error, and the direction.
+        free: what is unknown.
+        keyframes: position -> arm name -> joint positions [rad, m] that a person set.
+        ignore: position -> camera name -> pixels that show an occluder; none by default.
+        cameras: names of the cameras that take part, all by default.
+
+    Raises:
+        RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
+        SettingsError: there are no frames, a keyframe is none of them, times do not increase, nothing is free, or
+            the settings are of another solver or loss.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        load: Callable[[int], Frame],
+        times: Mapping[int, float | None],
+        extractor: FeatureExtractor,
+        *,
+        settings: OptimizerSettings | None = None,
+        model: SequenceSettings | None = None,
+        free: FreeParameters | None = None,
+        keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
+        ignore: Ignore | None = None,
+        cameras: Sequence[str] | None = None,
+    ) -> None:
+        self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
+        self._scene, self._load, self._extractor = scene.with_cameras(cameras), load, extractor
+        self._free = free or FreeParameters()
+        if (self.settings.solver, self.settings.loss) != ("gauss_newton", "surface"):
+            raise SettingsError(
+                f"sequence mode was given the solver {self.settings.solver} and the loss {self.settings.loss}; it "
+                "needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
+            )
+        self._keyframes = {
+            index: {name: np.asarray(values, np.float64) for name, values in positions.items()}
+            for index, positions in (keyframes or {}).items()
+        }
+        for positions in self._keyframes.values():
+            self._scene.state(positions)
+        self._gaps = _gaps(times, self.model)
+        strangers = set(self._keyframes) - set(self._gaps)
+        if strangers:
+            raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
+        self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}))
+        self._queue = list(self._gaps)
+        _, parameters = self._open(self._queue[0])
+        precision = parameters.prior_precision(
+            self.model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
+        )
+        self._errors = ErrorModel(self.model, precision.cpu().double().numpy() ** -0.5)
+        self._visits: dict[int, _Visit] = {}
+        self._beliefs: list[Gaussian] = []
+        self._stale = False
+        self._revisits: list[tuple[int, Gaussian]] | None = None
+        self._estimates: dict[int, FrameEstimate] | None = None
+        self.stop_reason: str | None = None
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Frames that were visited, and all frames; contradicted ones are visited again after that."""
+        return len(self._visits), len(self._gaps)
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames that were visited per second spent on them [1/s]."""
+        seconds = sum(visit.seconds for visit in self._visits.values())
+        return len(self._visits) / seconds if seconds else 0.0
+
+    @property
+    def estimates(self) -> dict[int, FrameEstimate]:
+        """Position -> estimate of every frame visited so far, in the light of all of them; ordered as visited."""
+        if self._estimates is None:
+            corrections = self._smoothed()
+            self._estimates = {index: self._estimate(index, corrections[index]) for index in corrections}
+        return dict(self._estimates)
+
+    def cancel(self) -> None:
+        """Stop; what was reached stays in `estimates`."""
+        self.stop_reason = self.stop_reason or "cancelled"
+
+    def __iter__(self) -> Iterator[FrameEstimate]:
+        """Step until all is done."""
+        while (estimate := self.step()) is not None:
+            yield estimate
+
+    def step(self) -> FrameEstimate | None:
+        """Visit the next frame; None once all is done.
+
+        The estimate knows the frames visited before it; those in `estimates` know all others.
+        """
+        if self.stop_reason is not None:
+            return None
+        if self._queue:
+            return self._visit(self._queue.pop(0))
+        if self._revisits is None:
+            self._revisits = self._contradicted()
+        if self._revisits:
+            return self._visit_again(*self._revisits.pop())
+        self.stop_reason = "finished"
+        return None
+
+    def _visit(self, index: int) -> FrameEstimate:
+        began = time.perf_counter()
+        frame, parameters = self._open(index)
+        errors = self._errors
+        fresh = expected = errors.initial()
+        if self._beliefs:
+            expected = errors.predicted(self._beliefs[-1], self._gaps[index])
+        hoped = errors.correction(expected)
+        if index in self._keyframes:
+            start: Start = "keyframe"
+            sight = self._keyframe(frame, parameters, hoped)
+        else:
+            start, sight, lost = self._look(frame, parameters, hoped, errors.correction(fresh))
+            if self._beliefs and sight.information.surprise(hoped) > _SURPRISE:
+                # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
+                if lost:
+                    start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
+                else:
+                    self._gaps[index], expected = math.inf, fresh
+        self._beliefs.append(errors.updated(expected, sight.information))
+        self._estimates = None
+        self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, time.perf_counter() - began)
+        return self._estimate(index, errors.correction(self._beliefs[-1]))
+
+    def _look(
+        self, frame: Frame, parameters: ParameterVector, expected: Gaussian, fresh: Gaussian
+    ) -> tuple[Start, Sight, bool]:
+        """Look warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
+        if not self._beliefs:
+            return "cold", self._eye.cold(frame, parameters, fresh), False
+        losses = [visit.sight.loss for visit in self._visits.values() if visit.start != "carried"]
+        usual = self.model.cold_factor * statistics.median(losses or [math.inf])
+        warm = self._eye.warm(frame, parameters, expected, expected.mean)
+        if warm.loss <= usual:
+            return "warm", warm, False
+        cold = self._eye.cold(frame, parameters, fresh)
+        best = min(warm, cold, key=lambda sight: sight.loss)
+        best = replace(best, iterations=warm.iterations + cold.iterations)
+        lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
+        return "warm" if best.loss == warm.loss else "cold", best, lost
+
+    def _keyframe(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
+        given = self._keyframes[frame.index]
+        correction = parameters.joint_offsets([given[arm.name] for arm in self._scene.arms])
+        here = np.where(np.isfinite(correction), correction, expected.mean)
+        seen = self._eye.at(frame, parameters, expected, here)
+        return replace(seen, information=Information.exact(correction))
+
+    def _open(self, index: int) -> tuple[Frame, ParameterVector]:
+        frame = self._load(index)
+        state = self._scene.state(frame.measured, self._extractor.device)
+        return frame, ParameterVector(self._scene, state, self._free, self.settings.lever)
+
+    def _smoothed(self) -> dict[int, Gaussian]:
+        """Corrections of all visited frames, each in the light of all of them."""
+        if not self._visits:
+            return {}
+        gaps = [self._gaps[index] for index in self._visits]
+        if self._stale:
+            self._beliefs, belief = [], self._errors.initial()
+            for visit, gap in zip(self._visits.values(), gaps, strict=True):
+                belief = self._errors.updated(self._errors.predicted(belief, gap), visit.sight.information)
+                self._beliefs.append(belief)
+            self._stale = False
+        return dict(zip(self._visits, self._errors.smoothed(self._beliefs, gaps), strict=True))
+
+    def _contradicted(self) -> list[tuple[int, Gaussian]]:
+        """Frames whose image does not fit what all frames together say, and what the others say of them."""
+        chosen = []
+        for index, smoothed in self._smoothed().items():
+            visit = self._visits[index]
+            certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
+            if visit.start == "carried" or visit.sight.information.surprise(certain) > _SURPRISE:
+                chosen.append((index, without(smoothed, visit.sight.information)))
+        return chosen
+
+    def _visit_again(self, index: int, expected: Gaussian) -> FrameEstimate:
+        began = time.perf_counter()
+        frame, parameters = self._open(index)
+        earlier = self._visits[index]
+        sight = self._eye.warm(frame, parameters, expected, expected.mean)
+        start: Start = "warm"
+        if sight.information.surprise(expected) > _SURPRISE:
+            start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
+        sight = replace(sight, iterations=earlier.sight.iterations + sight.iterations)
+        seconds = earlier.seconds + time.perf_counter() - began
+        self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
+        self._stale, self._estimates = True, None
+        return self._estimate(index, combined(expected, sight.information))
+
+    def _estimate(self, index: int, correction: Gaussian) -> FrameEstimate:
+        visit = self._visits[index]
+        offsets = torch.from_numpy(correction.mean).to(visit.parameters.lower)
+        state = visit.parameters.state(visit.parameters.clamp(offsets)).detached()
+        known = self._uncertainty(visit.parameters, correction)
+        names = [arm.name for arm in self._scene.arms]
+        deviation = [known.joint_std(arm.name, arm.robot.joint_names) for arm in self._scene.arms]
+        joints = [values.cpu().double().numpy() for values in state.joint_positions]
+        if index in self._keyframes:
+            joints = [self._keyframes[index][name] for name in names]
+            deviation = [np.zeros_like(values) for values in joints]
+            given = self._scene.state(self._keyframes[index], self._extractor.device)
+            state = replace(state, joint_positions=given.joint_positions)
+        return FrameEstimate(
+            index=index,
+            frame_id=visit.frame_id,
+            state=state,
+            joint_positions={name: values.copy() for name, values in zip(names, joints, strict=True)},
+            joint_std=dict(zip(names, deviation, strict=True)),
+            uncertainty=known,
+            loss=visit.sight.loss,
+            start=visit.start,
+            iterations=visit.sight.iterations,
+            seconds=visit.seconds,
+        )
+
+    def _uncertainty(self, parameters: ParameterVector, correction: Gaussian) -> Uncertainty:
+        scales = parameters.scales.cpu().double().numpy()
+        fresh = self._errors.correction(self._errors.initial())
+        std, expected = (np.sqrt(g.covariance.diagonal().clip(min=0.0)) * scales for g in (correction, fresh))
+        return Uncertainty(tuple(parameters.names), tuple(std.tolist()), tuple(expected.tolist()))
+
+
+def _gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
+    """Position -> seconds from the frame visited before it, in the order of the visits."""
+    if not times:
+        raise SettingsError("there are no frames to correct. Choose at least one.")
+    known = {
+        index: index * model.frame_seconds if seconds is None else seconds for index, seconds in sorted(times.items())
+    }
+    for (a, before), (b, after) in pairwise(known.items()):
+        if not before < after:
+            raise SettingsError(
+                f"frame {b} was taken at {after:g} s and frame {a} at {before:g} s. Times must increase; correct them "
+                "in the sequence."
+            )
+    order = list(known) if model.direction == "forward" else list(reversed(known))
+    return {index: abs(known[index] - known[previous]) for previous, index in pairwise([order[0], *order])}

@@ -1,0 +1,125 @@
+"""What one frame's images say of its correction, near a place where it is looked for."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..data import Frame
+from ..features.extractor import FeatureExtractor
+from ..scene import Scene
+from .error_model import Gaussian, Information
+from .evaluation import Evaluation, Objective
+from .parameters import ParameterVector
+from .prior import Prior
+from .settings import OptimizerSettings
+from .solvers import make_solver
+from .surface_objective import SurfaceObjective
+
+Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
+
+_WARM_STEPS, _WARM_TOLERANCE = 3, 1e-2
+"""As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The end of a descent in one frame."""
+
+    correction: Float[np.ndarray, " n"]
+    """Best for image and prior together [rad]."""
+    information: Information
+    """Of the image alone, linearized there."""
+    loss: float
+    iterations: int
+
+
+class Eye:
+    """Looks at frames.
+
+    Args:
+        scene: with the cameras that take part.
+        extractor: the networks.
+        settings: of a cold start; a warm one has its finest blur, one look and few steps.
+        sight_noise: as `OptimizerSettings.noise`, for all but the search of a cold start.
+        ignore: position of a frame -> camera name -> pixels that show an occluder.
+    """
+
+    def __init__(
+        self, scene: Scene, extractor: FeatureExtractor, settings: OptimizerSettings, sight_noise: float, ignore: Ignore
+    ) -> None:
+        self._scene, self._extractor, self._coarse, self._ignore = scene, extractor, settings, ignore
+        self._fine = replace(
+            settings,
+            blurs=settings.blurs[-1:],
+            looks=1,
+            noise=sight_noise,
+            stage_iterations=min(settings.stage_iterations, _WARM_STEPS),
+            tolerance=max(settings.tolerance, _WARM_TOLERANCE),
+        )
+
+    def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
+        """Find the correction near `start` [n]."""
+        parameters.prior = _prior(expected, parameters)
+        return _descend(self._objective(frame, parameters, self._fine), parameters, self._fine, start)
+
+    def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
+        """Find the correction from the measured values on, coarse to fine."""
+        parameters.prior = _prior(expected, parameters)
+        objective = self._objective(frame, parameters, self._coarse)
+        found = _descend(objective, parameters, self._coarse, np.zeros(len(parameters)))
+        end = self.warm(frame, parameters, expected, found.correction)
+        return replace(end, iterations=found.iterations + end.iterations)
+
+    def at(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, correction: np.ndarray) -> Sight:
+        """Evaluate a given correction [n], no more."""
+        parameters.prior = _prior(expected, parameters)
+        objective = self._objective(frame, parameters, self._fine)
+        offsets = torch.from_numpy(correction).to(parameters.lower)
+        evaluation = objective(offsets, objective.stages - 1, gradient=True)
+        return Sight(correction, _information(offsets, evaluation, parameters), evaluation.loss, 0)
+
+    def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
+        ignore = self._ignore(frame.index)
+        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings, ignore)
+
+
+def _prior(expected: Gaussian, parameters: ParameterVector) -> Prior:
+    like = parameters.lower
+    precision = np.linalg.inv(expected.covariance)
+    return Prior(torch.from_numpy(expected.mean).to(like), torch.from_numpy(precision).to(like))
+
+
+def _descend(
+    objective: Objective, parameters: ParameterVector, settings: OptimizerSettings, start: Float[np.ndarray, " n"]
+) -> Sight:
+    solver = make_solver(settings, parameters, objective.stages)
+    offsets = parameters.clamp(torch.from_numpy(start).to(parameters.lower))
+    best: tuple[Tensor, Evaluation] | None = None
+    iterations, last = 0, objective.stages - 1
+    while solver.finished is None:
+        stage = solver.stage
+        evaluation = objective(offsets, stage, gradient=True)
+        iterations += 1
+        if stage == last and (best is None or evaluation.value < best[1].value):
+            best = offsets, evaluation
+        offsets = solver(offsets, evaluation)
+    best = best or (offsets, objective(offsets, last, gradient=True))
+    return Sight(_double(best[0]), _information(*best, parameters), best[1].loss, iterations)
+
+
+def _information(offsets: Tensor, evaluation: Evaluation, parameters: ParameterVector) -> Information:
+    assert evaluation.curvature is not None and parameters.prior is not None
+    precision = _double(evaluation.curvature - parameters.prior.precision)
+    # Without what rounding took below 0: information is never negative.
+    values, vectors = np.linalg.eigh(0.5 * (precision + precision.T))
+    precision = vectors @ np.diag(values.clip(min=0.0)) @ vectors.T
+    slope = _double(evaluation.gradient - parameters.prior.gradient(offsets))
+    return Information(precision, precision @ _double(offsets) - slope)
+
+
+def _double(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()

@@ -1,0 +1,104 @@
+"""The Kalman smoother of measurement errors against plain linear algebra."""
+
+import math
+
+import numpy as np
+import pytest
+
+from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, combined, without
+from carts_core.optimization.sequence_settings import SequenceSettings
+
+N, FRAMES = 3, 5
+GAPS = np.array([0.0, 0.5, 0.1, 2.0, 0.3])
+SETTINGS = SequenceSettings(constant_deg=2.0, drift_deg=0.8, drift_seconds=1.5, jitter_deg=0.3)
+CONSTANT = np.radians([2.0, 2.0, 0.5])
+
+
+def information(seed: int, rank: int) -> Information:
+    rng = np.random.default_rng(seed)
+    jacobian = rng.standard_normal((rank, N)) * 60
+    correction = rng.standard_normal(N) * 0.03
+    precision = jacobian.T @ jacobian
+    return Information(precision, precision @ correction)
+
+
+def everything_at_once(seen: list[Information]) -> tuple[np.ndarray, np.ndarray]:
+    """Means [frames, n] and covariances of all corrections from one big Gaussian."""
+    times = np.cumsum(GAPS)
+    decay = np.exp(-np.abs(times[:, None] - times) / SETTINGS.drift_seconds)
+    over_time = 2.0**2 + 0.8**2 * decay + 0.3**2 * np.eye(FRAMES)
+    prior = np.kron(over_time / 2.0**2, np.diag(CONSTANT**2))
+    precision = np.linalg.inv(prior)
+    for index, one in enumerate(seen):
+        block = slice(index * N, (index + 1) * N)
+        precision[block, block] += one.precision
+    covariance = np.linalg.inv(precision)
+    mean = covariance @ np.concatenate([one.vector for one in seen])
+    return mean.reshape(FRAMES, N), covariance
+
+
+def smoothed(seen: list[Information]) -> list[Gaussian]:
+    model = ErrorModel(SETTINGS, CONSTANT)
+    beliefs, belief = [], model.initial()
+    for gap, one in zip(GAPS, seen, strict=True):
+        belief = model.updated(model.predicted(belief, gap), one)
+        beliefs.append(belief)
+    return model.smoothed(beliefs, GAPS.tolist())
+
+
+def test_smoothing_is_the_same_as_all_frames_at_once() -> None:
+    # Frames that tell nothing, one direction, or all of them.
+    seen = [information(seed, rank) for seed, rank in enumerate((3, 1, 0, 2, 1))]
+    mean, covariance = everything_at_once(seen)
+    for index, found in enumerate(smoothed(seen)):
+        block = slice(index * N, (index + 1) * N)
+        assert np.allclose(found.mean, mean[index], rtol=1e-6, atol=1e-9)
+        assert np.allclose(found.covariance, covariance[block, block], rtol=1e-6, atol=1e-12)
+
+
+def test_what_the_others_say_leaves_out_the_frame_itself() -> None:
+    seen = [information(seed, 2) for seed in range(FRAMES)]
+    others = without(smoothed(seen)[2], seen[2])
+    mean, covariance = everything_at_once([*seen[:2], Information.nothing(N), *seen[3:]])
+    assert np.allclose(others.mean, mean[2], rtol=1e-5, atol=1e-8)
+    assert np.allclose(others.covariance, covariance[6:9, 6:9], rtol=1e-5, atol=1e-11)
+
+
+def test_what_is_exact_stays_exact_and_moves_the_neighbours() -> None:
+    given = np.array([0.04, np.nan, -0.01])
+    seen = [Information.nothing(N) for _ in range(FRAMES)]
+    seen[2] = Information.exact(given)
+    found = smoothed(seen)
+    assert np.allclose(found[2].mean[[0, 2]], given[[0, 2]], atol=1e-9)
+    assert np.sqrt(found[2].covariance.diagonal())[[0, 2]].max() < 1e-6
+    assert found[2].mean[1] == 0
+    for neighbour in (found[1], found[3]):
+        assert 0.02 < neighbour.mean[0] < 0.04 and 0 < math.sqrt(neighbour.covariance[0, 0]) < CONSTANT[0]
+
+
+def test_after_an_endless_gap_nothing_is_known() -> None:
+    model = ErrorModel(SETTINGS, CONSTANT)
+    known = model.updated(model.initial(), information(0, 3))
+    forgotten = model.predicted(known, math.inf)
+    assert np.allclose(forgotten.covariance, model.initial().covariance)
+    assert np.allclose(forgotten.mean, 0)
+
+
+def test_surprise_is_about_one_where_the_model_holds_and_large_elsewhere() -> None:
+    rng = np.random.default_rng(4)
+    expected = Gaussian(np.zeros(N), np.diag(CONSTANT**2))
+    precision = information(1, 3).precision
+    deviation = np.linalg.cholesky(expected.covariance + np.linalg.inv(precision))
+    draws = (deviation @ rng.standard_normal(N) for _ in range(400))
+    values = [Information(precision, precision @ draw).surprise(expected) for draw in draws]
+    assert np.mean(values) == pytest.approx(1.0, abs=0.15)
+    far = Information(precision, precision @ np.full(N, 0.5))
+    assert far.surprise(expected) > 50
+    assert Information.nothing(N).surprise(expected) == 0
+
+
+def test_a_combination_is_the_weighted_mean() -> None:
+    belief = Gaussian(np.array([0.1]), np.array([[0.01]]))
+    found = combined(belief, Information(np.array([[300.0]]), np.array([300.0 * 0.3])))
+    assert found.mean[0] == pytest.approx((100 * 0.1 + 300 * 0.3) / 400)
+    assert found.covariance[0, 0] == pytest.approx(1 / 400)

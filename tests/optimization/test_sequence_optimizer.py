@@ -1,0 +1,231 @@
+"""Frames corrected together, with eyes that are never wrong but do not see everything."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from perfect_sight import PerfectSight
+
+from carts_core.data import Frame, Sequence
+from carts_core.errors import RobotError, SettingsError
+from carts_core.optimization import (
+    FrameOptimizer,
+    FreeParameters,
+    OptimizerSettings,
+    SequenceOptimizer,
+    SequenceSettings,
+)
+from carts_core.rendering import Renderer
+
+FRAMES = 6
+ARM = "PSM1"
+WRIST_PITCH = 4
+
+
+class Sights(PerfectSight):
+    """Sees the truth of the frame that was read last."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+        truths = [sequence.scene.state(sequence.frame(index).truth or {}) for index in range(len(sequence))]
+        self.all = [PerfectSight(sequence, truth).maps for truth in truths]
+        self.blind: set[int] = set()
+        self.read: list[int] = []
+
+    def load(self, index: int) -> Frame:
+        self.read.append(index)
+        self.maps = torch.zeros_like(self.all[index]) if index in self.blind else self.all[index]
+        return self.sequence.frame(index)
+
+
+@pytest.fixture
+def sights(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Sights:
+    seen = Sights(Sequence.open(tiny_sequence(frames=FRAMES, width=320, height=240)))
+    seen.follow_windows(monkeypatch)
+    return seen
+
+
+def optimizer(sights: Sights, **arguments) -> SequenceOptimizer:
+    times = {index: float(index) / 10 for index in range(FRAMES)}
+    return SequenceOptimizer(sights.sequence.scene, sights.load, times, sights, **arguments)  # pyright: ignore[reportArgumentType]
+
+
+def error(sights: Sights, index: int, joint_positions: dict[str, np.ndarray]) -> np.ndarray:
+    """Absolute error [dofs] [rad, m]."""
+    truth = (sights.sequence.frame(index).truth or {})[ARM]
+    return np.abs(joint_positions[ARM] - truth)
+
+
+def wrist_hidden(sights: Sights, hidden: set[int]) -> Callable[[int], dict[str, np.ndarray]]:
+    """Occluders of a frame: all that lies beyond the shaft, in the hidden frames."""
+    sequence = sights.sequence
+    renderer = Renderer(sequence.scene, cameras=["left"])
+
+    def ignore(index: int) -> dict[str, np.ndarray]:
+        if index not in hidden:
+            return {}
+        frame = sequence.frame(index)
+        there = renderer.segment(sequence.scene.state(frame.truth or {}))[0] >= 0
+        # The wrist is what moves when the wrist is bent.
+        bent = {ARM: frame.measured[ARM] + np.eye(7)[4] * 0.5}
+        moved = renderer.segment(sequence.scene.state(bent))[0] >= 0
+        changed = (there ^ moved).astype(np.uint8)
+        assert changed.any()
+        return {"left": cv2.dilate(changed, np.ones((41, 41), np.uint8)) > 0}
+
+    return ignore
+
+
+def test_a_constant_error_is_recovered_in_every_frame(sights: Sights) -> None:
+    sequence = optimizer(sights)
+    steps = list(sequence)
+    assert [step.index for step in steps[:FRAMES]] == list(range(FRAMES))
+    assert [step.start for step in steps[:FRAMES]] == ["cold"] + ["warm"] * (FRAMES - 1)
+    assert sequence.stop_reason == "finished" and sequence.progress == (FRAMES, FRAMES)
+    assert sequence.frames_per_second > 0
+    for index, estimate in sequence.estimates.items():
+        found = error(sights, index, estimate.joint_positions)
+        before = error(sights, index, sights.sequence.frame(index).measured)
+        # Yaw, pitch and insertion move the whole arm in the image.
+        assert found[:2].max() < np.deg2rad(0.2) < before[:2].min()
+        assert found[2] < 0.0006
+        assert found.mean() < 0.7 * before.mean()
+        # Deviations are honest: no error is far beyond them.
+        assert (found / estimate.joint_std[ARM]).max() < 4
+    assert max(step.iterations for step in steps[1:]) < steps[0].iterations
+
+
+def test_a_joint_that_is_hidden_now_and_then_is_carried_by_the_other_frames(sights: Sights) -> None:
+    hidden = {2, 3}
+    ignore = wrist_hidden(sights, hidden)
+    together = optimizer(sights, ignore=ignore)
+    list(together)
+    estimates = together.estimates
+    for index in hidden:
+        alone = FrameOptimizer(sights.sequence.scene, sights.load(index), {}, sights, ignore=ignore(index))  # pyright: ignore[reportArgumentType]
+        list(alone)
+        assert alone.best is not None
+        apart = error(sights, index, alone.best.joint_positions())
+        found = error(sights, index, estimates[index].joint_positions)
+        assert found[WRIST_PITCH] < 0.6 * apart[WRIST_PITCH]
+        # It is known less well than where it is seen, and better than before any image.
+        known = estimates[index].uncertainty
+        expected = known.expected[known.names.index(f"{ARM}/wrist_pitch")]
+        seen = estimates[0].joint_std[ARM][WRIST_PITCH]
+        assert 0.99 * seen < estimates[index].joint_std[ARM][WRIST_PITCH] < expected
+
+
+def test_a_frame_in_which_nothing_is_seen_takes_its_neighbours_correction(sights: Sights) -> None:
+    sights.blind = {3}
+    sequence = optimizer(sights)
+    list(sequence)
+    found = error(sights, 3, sequence.estimates[3].joint_positions)
+    assert found[:2].max() < np.deg2rad(0.25)
+    assert sequence.estimates[3].loss > 3 * sequence.estimates[2].loss
+
+
+def test_a_keyframe_stays_as_given_and_draws_the_others(sights: Sights) -> None:
+    given = {ARM: sights.sequence.frame(2).measured[ARM] + 0.02}
+    # Nothing else is seen, so what the others get can only come from the keyframe.
+    sights.blind = set(range(FRAMES))
+    sequence = optimizer(sights, keyframes={2: given})
+    for _ in sequence:
+        pass
+    estimates = sequence.estimates
+    assert np.array_equal(estimates[2].joint_positions[ARM], given[ARM])
+    assert np.allclose(estimates[2].state.joint_positions[0].numpy(), given[ARM], atol=1e-6)
+    assert estimates[2].start == "keyframe" and not estimates[2].joint_std[ARM].any()
+    estimates[2].joint_positions[ARM][:] = 0
+    assert np.array_equal(sequence.estimates[2].joint_positions[ARM], estimates[2].joint_positions[ARM])
+    for index in (0, 1, 3, 5):
+        correction = estimates[index].joint_positions[ARM] - sights.sequence.frame(index).measured[ARM]
+        assert 0.012 < correction[0] < 0.0205
+        assert (estimates[index].joint_std[ARM] > 0).all()
+
+
+def test_cancelling_keeps_what_is_there(sights: Sights) -> None:
+    sequence = optimizer(sights)
+    sequence.step()
+    sequence.step()
+    sequence.cancel()
+    assert sequence.step() is None and sequence.stop_reason == "cancelled"
+    assert list(sequence.estimates) == [0, 1] and sequence.progress == (2, FRAMES)
+    assert error(sights, 1, sequence.estimates[1].joint_positions)[:2].max() < np.deg2rad(0.25)
+
+
+def test_nothing_was_visited_yet(sights: Sights) -> None:
+    sequence = optimizer(sights)
+    sequence.cancel()
+    assert sequence.estimates == {} and sequence.frames_per_second == 0
+
+
+def test_backward_begins_at_the_last_frame_and_ends_alike(sights: Sights) -> None:
+    model = SequenceSettings(direction="backward")
+    backward, forward = optimizer(sights, model=model), optimizer(sights)
+    steps = list(backward)
+    list(forward)
+    assert [step.index for step in steps[:FRAMES]] == list(reversed(range(FRAMES)))
+    assert steps[0].start == "cold" and steps[1].start == "warm"
+    for index in range(FRAMES):
+        there, back = (s.estimates[index].joint_positions[ARM] for s in (forward, backward))
+        assert np.abs(there - back)[:2].max() < np.deg2rad(0.1)
+
+
+def test_a_jump_of_the_error_begins_anew(sights: Sights) -> None:
+    """From frame 3 on the encoders are off by other amounts, as after homing."""
+    jump = np.deg2rad([2.5, -2.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def load(index: int) -> Frame:
+        frame = sights.load(index)
+        return replace(frame, measured={ARM: frame.measured[ARM] + (index >= 3) * jump})
+
+    times = {index: float(index) / 10 for index in range(FRAMES)}
+    sequence = SequenceOptimizer(sights.sequence.scene, load, times, sights)  # pyright: ignore[reportArgumentType]
+    list(sequence)
+    for index, estimate in sequence.estimates.items():
+        # Of 3 degrees, the last half degree is held back by what is expected of a constant.
+        assert error(sights, index, estimate.joint_positions)[:2].max() < np.deg2rad(0.6)
+
+
+def test_locked_joints_stay_measured_and_have_no_deviation(sights: Sights) -> None:
+    sequence = optimizer(sights, free=FreeParameters(locked_joints=("roll",)))
+    sequence.step()
+    (estimate,) = sequence.estimates.values()
+    measured = sights.sequence.frame(0).measured[ARM]
+    assert estimate.joint_positions[ARM][3] == pytest.approx(measured[3], abs=1e-6)
+    assert np.isnan(estimate.joint_std[ARM][3]) and np.isfinite(np.delete(estimate.joint_std[ARM], 3)).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"settings": OptimizerSettings.acs()}, "given the solver adam and the loss acs; it needs gauss_newton"),
+        ({"keyframes": {9: {ARM: np.zeros(7)}}}, "keyframe 9 is not among the frames"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(sights: Sights, arguments: dict, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        optimizer(sights, **arguments)
+
+
+def test_a_keyframe_needs_every_arm(sights: Sights) -> None:
+    with pytest.raises(RobotError, match="no joint positions for arm 'PSM1'"):
+        optimizer(sights, keyframes={0: {}})
+
+
+@pytest.mark.parametrize(
+    ("times", "message"), [({}, "no frames to correct"), ({0: 1.0, 1: 1.0}, "Times must increase")]
+)
+def test_frames_and_times_that_do_not_fit_are_refused(sights: Sights, times: dict, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        SequenceOptimizer(sights.sequence.scene, sights.load, times, sights)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("name", "value"), [("drift_seconds", 0.0), ("sight_noise", 1e3), ("direction", "sideways")])
+def test_settings_out_of_range_are_named(name: str, value: object) -> None:
+    with pytest.raises(SettingsError, match=f"{name} is {value!r}; allowed is"):
+        SequenceSettings(**{name: value})  # pyright: ignore[reportArgumentType]
