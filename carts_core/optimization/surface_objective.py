@@ -110,7 +110,7 @@ class SurfaceObjective:
             seed: of the random numbers.
         """
         generator = torch.Generator().manual_seed(seed)
-        spread = _SPREAD * self._prior.rsqrt().cpu()
+        spread = _SPREAD * self._prior.marginal.rsqrt().cpu()
         best = offsets
         with torch.no_grad():
             best_cost = self._coarse_cost(best)
@@ -126,7 +126,7 @@ class SurfaceObjective:
 
     def _coarse_cost(self, offsets: Tensor) -> float:
         cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
-        return cost / self.settings.noise**2 + 0.5 * float((self._prior * offsets.square()).sum())
+        return cost / self.settings.noise**2 + self._prior.value(offsets)
 
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
