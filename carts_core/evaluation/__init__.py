@@ -12,7 +12,10 @@ from .evaluate import start_positions as start_positions
 from .evaluate import to_json as to_json
 from .metrics import dice as dice
 from .metrics import joint_mae_deg as joint_mae_deg
+from .metrics import joint_std_deg as joint_std_deg
 from .metrics import normalized_surface_distance as normalized_surface_distance
+from .sequence import Starts as Starts
+from .sequence import evaluate_sequence as evaluate_sequence
 
 __all__ = [
     "FrameResidual",
