@@ -51,7 +51,7 @@ class OptimizerSettings:
     """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
     bad_loss: float = 0.09
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
-    noise: float = 0.7
+    noise: float = 1.5
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""

@@ -151,7 +151,9 @@ class SurfaceObjective:
         if compared.gradient is not None and compared.curvature is not None:
             slope = self._prior.gradient(offsets) + compared.gradient
             curvature = self._prior.precision + compared.curvature
-            known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
+            # As a part of a larger objective, unknowns have no prior here and are not judged.
+            if bool((self._prior.precision.diagonal() > 0).all()):
+                known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
         empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])
