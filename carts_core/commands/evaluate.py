@@ -29,6 +29,8 @@ class Evaluate:
     """Write the scores of all frames and their means to this file."""
     mode: Mode = "frame"
     """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+    together: bool = False
+    """Let all chosen cameras look at a frame in one optimization (stereo), instead of each alone; frame mode only."""
     perturb_deg: float = 0.0
     """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
     seed: int = 0
@@ -47,7 +49,8 @@ class Evaluate:
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
-        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
+        alone = partial(evaluate, together=self.together)
+        run = alone if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
         found = run(
             sequence,
             extractor,

@@ -47,56 +47,54 @@ def evaluate(
     free: FreeParameters,
     perturb_deg: float = 0.0,
     seed: int = 0,
+    together: bool = False,
 ) -> Iterator[FrameScore]:
-    """Optimize every frame in every camera and domain, each on its own, and yield its score.
+    """Optimize every frame in every domain and camera, each on its own, and yield its score.
 
     Args:
         sequence: with masks, true kinematics, both or neither.
         extractor: the feature network.
         frames: positions in the sequence.
-        cameras: names; every one sees the frame alone.
+        cameras: names; every one sees the frame alone, unless they look `together`.
         domains: names.
         settings, free: of the optimization.
         perturb_deg: 0 starts at the measured joint positions. Otherwise the start is the true joint positions (the
             measured ones where there is no truth) with every measured joint moved by this much; see `perturb`.
         seed: of the perturbation; the same frame gets the same one in every camera and domain.
+        together: one optimization for all cameras; a frame has a score for each, which share its time.
     """
+    groups = [tuple(cameras)] if together else [(camera,) for camera in cameras]
     for domain in domains:
-        for camera in cameras:
-            renderer = Renderer(sequence.scene, cameras=[camera])
-            background = {camera: sequence.background(camera, domain)}
+        for group in groups:
+            scene = sequence.scene.with_cameras(group)
+            renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
+            backgrounds = {camera: sequence.background(camera, domain) for camera in group}
             for index in frames:
-                frame = sequence.frame(index, domain, [camera])
+                frame = sequence.frame(index, domain, list(group))
                 start = start_positions(sequence, frame, perturb_deg, seed)
                 began = time.perf_counter()
                 optimizer = FrameOptimizer(
-                    sequence.scene,
-                    frame,
-                    background,
-                    extractor,
-                    start=start,
-                    settings=settings,
-                    free=free,
-                    cameras=[camera],
+                    scene, frame, backgrounds, extractor, start=start, settings=settings, free=free
                 )
                 for _ in optimizer:
                     pass
-                seconds = time.perf_counter() - began
+                seconds = (time.perf_counter() - began) / len(group)
                 best = optimizer.best
                 assert best is not None and optimizer.stop_reason is not None
-                yield frame_score(
-                    sequence,
-                    frame,
-                    camera,
-                    renderer,
-                    start,
-                    best.state,
-                    best.joint_positions(),
-                    best.joint_std(),
-                    len(optimizer.history) - 1,
-                    seconds,
-                    optimizer.stop_reason,
-                )
+                for camera, renderer in renderers.items():
+                    yield frame_score(
+                        sequence,
+                        frame,
+                        camera,
+                        renderer,
+                        start,
+                        best.state,
+                        best.joint_positions(),
+                        best.joint_std(),
+                        len(optimizer.history) - 1,
+                        seconds,
+                        optimizer.stop_reason,
+                    )
 
 
 def start_positions(

@@ -1,0 +1,31 @@
+"""Evaluation of optimized frames, cameras alone and together."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.evaluation import evaluate
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import FreeParameters, OptimizerSettings
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_every_camera_of_a_frame_has_a_score(tiny_sequence: Callable[..., Path], together: bool) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), width=320, height=240))
+    scores = list(
+        evaluate(
+            sequence,
+            FeatureExtractor.load(),
+            frames=[0],
+            cameras=["left", "right"],
+            domains=["regular"],
+            settings=OptimizerSettings(iterations=3),
+            free=FreeParameters(),
+            together=together,
+        )
+    )
+    assert [score.camera for score in scores] == ["left", "right"]
+    errors = {score.joint_mae_deg_after for score in scores}
+    assert len(errors) == (1 if together else 2), "cameras that look together agree on the joints"
