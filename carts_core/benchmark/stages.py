@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from ..bench import iteration_figures, milliseconds, render_figures
+from ..bench import optimizer_figures, milliseconds, render_figures
 from ..data import Sequence
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
@@ -33,7 +33,7 @@ def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
     figures = {
         **render_figures(sequence, _RUNS),
         **network_figures(extractor),
-        **iteration_figures(sequence, _RUNS),
+        **optimizer_figures(sequence, _RUNS),
     }
     write_bytes(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1).encode())
 
