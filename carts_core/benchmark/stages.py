@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from ..bench import optimizer_figures, milliseconds, render_figures
+from ..bench import milliseconds, optimizer_figures, render_figures
 from ..data import Sequence
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor

@@ -90,9 +90,9 @@ class Renderer:
         face_ids, inverse_depth = self._visibility(views_T.detach(), views_K.detach())
         points = visible_points(self.geometry, face_ids, inverse_depth, views_T.detach(), views_K.detach())
         point, normal = points.transformed(views_T)
-        color = phong(self.geometry.face_colors[:, points.face], point, normal, self.scene.light)
+        color = phong(self.geometry.face_colors.index_select(1, points.face), point, normal, self.scene.light)
         values = torch.cat([color, torch.ones_like(color[:1])])
-        dense = values.new_zeros(4, face_ids.numel()).index_copy(1, points.pixel, values).view(4, *face_ids.shape)
+        dense = values.new_zeros(4, face_ids.numel()).index_copy_(1, points.pixel, values).view(4, *face_ids.shape)
         if torch.is_grad_enabled() and (point.requires_grad or views_K.requires_grad):
             K = points.intrinsics(views_K)
             position = K[:2] * point[:2] / point[2:] + K[2:]
@@ -133,7 +133,7 @@ class Renderer:
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
         points = visible_points(self.geometry, face_ids, inverse_depth, Ts, intrinsics)
         parts = self.geometry.face_parts[points.face]
-        colors = self.geometry.face_colors[:, points.face]
+        colors = self.geometry.face_colors.index_select(1, points.face)
         return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents, margin)
 
     @torch.no_grad()

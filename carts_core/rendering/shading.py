@@ -7,8 +7,9 @@ Vectors are columns (`3 K`), and points stand in the order of their links, so th
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..scene import Light
@@ -61,7 +62,7 @@ def visible_points(
     """The surface point and the normal that each visible pixel sees."""
     views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
-    pixel = (face_ids.flatten() >= 0).nonzero()[:, 0]
+    pixel = _nonzero(face_ids.flatten() >= 0)
     face = face_ids.flatten()[pixel].long()
     view = pixel // (height * width)
     key = (view * links + geometry.face_links[face]).short()
@@ -82,12 +83,19 @@ def visible_points(
         or [points],
         1,
     )
-    maps = geometry.face_barycentric[:, face].view(2, 4, -1)
+    maps = geometry.face_barycentric.index_select(1, face).view(2, 4, -1)
     # A pixel at the rim of its triangle may leave it by a rounding error.
     weight = ((maps[:, :3] * point_link).sum(1) + maps[:, 3]).clamp(0.0, 1.0)
-    a, b, c = geometry.face_normals[:, face].view(3, 3, -1)
+    a, b, c = geometry.face_normals.index_select(1, face).view(3, 3, -1)
     normal = a + weight[0] * (b - a) + weight[1] * (c - a)
     return VisiblePoints(pixel, face, groups, point_link, unit(normal))
+
+
+def _nonzero(flags: Bool[Tensor, " n"]) -> Int[Tensor, " K"]:
+    """Where flags are set; NumPy is several times faster on a CPU."""
+    if flags.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(flags.numpy()))
+    return flags.nonzero()[:, 0]
 
 
 def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
