@@ -7,7 +7,7 @@ import viser
 from carts_core.losses import Loss
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
 
@@ -57,7 +57,7 @@ class OptimizePanel:
         self._reset.disabled = not state.run.curves.loss
         write(self._loss, _label(self._losses, state.settings.loss))
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        self._status.content = f'<p class="carts-status">{status_line(state)}</p>'
+        self._status.content = f'<p class="carts-status">{status_line(state)}</p>{observability_lines(state)}'
 
 
 def status_line(state: ViewState) -> str:
@@ -76,6 +76,24 @@ def status_line(state: ViewState) -> str:
     elif state.run.reason:
         parts.append(f"<b>{escaped(state.run.reason)}</b>")
     return " · ".join(parts) or "Press Run to fit the arm to this frame."
+
+
+def observability_lines(state: ViewState) -> str:
+    """Which unknowns the last iterate's image leaves open, as HTML; empty while running and for losses that cannot say."""
+    known = None if state.maps is None else state.maps.iterate.uncertainty
+    if known is None or state.run.phase is Phase.RUNNING:
+        return ""
+    lines = []
+    for verdict, meaning in (("weak", "Weakly determined"), ("not visible", "Not visible, left as it was")):
+        names = [_spoken(name) for name in known.names if known.verdict(name) == verdict]
+        if names:
+            lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
+    return "".join(lines)
+
+
+def _spoken(unknown: str) -> str:
+    owner, _, name = unknown.partition("/")
+    return f"{owner} {humanized(name).lower()}"
 
 
 def _label(labels: dict[str, str], name: str) -> str:

@@ -1,0 +1,28 @@
+"""What the optimizer's panel says about joints that the image does not determine."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+from carts_core.optimization.observability import Uncertainty
+from carts_viewer.panels.optimize import observability_lines
+from carts_viewer.state import Maps, Phase, RunState
+
+
+def _state(uncertainty: Uncertainty | None, phase: Phase) -> SimpleNamespace:
+    iterate = SimpleNamespace(uncertainty=uncertainty)
+    return SimpleNamespace(maps=Maps(iterate, ("left",)), run=replace(RunState(), phase=phase))  # pyright: ignore
+
+
+KNOWN = Uncertainty(("PSM1/outer_yaw", "PSM1/wrist_yaw", "PSM1/jaw"), (0.01, 0.03, 0.05), (0.05, 0.05, 0.05))
+
+
+def test_joints_that_the_image_leaves_open_are_named_by_how_much() -> None:
+    lines = observability_lines(_state(KNOWN, Phase.IDLE))  # pyright: ignore
+    assert "Weakly determined: PSM1 wrist yaw<" in lines
+    assert "Not visible, left as it was: PSM1 jaw<" in lines
+    assert "outer" not in lines
+
+
+def test_nothing_is_said_while_running_or_by_losses_that_cannot_say() -> None:
+    assert observability_lines(_state(KNOWN, Phase.RUNNING)) == ""  # pyright: ignore
+    assert observability_lines(_state(None, Phase.IDLE)) == ""  # pyright: ignore
