@@ -79,7 +79,7 @@ def status_line(state: ViewState) -> str:
 
 
 def observability_lines(state: ViewState) -> str:
-    """Which unknowns the last iterate's image leaves open, as HTML; empty while running and for losses that cannot say."""
+    """Which unknowns the image leaves open, as HTML; empty while running and for losses that cannot say."""
     known = None if state.maps is None else state.maps.iterate.uncertainty
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
