@@ -43,7 +43,7 @@ class OptimizerSettings:
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
     blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
-    looks: int = 2
+    looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
@@ -51,7 +51,7 @@ class OptimizerSettings:
     """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
     bad_loss: float = 0.09
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
-    noise: float = 1.5
+    noise: float = 2.0
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""

@@ -35,7 +35,7 @@ _SPREAD = 1.5
 """Deviation of random starts, in expected errors."""
 
 _FINE = 2
-"""Number of stages that every look but the first one goes through."""
+"""Number of stages of the second look."""
 
 _COARSEST = 8
 """Working pixels per side of a pixel in the coarsest stages."""
@@ -51,7 +51,7 @@ class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
-    look serves the coarse stages, each later one the last two.
+    look serves the coarse stages, the second one the last two, each later one the last.
 
     Args:
         scene: with the cameras that take part.
@@ -77,7 +77,9 @@ class SurfaceObjective:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
         self._plan = [(0, blur) for blur in coarse]
-        self._plan += [(look, blur) for look in range(min(1, settings.looks - 1), settings.looks) for blur in fine]
+        second = min(1, settings.looks - 1)
+        self._plan += [(second, blur) for blur in fine]
+        self._plan += [(look, fine[-1]) for look in range(second + 1, settings.looks)]
         self.stages = len(self._plan)
         self._size = working_size(scene, settings.working_width, extractor.stride)
         device = extractor.device
