@@ -18,6 +18,7 @@ from .domain_randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
 from .objective import dilated, weighted_mean
 from .surface_network import SurfaceNetwork
 from .task import Batch, byte_tensor, flips
+from .validation import dice
 
 if TYPE_CHECKING:
     from .training_config import TrainingConfig
@@ -104,8 +105,8 @@ class SurfaceTask:
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
         cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
         return {
-            "dice": float(_dice(guess, true).mean()),
-            "dice_believed": float(_dice(known, true).mean()),
+            "dice": float(dice(guess, true).mean()),
+            "dice_believed": float(dice(known, true).mean()),
             "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
             "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
         }
@@ -142,10 +143,6 @@ def _part_dice_loss(
     assert predicted.shape[1] == len(PARTS)
     overlap = (predicted * coverage).sum((2, 3))
     return 1 - ((2 * overlap + 1) / (predicted.sum((2, 3)) + coverage.sum((2, 3)) + 1)).mean()
-
-
-def _dice(a: Tensor, b: Tensor) -> Tensor:
-    return (2 * (a & b).sum((1, 2)) + 1e-9) / (a.sum((1, 2)) + b.sum((1, 2)) + 1e-9)
 
 
 def _colors(channels: Float[Tensor, "3 h w"]) -> np.ndarray:
