@@ -12,6 +12,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ..errors import SettingsError
 from .checkpoint import History, load_checkpoint, save_checkpoint
+from .growth import grow
 from .loader import training_batches, validation_set
 from .network import UNet, channels_last
 from .report import write_report
@@ -183,12 +184,7 @@ def _first_network(config: TrainingConfig) -> UNet:
             f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
             "weights of that kind, or start from random weights."
         )
-    if network.architecture != config.architecture:
-        raise SettingsError(
-            f"{config.start} holds a network of {network.architecture}, but {config.architecture} is asked for. Give "
-            "the architecture of the file, or start from random weights."
-        )
-    return network
+    return network if network.architecture == config.architecture else grow(fresh, network)
 
 
 def weights_file(config: TrainingConfig, output: Path) -> Path:

@@ -9,6 +9,7 @@ from carts_core.features.domain_randomization import (
     AppearanceRanges,
     ImageSettings,
     PairGenerator,
+    SurfaceGenerator,
     TrainingPair,
     variants,
 )
@@ -16,6 +17,7 @@ from carts_core.features.domain_randomization.backgrounds import random_backgrou
 from carts_core.features.domain_randomization.gbuffer import render_gbuffer
 from carts_core.features.domain_randomization.geometry import RobotGeometry
 from carts_core.features.domain_randomization.lens import tone
+from carts_core.features.domain_randomization.occluders import occlude
 from carts_core.features.domain_randomization.placement import perturbed, random_intrinsics, random_placement
 from carts_core.features.domain_randomization.ranges import DARKEST_BRIGHTNESS
 from carts_core.features.domain_randomization.shading import shade
@@ -185,3 +187,27 @@ def test_shading_differs_from_draw_to_draw_and_stays_in_range(geometry: RobotGeo
     colors = [shade(rng, view, [geometry], np.array([0.6, 0.4, 0.4])) for _ in range(12)]
     assert all(np.isfinite(color).all() and color.min() >= 0 and color.max() <= 1 for color in colors)
     assert np.std([color.mean() for color in colors]) > 0.02
+
+
+def test_occluders_hide_some_of_the_arms_and_only_what_is_near_them():
+    rng = np.random.default_rng(3)
+    image, coverage = np.zeros((160, 192, 3), np.float32), np.zeros((160, 192), np.float32)
+    assert np.array_equal(occlude(rng, image, coverage), image)
+    coverage[60:90, :100] = 1
+    hidden = [(occlude(rng, image, coverage).max(2) > 0.02)[coverage > 0].mean() for _ in range(40)]
+    assert 0.02 < np.mean(hidden) < 0.4
+    assert np.min(hidden) > 0
+
+
+def test_no_occluder_is_red_as_blood_is():
+    rng = np.random.default_rng(4)
+    coverage = np.ones((64, 80), np.float32)
+    for _ in range(40):
+        image = occlude(rng, np.zeros((64, 80, 3), np.float32), coverage)
+        assert image.mean((0, 1))[0] <= 1.02 * image.mean((0, 1))[1:].max()
+
+
+def test_what_is_to_be_learnt_lies_below_the_occluders(shipped_psm: Robot):
+    bare, occluded = (SurfaceGenerator([shipped_psm], ImageSettings(occluded=share), 5)() for share in (0.0, 1.0))
+    assert (bare.observed != occluded.observed).any()
+    assert np.array_equal(bare.surface, occluded.surface)

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -133,11 +134,17 @@ def test_fine_tuning_starts_from_the_given_weights(tmp_path: Path, small_weights
         torch.testing.assert_close(value, given[name], atol=1e-6, rtol=1e-4)
 
 
-def test_fine_tuning_weights_of_another_architecture_is_refused(tmp_path: Path, small_weights: Path):
+def test_fine_tuning_grows_into_a_larger_architecture(tmp_path: Path, small_weights: Path):
+    smaller = read_weights(small_weights).network
+    widths = tuple(width + 3 for width in smaller.architecture.widths)
+    larger = replace(smaller.architecture, widths=widths)
+    result = train(small_config(start=small_weights, architecture=larger, steps=1, learning_rate=1e-9), tmp_path)
+    assert read_weights(result.weights).network.architecture == larger
+
+
+def test_fine_tuning_weights_that_do_not_fit_in_is_refused(tmp_path: Path, small_weights: Path):
     other = Architecture(widths=(4, 6), encoder_convolutions=(1, 1), decoder_convolutions=(1,))
-    with pytest.raises(
-        SettingsError, match=r"small\.safetensors holds a network of .*Give the architecture of the file"
-    ):
+    with pytest.raises(SettingsError, match=r"as many convolutions or more"):
         train(small_config(start=small_weights, architecture=other), tmp_path)
 
 

@@ -14,6 +14,7 @@ from .clutter import add_clutter, cast_shadow
 from .gbuffer import GBuffer, render_gbuffer
 from .geometry import Intrinsics, RobotGeometry
 from .lens import photograph
+from .occluders import occlude
 from .placement import Placement, random_intrinsics, random_placement
 from .ranges import AppearanceRanges
 from .shading import shade
@@ -41,6 +42,8 @@ class ImageSettings:
     """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
     same_background: float = 0.7
     """Share of pairs whose mean background is that of the observed image."""
+    occluded: float = 0.3
+    """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
     coverage: tuple[float, float] = (0.004, 0.5)
     """Allowed share of the image that shows arms."""
     appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
@@ -53,7 +56,7 @@ class ImageSettings:
             )
         if self.field_width < self.width:
             raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
-        for name in ("two_arms", "same_kinematics", "same_background"):
+        for name in ("two_arms", "same_kinematics", "same_background", "occluded"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
         if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
@@ -143,6 +146,8 @@ class Observer:
         for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
             background = cast_shadow(rng, background, coverage)
         composed = background * (1 - coverage[..., None]) + arms
+        if rng.random() < self.settings.occluded:
+            composed = occlude(rng, composed, coverage)
         return photograph(np.random.default_rng(camera_seed), composed, self.settings.appearance)
 
 
