@@ -86,7 +86,8 @@ class OptimizerFactory:
         extractor = self.prepare()
         self._report("Preparing the frame")
         frame = self._sequence.frame(index, domain, list(cameras))
-        backgrounds = {camera: self._sequence.background(camera, domain) for camera in cameras}
+        seen = cameras if settings.needs_background else ()
+        backgrounds = {camera: self._sequence.background(camera, domain) for camera in seen}
         scene = scene_at(self._sequence.scene, pose.scene)
         start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
         return FrameOptimizer(

@@ -93,7 +93,8 @@ class Optimize:
         output: FrameFolder,
         console: Console,
     ) -> None:
-        background = {camera: sequence.background(camera, domain)} if todo else {}
+        needed = todo and self.optimizer.needs_background
+        background = {camera: sequence.background(camera, domain)} if needed else {}
         for index in track(todo, f"{domain}, {camera}", console=console, disable=not todo):
             frame = sequence.frame(index, domain, [camera])
             optimizer = FrameOptimizer(

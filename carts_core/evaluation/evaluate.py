@@ -68,7 +68,8 @@ def evaluate(
         for group in groups:
             scene = sequence.scene.with_cameras(group)
             renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-            backgrounds = {camera: sequence.background(camera, domain) for camera in group}
+            seen = group if settings.needs_background else ()
+            backgrounds = {camera: sequence.background(camera, domain) for camera in seen}
             for index in frames:
                 frame = sequence.frame(index, domain, list(group))
                 start = start_positions(sequence, frame, perturb_deg, seed)

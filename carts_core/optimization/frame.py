@@ -76,7 +76,7 @@ class FrameOptimizer:
     Args:
         scene: arms and cameras.
         frame: observed images and measured joint positions.
-        backgrounds: camera name -> mean background BG_m.
+        backgrounds: camera name -> mean background BG_m; the loss `surface` needs none.
         extractor: the feature network.
         ignore: camera name -> pixels that show an occluder; the loss `surface` leaves them out.
         start: arm name -> joint positions to start from, the measured ones by default.

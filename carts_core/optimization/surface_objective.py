@@ -134,7 +134,7 @@ class SurfaceObjective:
         """Have the network say what the image shows, knowing the present estimate."""
         believed = self._whole.surface(self.parameters.state(offsets)).maps
         window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
-        observed = self._extractor.surface(window.of(self._images), window.of(believed))
+        observed = self._extractor.surface(window.of(self._images), window.of(believed), self.settings.views)
         weight = window.of(self._weight)
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
