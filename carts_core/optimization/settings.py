@@ -46,7 +46,7 @@ class OptimizerSettings:
     looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     views: int = 2
-    """`surface`: 1 shows the network the image alone, 2 also its mirror image, 4 also both upside down; the mean counts."""
+    """`surface`: 1 shows the network the image, 2 also its mirror image, 4 also both upside down; the mean counts."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
     candidates: int = 64
