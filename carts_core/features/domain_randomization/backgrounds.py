@@ -27,7 +27,7 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
 
     Its mean brightness stays above about 0.25: low light is no part of the training data.
     """
-    kind = rng.choice(["tissue", "board", "free", "pattern"], p=[0.38, 0.4, 0.14, 0.08])
+    kind = rng.choice(["tissue", "board", "free", "pattern"], p=[0.55, 0.27, 0.11, 0.07])
     if kind == "tissue":
         image = _tissue(rng, width, height)
     elif kind == "board":
@@ -86,7 +86,7 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
         image = _vessel(rng, image)
     for _ in range(rng.choice([0, 1, 2, 4], p=[0.35, 0.25, 0.25, 0.15])):
         image = _glare(rng, image)
-    if rng.random() < 0.5:
+    if rng.random() < 0.65:
         image = _wet_relief(rng, image)
     elif rng.random() < 0.5:  # wet spots mirror the light
         wet = smooth_noise(rng, width, height, rng.uniform(15, 45), 2) + 0.5 * relief
@@ -101,6 +101,10 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     relief = smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(14))), int(rng.integers(1, 4)))
     if rng.random() < 0.4:  # creases
         relief = -np.abs(relief)
+    if rng.random() < 0.5:
+        folds = _folds(rng, width, height)
+        relief = np.float32(rng.uniform(0.1, 0.5)) * relief + folds * np.float32(rng.uniform(1, 3))
+        image = image * (1 - rng.uniform(0, 0.5) * np.exp(-8 * folds))[..., None]  # dark between folds
     steepness = rng.uniform(4, 14)
     slope_x, slope_y = (
         cv2.Sobel(relief, cv2.CV_32F, 1, 0) * steepness / 8,
@@ -120,6 +124,22 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
         highlight = highlight * np.clip(1 + smooth_noise(rng, width, height, width / rng.uniform(3, 10), 1), 0, 3)
     shade = 1 + rng.uniform(0.2, 0.8) * (facing - facing.mean())
     return image * shade[..., None] + highlight[..., None]
+
+
+def _folds(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """Heights of folds, gut and vessels: tubes of a few widths that wind over one another [height, width], in [0, 1]."""
+    heights = np.zeros((height, width), np.float32)
+    for _ in range(rng.integers(2, 14)):
+        heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, rng.uniform(0.05, 0.4), 30))
+        steps = np.stack([np.cos(heading), np.sin(heading)], 1) * rng.uniform(0.01, 0.05) * width
+        points = rng.uniform(-0.1, 1.1, 2) * (width, height) + np.cumsum(steps, axis=0)
+        away = np.ones((height, width), np.uint8)
+        cv2.polylines(away, [np.rint(points).astype(np.int32)], False, 0, 1)
+        distance = cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        radius = np.float32(np.exp(rng.uniform(np.log(2.5), np.log(26))))
+        tube = np.sqrt(np.clip(1 - (distance / radius) ** 2, 0, 1))
+        heights = np.maximum(heights, tube * np.float32(min(radius / 12, 1.0)))
+    return cv2.GaussianBlur(heights, (0, 0), rng.uniform(0.6, 2.0))
 
 
 def _glare(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
