@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
+from ..losses import attention
 from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
@@ -30,6 +31,10 @@ from .window import Window
 
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
+
+_ATTENTION = (40, 20)
+"""Distance from the arms as they are believed to be, beyond which nothing counts [px of the working image]: of the
+first look and of those that know better. What is taken for an arm further off is none."""
 
 _SPREAD = 1.5
 """Deviation of random starts, in expected errors."""
@@ -135,7 +140,9 @@ class SurfaceObjective:
         believed = self._whole.surface(self.parameters.state(offsets)).maps
         window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed), self.settings.views)
-        weight = window.of(self._weight)
+        silhouette = (believed[:, COVERAGE].sum(1) > 0).to(believed)
+        near = attention(silhouette, _ATTENTION[min(look, 1)]) if silhouette.any() else torch.ones_like(silhouette)
+        weight = window.of(self._weight * near[:, None])
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
         blurs = [blur for number, blur in self._plan if number == look]

@@ -127,7 +127,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 
 
 def _folds(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Heights of folds, gut and vessels: tubes of a few widths that wind over one another [height, width], in [0, 1]."""
+    """Heights of folds, gut and vessels: tubes that wind over one another [height, width], in [0, 1]."""
     heights = np.zeros((height, width), np.float32)
     for _ in range(rng.integers(2, 14)):
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, rng.uniform(0.05, 0.4), 30))
