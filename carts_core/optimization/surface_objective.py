@@ -32,7 +32,7 @@ from .window import Window
 _MARGIN = 40
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
-_ATTENTION = (40, 20)
+_ATTENTION = (40, 12)
 """Distance from the arms as they are believed to be, beyond which nothing counts [px of the working image]: of the
 first look and of those that know better. What is taken for an arm further off is none."""
 
