@@ -6,6 +6,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 from carts_core.data import Sequence
@@ -147,10 +148,11 @@ class ViewerApp:
         self._closed = True
         self._worker.stop()
         self.page.close()
-        try:
-            self._session.close()
-        finally:
-            self._storage.close()
+        with ExitStack() as stack:
+            # From the last to the first, whatever fails.
+            stack.callback(self._storage.close)
+            stack.callback(self._session.close)
+            stack.callback(self._controller.close)
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
         """Wait until everything asked for so far has been done and sent to the page.

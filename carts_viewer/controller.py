@@ -18,6 +18,7 @@ from carts_viewer.exporting import Exporter
 from carts_viewer.optimizing import Runner
 from carts_viewer.picture import Painter
 from carts_viewer.posing import Poser
+from carts_viewer.propagating import Propagator
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState
@@ -48,12 +49,14 @@ class Controller:
         self._browser = Browser(self)
         self._annotator = Annotator(self)
         self._runner = Runner(self, optimizers)
+        self._propagator = Propagator(self, optimizers)
         self._exporter = Exporter(self)
         self._parts: dict[type[ask.Intent], Callable[[Any], None]] = {
             ask.Browsing: self._browser.handle,
             ask.Posing: Poser(self).handle,
             ask.Optimizing: self._runner.handle,
             ask.Annotation: self._annotator.handle,
+            ask.Propagating: self._propagator.handle,
             ask.Exporting: self._exporter.handle,
             ask.Refresh: lambda _: self.change(),
             # Nothing to do: it has woken the worker, which now may send the next overlay.
@@ -77,16 +80,17 @@ class Controller:
 
     def patience(self) -> float | None:
         """How long nothing needs to be done unless somebody asks [s]; None for ever."""
-        waits = [self._runner.patience(), self._exporter.patience(), self._browser.patience()]
-        return min((wait for wait in waits if wait is not None), default=None)
+        parts = (self._runner, self._propagator, self._exporter, self._browser)
+        return min((wait for part in parts if (wait := part.patience()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
         """How long until `advance` has to save a gesture that nobody has ended [s]; None: nothing to save."""
         return self._editor.overdue_in()
 
     def advance(self) -> None:
-        """Do one bit of what is going on: an iteration, a frame of an export, the next frame of playing."""
+        """Do one bit of what is going on: an iteration, a frame to be solved or exported, the next frame of playing."""
         self._runner.advance()
+        self._propagator.advance()
         self._exporter.advance()
         self._browser.advance()
         if self.overdue_in() == 0.0:
@@ -103,8 +107,19 @@ class Controller:
         self.change(error=text, busy=None)
         if stop:
             self._runner.end("Stopped by an error", save=False)
+            self._propagator.drop("Stopped by an error")
             self._exporter.cancel()
             self.change(playing=False)
+
+    def close(self) -> None:
+        """Save what is under way; exports are abandoned.
+
+        Raises:
+            CartsError: it could not be saved.
+        """
+        self._exporter.cancel()
+        self._propagator.finish()
+        self.save()
 
     def say(self, text: str | None) -> None:
         """Tell the user what is being prepared; None when nothing is."""

@@ -8,6 +8,7 @@ from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.panels.joints import JointsPanel
+from carts_viewer.panels.keyframes import KeyframesPanel
 from carts_viewer.panels.keypoints import KeypointsPanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
@@ -69,6 +70,7 @@ class Layout:
             panels += [
                 TimelinePanel(gui),
                 ReviewPanel(page, emit, waits),
+                KeyframesPanel(page, session, emit),
                 KeypointsPanel(page, session, emit),
                 HistoryPanel(page, emit),
             ]

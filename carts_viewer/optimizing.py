@@ -171,6 +171,8 @@ class Runner:
     def _start(self) -> None:
         if self._controller.state.settings_error is not None:
             raise SettingsError(self._controller.state.settings_error)
+        if self._controller.state.solving:
+            raise CartsError("Many frames are being solved. Wait, or stop that first.")
         self._run = self._make(self._controller.cameras)
         self._controller.save()
         self._controller.forget_pins()
@@ -202,7 +204,7 @@ class Runner:
     def _accept(self, run: ActiveRun, iterate: Any) -> None:
         """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
         state = self._controller.state
-        edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance)
+        edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
         review = self._session.editor.project.state.review(state.index)
         if review.state is ReviewState.UNTOUCHED:
             edits[Key.review(state.index)] = Review(ReviewState.OPTIMIZED, review.note)

@@ -53,3 +53,8 @@ from .posing import Nudge as Nudge
 from .posing import Perturb as Perturb
 from .posing import Posing as Posing
 from .posing import SetJoint as SetJoint
+from .propagating import HoldKeyframe as HoldKeyframe
+from .propagating import Propagating as Propagating
+from .propagating import SetDirection as SetDirection
+from .propagating import Solve as Solve
+from .propagating import StopSolving as StopSolving
