@@ -9,6 +9,7 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_core.project import Edits, Figures, Key, Provenance, Review, Source
+from carts_core.project.keys import WHOLE_PROJECT
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
 from carts_viewer.annotating import Annotator
@@ -203,7 +204,9 @@ class Controller:
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
-        self._editor.draft(f"{name}, frame {self.state.frame.frame_id}", edits, gesture or object())
+        everywhere = all(key.frame == WHOLE_PROJECT for key in edits)
+        where = "" if everywhere else f", frame {self.state.frame.frame_id}"
+        self._editor.draft(f"{name}{where}", edits, gesture or object())
         self.refresh(maps)
         if gesture is None:
             self.save()
@@ -239,6 +242,9 @@ class Controller:
 
     def refresh(self, maps: Maps | None = None) -> None:
         """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
+        if not self.session.matched(self.state.frame):
+            frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
+            self.change(frame=frame, scores=None, maps=None)
         pose = self.session.pose(self.state.frame)
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)

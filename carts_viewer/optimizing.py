@@ -164,7 +164,9 @@ class Runner:
 
     def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
         state = self._controller.state
-        optimizer = self._optimizers.make(state.index, state.domain, cameras, state.pose, state.settings, state.free)
+        optimizer = self._optimizers.make(
+            self._session.sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free
+        )
         provenance = self._optimizers.provenance(cameras, state.settings, state.free)
         return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance)
 
