@@ -280,7 +280,7 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     tab, other = open_tab(app), open_tab(app, (1000, 900))
     tab.page.get_by_text("Review", exact=True).first.click()
     tab.page.keyboard.press("k")
-    expect(tab.page.get_by_text("001 to 008")).to_be_visible()
+    expect(tab.page.get_by_text("from 001 to 008")).to_be_visible()
     app.mailbox.put(ask.MoveFrame(1))
     expect(tab.page.get_by_text("7 to solve, 1 kept")).to_be_visible()
     tab.button("Solve between")
