@@ -257,6 +257,9 @@ class Controller:
 
     def _released(self) -> None:
         self._annotator.released()
+        if self.state.time_error is not None:
+            # Whoever leaves the field means what is in it.
+            self.change(error=self.state.time_error, time_error=None)
         # A run is no gesture of a hand, so nobody's letting go of something ends it.
         if not self._runner.active:
             self.save()
