@@ -4,6 +4,7 @@ Runs on the worker's thread alone, knows neither threads nor widgets.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -108,7 +109,9 @@ class Controller:
         self.change(error=text, busy=None)
         if stop:
             self._runner.end("Stopped by an error", save=False)
-            self._propagator.drop("Stopped by an error")
+            # What is solved is not lost to an error of something else; its own errors have saved it already.
+            with suppress(CartsError):
+                self._propagator.finish()
             self._exporter.cancel()
             self.change(playing=False)
 
