@@ -14,7 +14,7 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, ExportFormat, FormatName, read_kinematics_csv
 from carts_core.export.formats import FORMATS as REGISTERED
 from carts_core.project import JointCorrection, Key, MaskCorrection, Provenance, ReviewState, Source
-from carts_viewer import archive
+from carts_viewer import archive, exporting
 from carts_viewer import intents as ask
 
 
@@ -96,7 +96,8 @@ def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None
     assert read_kinematics_csv(export.path, desk.session.scene)[0].source == "measured"
 
 
-def test_cancelling_leaves_nothing(desk: Desk) -> None:
+def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporting, "_BIT", 0.0)  # So that it cannot be done already.
     desk.do(ask.Export("coco", "All"))
     desk.controller.advance()
     desk.do(ask.CancelExport())
