@@ -52,6 +52,8 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("R", "Run or pause the optimizer", ask.RunOrPause()),
         Shortcut("T", "One step of the optimizer", ask.Step()),
         Shortcut("X", "Reset to the start of the run", ask.Reset()),
+        Shortcut("K", "Make the frame a keyframe, or none", ask.HoldKeyframe()),
+        Shortcut("K", "Solve between the keyframes", ask.Solve(), "shift"),
         Shortcut("G", "Accept, and go to the next unreviewed frame", ask.AcceptAndNext()),
         Shortcut("F", "Mark as needing work", ask.SetReview(ReviewState.NEEDS_WORK)),
         Shortcut("J", "Reject", ask.SetReview(ReviewState.REJECTED)),

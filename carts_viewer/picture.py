@@ -2,9 +2,11 @@
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from carts_core.data import Frame, Sequence
 from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.project import MaskCorrection
 from carts_core.rendering import Renderer
 from carts_core.scene import SceneState
 from carts_viewer import layers
@@ -30,6 +32,13 @@ class Painter:
             arm_ids = self._renderer(camera).segment(state.to(self._device))[0]
             self._last = (state, camera, arm_ids)
         return arm_ids
+
+    def mask(
+        self, state: SceneState, camera: str, correction: MaskCorrection | None = None
+    ) -> Bool[np.ndarray, "height width"]:
+        """Where arms are visible in the camera's own image, as rendered and then as corrected."""
+        rendered = self.arm_ids(state, camera) >= 0
+        return rendered if correction is None else correction.applied_to(rendered)
 
     def overlay(
         self, state: SceneState, frame: Frame, camera: str, layer: Layer, opacity: float, maps: Maps | None

@@ -1,12 +1,13 @@
 """The recording that is open, and the poses that its project gives to its frames. No widgets, no optimizer."""
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from carts_core.data import Frame, FrameReader, Sequence
@@ -46,14 +47,14 @@ class Session:
     A frame's pose is the measured one until somebody corrects it; neither camera nor domain touches corrections.
 
     Attributes:
-        sequence: the recording.
         scene: its arms and cameras.
         editor: its project, and what is on the way there.
         ranges: what each joint may be set to, arm by arm.
     """
 
     def __init__(self, sequence: Sequence, project: Project) -> None:
-        self.sequence = sequence
+        self._sequence = sequence
+        self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
         self.editor = Editor(project)
         self.ranges = tuple(
@@ -61,12 +62,34 @@ class Session:
         )
         self._reader = FrameReader(sequence)
 
+    @property
+    def time_offset(self) -> float | None:
+        """Time in the kinematics table minus time of the image [s]; None where rows are not matched by time."""
+        chosen = self.editor.view.get(Key.time_offset())
+        return self._own_offset if chosen is None or self._own_offset is None else chosen.seconds
+
+    @property
+    def sequence(self) -> Sequence:
+        """The recording, its joint positions matched with frames as `time_offset` says.
+
+        Raises:
+            SequenceError: with this offset, a frame has no joint positions.
+        """
+        self._follow()
+        return self._sequence
+
+    def matched(self, frame: Frame) -> bool:
+        """Whether the frame has the joint positions that it has with the present time offset."""
+        measured = self.sequence.measured
+        return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
+
     def frame(self, index: int, domain: str, camera: str) -> Frame:
         """The frame with the image of that camera; those ahead of it are read in advance.
 
         Raises:
             SequenceError: the image is not usable.
         """
+        self._follow()
         return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
@@ -88,14 +111,31 @@ class Session:
         sources = {correction.provenance.source for correction in corrections.values()}
         return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
 
+    def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
+        regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
+        return {camera: region.region() for camera, region in regions.items() if region is not None}
+
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
         return _calibrated(self.scene, self.scene.state(frame.measured), self.editor.view)
 
-    def edits(self, frame: Frame, state: SceneState, provenance: Provenance) -> dict[Key[Any], Any]:
+    def edits(
+        self,
+        frame: Frame,
+        state: SceneState,
+        provenance: Provenance,
+        joint_std: Mapping[str, Float[np.ndarray, " dofs"]] | None = None,
+    ) -> dict[Key[Any], Any]:
         """What a project must change so that the frame's pose is this state.
 
         What is as it was saved keeps its provenance, and what is as measured needs no correction.
+
+        Args:
+            frame: which one.
+            state: its pose.
+            provenance: of the change.
+            joint_std: arm -> standard deviations [rad, m], NaN where not known.
         """
         saved = self.editor.project.state
         before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured)
@@ -107,7 +147,7 @@ class Session:
             elif torch.equal(values, measured.joint_positions[row]):
                 edits[key] = None
             else:
-                edits[key] = JointCorrection(tuple(values.tolist()), provenance)
+                edits[key] = joint_correction(values.numpy(), provenance, (joint_std or {}).get(arm.name))
             if not torch.equal(state.T_world_base[row], before.T_world_base[row]):
                 edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
         for row, camera in enumerate(self.scene.cameras):
@@ -186,6 +226,24 @@ class Session:
             arm.name: values.numpy().astype(np.float64)
             for arm, values in zip(self.scene.arms, state.joint_positions, strict=True)
         }
+
+    def _follow(self) -> None:
+        """Match joint positions with frames as `time_offset` says, if they are not."""
+        matching, offset = self._sequence.matching, self.time_offset
+        if matching is not None and offset is not None and offset != matching.time_offset:
+            self._sequence = self._sequence.with_time_offset(offset)
+            self._reader.close()
+            self._reader = FrameReader(self._sequence)
+
+
+def joint_correction(
+    joint_positions: Float[np.ndarray, " dofs"],
+    provenance: Provenance,
+    joint_std: Float[np.ndarray, " dofs"] | None = None,
+) -> JointCorrection:
+    """A correction [rad, m] with its standard deviations, as far as any is known."""
+    std = None if joint_std is None or not np.isfinite(joint_std).any() else tuple(joint_std.tolist())
+    return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
 
 
 _TELLING_FIRST = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)

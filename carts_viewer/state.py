@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 
 import torch
 
 from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
 from carts_core.optimization.keypoints import Pin
+from carts_core.optimization.sequence_settings import Direction
 from carts_core.project import ProjectState, Review, Source
 from carts_core.scene import SceneState
 from carts_viewer.layers import Layer
@@ -79,11 +81,31 @@ class RunState:
 
 
 @dataclass(frozen=True)
-class ExportState:
-    """A running export of all frames."""
+class SolveState:
+    """Solving many frames together, or how it ended."""
 
-    done: int
-    total: int
+    frames: range
+    """From the first to the last one, kept frames included."""
+    done: int = 0
+    """Frames that were visited."""
+    running: bool = True
+    text: str = ""
+    """How it goes, for people."""
+
+
+@dataclass(frozen=True)
+class ExportState:
+    """The present or the last export."""
+
+    format: str
+    """For people."""
+    frames: int
+    """How many frames are exported."""
+    done: int = 0
+    total: int = 0
+    """Steps of the export; 0 until the first is done."""
+    path: Path | None = None
+    """What was written; None while it is being written."""
 
 
 @dataclass(frozen=True)
@@ -119,11 +141,17 @@ class ViewState:
     """Whether the last step of `project` is a gesture that is not saved yet."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
+    time_error: str | None = None
+    """Why the time offset that is being typed cannot be used."""
     every_camera: bool = False
     """Whether a run uses all cameras or only the shown one."""
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
+    solve: SolveState | None = None
+    """The present or the last solving of many frames."""
+    direction: Direction = "forward"
+    """In which direction many frames are solved."""
     joint: tuple[str, int] | None = None
     """The joint that keys nudge: arm, index of the joint; None: the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
@@ -140,6 +168,11 @@ class ViewState:
     def undoable(self) -> int:
         """How many steps can be taken back."""
         return self.project.position
+
+    @property
+    def solving(self) -> bool:
+        """Whether many frames are being solved now."""
+        return self.solve is not None and self.solve.running
 
     @property
     def review(self) -> Review:

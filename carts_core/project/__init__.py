@@ -9,6 +9,7 @@ from .layers import MaskCorrection as MaskCorrection
 from .place import default_path as default_path
 from .project import Change as Change
 from .project import Project as Project
+from .queries import between_kept as between_kept
 from .queries import frames_in as frames_in
 from .queries import next_unreviewed as next_unreviewed
 from .queries import worst_first as worst_first
@@ -24,3 +25,4 @@ from .values import Provenance as Provenance
 from .values import Review as Review
 from .values import ReviewState as ReviewState
 from .values import Source as Source
+from .values import TimeOffset as TimeOffset
