@@ -18,6 +18,7 @@ from carts_viewer.guard import check_loopback
 from carts_viewer.layers import Layer
 from carts_viewer.mailbox import Mailbox
 from carts_viewer.page import Page
+from carts_viewer.painting import Paint
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.curves import CurvesPanel
 from carts_viewer.panels.export import ExportPanel
@@ -28,6 +29,7 @@ from carts_viewer.panels.keypoints import KeypointsPanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
 from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
@@ -39,8 +41,10 @@ from carts_viewer.session import Session
 from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage, open_storage
+from carts_viewer.strokes import read_stroke
 from carts_viewer.worker import Worker
 
+_log = logging.getLogger(__name__)
 _PANEL_WIDTH = 312.0
 
 Report = Callable[[str], None]
@@ -100,6 +104,7 @@ class ViewerApp:
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.mailbox.put(ask.Released()))
         self.page.on_pointed(self._on_pointed)
+        self.page.on_painted(self._on_painted)
         self.page.on_picked(lambda share: self.mailbox.put(ask.ShowFrame(int(_unit(share) * len(sequence)))))
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
@@ -212,6 +217,7 @@ class ViewerApp:
             MessagePanel(page, emit),
             BrowsePanel(page, session, emit, waits),
             OverlayPanel(page, session, state, emit, waits),
+            PaintPanel(page, session, state, emit, waits),
         ]
         with gui.add_folder("Joints"):
             self.joints = JointsPanel(page, session, state, emit, waits)
@@ -258,6 +264,16 @@ class ViewerApp:
     def _on_pointed(self, u: float, v: float) -> None:
         camera = self.scene.camera(self.state.camera)
         self.mailbox.put(ask.PointAt(u * camera.width, v * camera.height))
+
+    def _on_painted(self, tab: int, text: str) -> None:
+        try:
+            cameras = {camera.name: camera for camera in self.scene.cameras}
+            stroke = read_stroke(text, len(self.sequence), cameras)
+        except CartsError as error:
+            # Our page sends no such thing, and others that look on did nothing wrong.
+            _log.info("Refused: %s", error)
+        else:
+            self.mailbox.put(Paint(tab, stroke))
 
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:
         client = self.page.server.get_clients().get(client_id)

@@ -17,6 +17,7 @@ from carts_viewer import intents as ask
 from carts_viewer.annotating import Annotator
 from carts_viewer.exporting import ZipExport, frame_mask
 from carts_viewer.layers import Layer
+from carts_viewer.painting import Brushwork, Painting
 from carts_viewer.picture import Painter
 from carts_viewer.running import ActiveRun, OptimizerFactory
 from carts_viewer.session import Session
@@ -46,13 +47,14 @@ class Controller:
         self.state = state
         self.session = session
         self._editor = session.editor
-        self._painter = painter
+        self.painter = painter
         self._optimizers = optimizers
         self._deliver = deliver
         self._run: ActiveRun | None = None
         self._export: tuple[ZipExport, int] | None = None
         self._next_frame_at = 0.0
         self._annotator = Annotator(self)
+        self._brushwork = Brushwork(self)
         self._loss: float | None = None
         self._before_run: Edits | None = None
 
@@ -103,7 +105,7 @@ class Controller:
         state = self.state
         if state.scores is not None:
             return
-        scores = self._painter.scores(state.pose.scene, state.frame, state.camera)
+        scores = self.painter.scores(state.pose.scene, state.frame, state.camera, state.mask_correction)
         self.change(scores=scores)
         project = self._editor.project
         known = scores.dice is None or state.unsaved or project.state.figures(state.index) is not None
@@ -185,6 +187,10 @@ class Controller:
     @handle.register
     def _(self, intent: ask.Annotation) -> None:
         self._annotator.handle(intent)
+
+    @handle.register
+    def _(self, intent: Painting) -> None:
+        self._brushwork.handle(intent)
 
     @handle.register
     def _(self, intent: ask.SetJoint) -> None:
@@ -299,11 +305,11 @@ class Controller:
     def _(self, intent: ask.ExportMask) -> None:
         state = self.state
         name = file_name(f"{self.session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
-        self._deliver(intent.client_id, name, frame_mask(self._painter, state.pose, state.camera))
+        self._deliver(intent.client_id, name, frame_mask(self.painter, state.pose, state.camera, state.mask_correction))
 
     @handle.register
     def _(self, intent: ask.ExportAll) -> None:
-        export = ZipExport(self.session, self._painter)
+        export = ZipExport(self.session, self.painter)
         self._export = (export, intent.client_id)
         self.change(export=ExportState(0, export.total))
 
@@ -381,6 +387,7 @@ class Controller:
         gesture: object = None,
         loss: float | None = None,
         maps: Maps | None = None,
+        frame: int | None = None,
     ) -> None:
         """Change the project; arguments and errors as `edit`, for any edits.
 
@@ -390,11 +397,13 @@ class Controller:
             gesture: see `edit`.
             loss: the optimizer's, at the new pose.
             maps: what the optimizer saw there.
+            frame: index of the frame that changes; the shown one if None.
         """
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
-        self._editor.draft(f"{name}, frame {self.state.frame.frame_id}", edits, gesture or object())
+        frame_id = self.session.sequence.frame_ids[self.state.index if frame is None else frame]
+        self._editor.draft(f"{name}, frame {frame_id}", edits, gesture or object())
         self.refresh(maps)
         if gesture is None:
             self.save()
@@ -422,10 +431,14 @@ class Controller:
 
     def refresh(self, maps: Maps | None = None) -> None:
         """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
-        pose = self.session.pose(self.state.frame)
+        before, pose = self.state, self.session.pose(self.state.frame)
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)
         self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
+        if self.state.mask_correction != before.mask_correction:
+            self.change(scores=None)
+        if self.state.ignore_region != before.ignore_region:
+            self.change(maps=None)
 
     def forget_pins(self) -> None:
         """Drop what was said about where keypoints are."""
@@ -440,7 +453,10 @@ class Controller:
 
     def _make_run(self, cameras: tuple[str, ...]) -> ActiveRun:
         state, scene = self.state, self.session.scene
-        optimizer = self._optimizers.make(state.index, state.domain, cameras, state.pose, state.settings, state.free)
+        ignore = self.session.ignored(state.index, cameras)
+        optimizer = self._optimizers.make(
+            state.index, state.domain, cameras, state.pose, state.settings, state.free, ignore
+        )
         provenance = self._optimizers.provenance(cameras, state.settings, state.free)
         return ActiveRun(optimizer, scene, state.pose, cameras, provenance)
 

@@ -4,14 +4,15 @@ import io
 import zipfile
 
 from carts_core.export import KinematicsRow, file_name, kinematics_csv, mask_png
+from carts_core.project import Key, MaskCorrection
 from carts_viewer.picture import Painter
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
 
 
-def frame_mask(painter: Painter, pose: Pose, camera: str) -> bytes:
-    """The rendered mask of a pose in one camera, as a PNG file of the camera's own size."""
-    return mask_png(painter.arm_ids(pose.scene, camera) >= 0)
+def frame_mask(painter: Painter, pose: Pose, camera: str, correction: MaskCorrection | None) -> bytes:
+    """The corrected mask of a pose in one camera, as a PNG file of the camera's own size."""
+    return mask_png(painter.mask(pose.scene, camera, correction))
 
 
 class ZipExport:
@@ -37,8 +38,9 @@ class ZipExport:
         frame = sequence.frame(self.done, cameras=[])
         pose = self._session.pose(frame, self._project)
         for camera in sequence.scene.cameras:
+            correction = self._project.get(Key.mask_correction(frame.index, camera.name))
             name = f"masks/{file_name(camera.name)}/{file_name(frame.frame_id)}.png"
-            self._zip.writestr(name, frame_mask(self._painter, pose, camera.name), zipfile.ZIP_STORED)
+            self._zip.writestr(name, frame_mask(self._painter, pose, camera.name, correction), zipfile.ZIP_STORED)
         self._rows.append(KinematicsRow(frame.frame_id, str(pose.source), self._session.joints(pose.scene)))
         self.done += 1
         return self.done < self.total

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from carts_core.project import IgnoreRegion, MaskCorrection
+
 
 class Layer(StrEnum):
     """A way to show the arm over the frame; the value is what people read."""
@@ -29,6 +31,9 @@ TRUTH_COLORS = {
     "true negative": (0, 0, 0),
 }
 """The paper's colours for the comparison with a true mask."""
+
+ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
+"""Colours of pixels that somebody added to the mask, removed from it, or told the optimizer to ignore."""
 
 Rgba = UInt8[np.ndarray, "height width 4"]
 ArmIds = Int[np.ndarray, "height width"]
@@ -96,6 +101,22 @@ def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[
     picture[..., :3] = colored[..., ::-1]
     picture[..., 3] = _byte(opacity)
     return picture
+
+
+def paint_over(picture: Rgba, correction: MaskCorrection | None, ignored: IgnoreRegion | None, opacity: float) -> None:
+    """Draw painted layers into a picture of their size: corrections solid, ignored pixels hatched."""
+    if correction is not None:
+        picture[correction.added()] = (*ADDED_COLOR, _byte(opacity))
+        picture[correction.removed()] = (*REMOVED_COLOR, _byte(opacity))
+    if ignored is not None:
+        region = ignored.region()
+        step = max(3, round(max(region.shape) / 160))
+        rows, columns = np.nonzero(region)
+        # What is below stays to be seen between the lines.
+        hatch = (rows + columns) // step % 2 == 0
+        picture[rows[hatch], columns[hatch]] = (*IGNORED_COLOR, _byte(opacity))
+        edge = region & ~cv2.erode(region.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        picture[edge] = (*IGNORED_COLOR, 255)
 
 
 def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:

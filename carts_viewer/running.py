@@ -1,11 +1,13 @@
 """The optimizer as the viewer drives it: made for one frame, stepped, and turned into poses of the whole scene."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import torch
+from jaxtyping import Bool
 
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
@@ -77,8 +79,9 @@ class OptimizerFactory:
         pose: Pose,
         settings: OptimizerSettings,
         free: FreeParameters,
+        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> Optimizer:
-        """An optimizer that starts at the pose.
+        """An optimizer that starts at the pose; `ignore` says which pixels of which camera show an occluder.
 
         Raises:
             CartsError: weights, an image or a setting is not usable.
@@ -90,7 +93,15 @@ class OptimizerFactory:
         scene = scene_at(self._sequence.scene, pose.scene)
         start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
         return FrameOptimizer(
-            scene, frame, backgrounds, extractor, start=start, settings=settings, free=free, cameras=list(cameras)
+            scene,
+            frame,
+            backgrounds,
+            extractor,
+            ignore=ignore,
+            start=start,
+            settings=settings,
+            free=free,
+            cameras=list(cameras),
         )
 
 

@@ -1,12 +1,13 @@
 """The recording that is open, and the poses that its project gives to its frames. No widgets, no optimizer."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from carts_core.data import Frame, FrameReader, Sequence
@@ -87,6 +88,11 @@ class Session:
         state = _calibrated(self.scene, self.scene.state(joints), project)
         sources = {correction.provenance.source for correction in corrections.values()}
         return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
+
+    def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
+        regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
+        return {camera: region.region() for camera, region in regions.items() if region is not None}
 
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
