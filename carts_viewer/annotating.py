@@ -12,6 +12,7 @@ from carts_core.project import Review, ReviewState, Source, next_unreviewed, wor
 from carts_core.project.values import LONGEST_NOTE
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
+from carts_viewer.checks import unknown
 from carts_viewer.marks import labelled_keypoints
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Annotator:
         Raises:
             CartsError: with a text for people; the state is still a valid one.
         """
-        raise CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+        raise unknown(intent)
 
     def released(self) -> None:
         """The pointer was let go of."""

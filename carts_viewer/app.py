@@ -6,6 +6,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 from carts_core.data import Sequence
@@ -16,25 +17,9 @@ from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
 from carts_viewer.guard import check_loopback
 from carts_viewer.layers import Layer
+from carts_viewer.layout import Layout
 from carts_viewer.mailbox import Mailbox
 from carts_viewer.page import Page
-from carts_viewer.painting import Paint
-from carts_viewer.panels.browse import BrowsePanel
-from carts_viewer.panels.curves import CurvesPanel
-from carts_viewer.panels.export import ExportPanel
-from carts_viewer.panels.help import HelpPanel
-from carts_viewer.panels.inputs import Panel
-from carts_viewer.panels.joints import JointsPanel
-from carts_viewer.panels.keypoints import KeypointsPanel
-from carts_viewer.panels.message import MessagePanel
-from carts_viewer.panels.optimize import OptimizePanel
-from carts_viewer.panels.overlay import OverlayPanel, offered_layers
-from carts_viewer.panels.paint import PaintPanel
-from carts_viewer.panels.project import HistoryPanel, SavedPanel
-from carts_viewer.panels.review import ReviewPanel
-from carts_viewer.panels.settings import FreePanel, SettingsPanel
-from carts_viewer.panels.timeline import TimelinePanel
-from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.picture import Painter
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
@@ -45,7 +30,6 @@ from carts_viewer.strokes import read_stroke
 from carts_viewer.worker import Worker
 
 _log = logging.getLogger(__name__)
-_PANEL_WIDTH = 312.0
 
 Report = Callable[[str], None]
 """Told, line by line, what takes long."""
@@ -97,10 +81,10 @@ class ViewerApp:
         self._painter.arm_ids(state.pose.scene, state.camera)
         self.page = Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
         self.url = self.page.url
-        self.joints: JointsPanel
-        panels = self._build(state)
+        layout = Layout(self.page, self._session, storage, state, self.mailbox)
+        self.joints = layout.joints
         self.stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
-        self.display = PageDisplay(self.page, self._session, self._painter, self.stage, panels)
+        self.display = PageDisplay(self.page, self._session, self._painter, self.stage, layout.panels)
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.mailbox.put(ask.Released()))
         self.page.on_pointed(self._on_pointed)
@@ -168,10 +152,11 @@ class ViewerApp:
         self._closed = True
         self._worker.stop()
         self.page.close()
-        try:
-            self._session.close()
-        finally:
-            self._storage.close()
+        with ExitStack() as stack:
+            # From the last to the first, whatever fails.
+            stack.callback(self._storage.close)
+            stack.callback(self._session.close)
+            stack.callback(self._controller.close)
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
         """Wait until everything asked for so far has been done and sent to the page.
@@ -204,48 +189,6 @@ class ViewerApp:
             project=self.project.state,
         )
 
-    def _build(self, state: ViewState) -> list[Panel]:
-        """Lay out the page: browsing, overlay and joints on the left, optimizing, export and help on the right."""
-        page, session, emit, waits = self.page, self._session, self.mailbox.put, self.mailbox.waits
-        gui = page.server.gui
-        gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
-        gui.set_panel_label("CaRTS")
-        gui.main_panel.dock_left()
-        gui.main_panel.set_width(_PANEL_WIDTH)
-        panels: list[Panel] = [
-            SavedPanel(page, self._storage),
-            MessagePanel(page, emit),
-            BrowsePanel(page, session, emit, waits),
-            OverlayPanel(page, session, state, emit, waits),
-            PaintPanel(page, session, state, emit, waits),
-        ]
-        with gui.add_folder("Joints"):
-            self.joints = JointsPanel(page, session, state, emit, waits)
-        right = gui.add_panel()
-        with right.add_tab("Optimize"):
-            panels += [
-                OptimizePanel(page, session, state, emit),
-                CurvesPanel(gui),
-                SettingsPanel(page, state, emit),
-                FreePanel(page, session, state, emit),
-            ]
-        with right.add_tab("Review"):
-            panels += [
-                TimelinePanel(gui),
-                ReviewPanel(page, emit, waits),
-                KeypointsPanel(page, session, emit),
-                HistoryPanel(page, emit),
-            ]
-        with right.add_tab("Values"):
-            panels.append(ValuesPanel(gui, session))
-        with right.add_tab("Export"):
-            panels.append(ExportPanel(page, session, emit))
-        with right.add_tab("Help"):
-            HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
-        right.dock_right()
-        right.set_width(_PANEL_WIDTH)
-        return [*panels, self.joints]
-
     def _prepare(self) -> None:
         """Load on the worker, with the page already up, what the first run will need."""
         try:
@@ -273,7 +216,7 @@ class ViewerApp:
             # Our page sends no such thing, and others that look on did nothing wrong.
             _log.info("Refused: %s", error)
         else:
-            self.mailbox.put(Paint(tab, stroke))
+            self.mailbox.put(ask.Paint(tab, stroke))
 
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:
         client = self.page.server.get_clients().get(client_id)

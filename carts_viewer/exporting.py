@@ -2,12 +2,74 @@
 
 import io
 import zipfile
+from functools import singledispatchmethod
+from typing import TYPE_CHECKING
 
 from carts_core.export import KinematicsRow, file_name, kinematics_csv, mask_png
 from carts_core.project import Key, MaskCorrection
+from carts_viewer import intents as ask
+from carts_viewer.checks import unknown
 from carts_viewer.picture import Painter
 from carts_viewer.session import Session
-from carts_viewer.state import Pose
+from carts_viewer.state import ExportState, Pose
+
+if TYPE_CHECKING:
+    from carts_viewer.controller import Controller
+
+
+class Exporter:
+    """The part of the controller that makes files."""
+
+    def __init__(self, controller: "Controller") -> None:
+        self._controller = controller
+        self._session = controller.session
+        self._export: tuple[ZipExport, int] | None = None
+
+    @singledispatchmethod
+    def handle(self, intent: ask.Exporting) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def patience(self) -> float | None:
+        """0 while there is something to write; None when there is not."""
+        return None if self._export is None else 0.0
+
+    def advance(self) -> None:
+        """Write the next frame, if there is one to write."""
+        if self._export is None:
+            return
+        export, client_id = self._export
+        if export.step():
+            self._controller.change(export=ExportState(export.done, export.total))
+            return
+        self.cancel()
+        self._controller.deliver(client_id, file_name(self._session.sequence.name) + ".zip", export.finish())
+
+    def cancel(self) -> None:
+        """Forget the export that is going on, if there is one."""
+        self._export = None
+        self._controller.change(export=None)
+
+    @handle.register
+    def _(self, intent: ask.ExportMask) -> None:
+        state = self._controller.state
+        name = file_name(f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
+        mask = frame_mask(self._controller.painter, state.pose, state.camera, state.mask_correction)
+        self._controller.deliver(intent.client_id, name, mask)
+
+    @handle.register
+    def _(self, intent: ask.ExportAll) -> None:
+        export = ZipExport(self._session, self._controller.painter)
+        self._export = (export, intent.client_id)
+        self._controller.change(export=ExportState(0, export.total))
+
+    @handle.register
+    def _(self, intent: ask.CancelExport) -> None:
+        self.cancel()
 
 
 def frame_mask(painter: Painter, pose: Pose, camera: str, correction: MaskCorrection | None) -> bytes:
@@ -38,8 +100,8 @@ class ZipExport:
         frame = sequence.frame(self.done, cameras=[])
         pose = self._session.pose(frame, self._project)
         for camera in sequence.scene.cameras:
-            correction = self._project.get(Key.mask_correction(frame.index, camera.name))
             name = f"masks/{file_name(camera.name)}/{file_name(frame.frame_id)}.png"
+            correction = self._project.get(Key.mask_correction(frame.index, camera.name))
             self._zip.writestr(name, frame_mask(self._painter, pose, camera.name, correction), zipfile.ZIP_STORED)
         self._rows.append(KinematicsRow(frame.frame_id, str(pose.source), self._session.joints(pose.scene)))
         self.done += 1

@@ -13,7 +13,6 @@ from typing import Literal
 
 from carts_core.project import ReviewState
 from carts_viewer import intents as ask
-from carts_viewer import painting as paint
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Tool
 
@@ -55,6 +54,8 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("R", "Run or pause the optimizer", ask.RunOrPause()),
         Shortcut("T", "One step of the optimizer", ask.Step()),
         Shortcut("X", "Reset to the start of the run", ask.Reset()),
+        Shortcut("K", "Make the frame a keyframe, or none", ask.HoldKeyframe()),
+        Shortcut("K", "Solve between the keyframes", ask.Solve(), "shift"),
         Shortcut("G", "Accept, and go to the next unreviewed frame", ask.AcceptAndNext()),
         Shortcut("F", "Mark as needing work", ask.SetReview(ReviewState.NEEDS_WORK)),
         Shortcut("J", "Reject", ask.SetReview(ReviewState.REJECTED)),
@@ -75,13 +76,13 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("M", "Back to measured joints", ask.BackToMeasured()),
         Shortcut("Z", "Undo", ask.Undo(), "cmd/ctrl"),
         Shortcut("Z", "Redo", ask.Redo(), "cmd/ctrl+shift"),
-        Shortcut("B", "Brush, or put it away", paint.ToggleTool(Tool.BRUSH), "shift"),
-        Shortcut("X", "Eraser, or put it away", paint.ToggleTool(Tool.ERASER), "shift"),
-        Shortcut("P", "Polygon, or put it away", paint.ToggleTool(Tool.POLYGON), "shift"),
-        Shortcut("M", "Paint on the mask or on the ignore region", paint.SetTarget(), "shift"),
-        Shortcut("[", "Smaller brush", paint.ScaleBrush(1 / _GROWTH)),
-        Shortcut("]", "Larger brush", paint.ScaleBrush(_GROWTH)),
-        Shortcut("escape", "Drop the polygon, or put the tool away", paint.SetTool(Tool.OFF)),
+        Shortcut("B", "Brush, or put it away", ask.ToggleTool(Tool.BRUSH), "shift"),
+        Shortcut("X", "Eraser, or put it away", ask.ToggleTool(Tool.ERASER), "shift"),
+        Shortcut("P", "Polygon, or put it away", ask.ToggleTool(Tool.POLYGON), "shift"),
+        Shortcut("M", "Paint on the mask or on the ignore region", ask.SetTarget(), "shift"),
+        Shortcut("[", "Smaller brush", ask.ScaleBrush(1 / _GROWTH)),
+        Shortcut("]", "Larger brush", ask.ScaleBrush(_GROWTH)),
+        Shortcut("escape", "Drop the polygon, or put the tool away", ask.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
             Shortcut(str(number), f"Overlay: {layer.lower()}", ask.ShowLayer(layer))

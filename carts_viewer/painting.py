@@ -1,13 +1,12 @@
-"""Painting over frames: what people ask for, and what that does to the project."""
+"""What intents about painting do: tools in hand, and layers of the project."""
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import singledispatchmethod
 from typing import TYPE_CHECKING, Any
 
-from carts_core.errors import CartsError
 from carts_core.project import Key, Kind
-from carts_viewer.intents import Intent, Latest
+from carts_viewer import intents as ask
+from carts_viewer.checks import clamped, unknown
 from carts_viewer.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored
 
 if TYPE_CHECKING:
@@ -22,61 +21,6 @@ _STEPS = {
 _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the ignore region"}
 
 
-@dataclass(frozen=True)
-class Painting(Intent):
-    """An intent about painted layers and the tools for them."""
-
-
-@dataclass(frozen=True)
-class SetTool(Painting, Latest):
-    """Take a tool."""
-
-    tool: Tool
-
-
-@dataclass(frozen=True)
-class ToggleTool(Painting):
-    """Take a tool or, if it is in hand, put it away."""
-
-    tool: Tool
-
-
-@dataclass(frozen=True)
-class SetTarget(Painting, Latest):
-    """Paint on this layer; None changes over."""
-
-    target: Target | None = None
-
-
-@dataclass(frozen=True)
-class SetDiameter(Painting, Latest):
-    """Make the brush this thick [px]."""
-
-    diameter: float
-
-
-@dataclass(frozen=True)
-class ScaleBrush(Painting):
-    """Make the brush thicker or thinner by a factor, by a pixel at least."""
-
-    factor: float
-
-
-@dataclass(frozen=True)
-class Paint(Painting):
-    """Apply a finished stroke."""
-
-    client_id: int
-    stroke: Stroke
-
-
-@dataclass(frozen=True)
-class ClearLayer(Painting):
-    """Remove what was painted on a layer of the shown frame and camera; None: the layer that is painted on."""
-
-    target: Target | None = None
-
-
 class Brushwork:
     """The part of the controller that painting is about."""
 
@@ -85,41 +29,39 @@ class Brushwork:
         self._session = controller.session
 
     @singledispatchmethod
-    def handle(self, intent: Painting) -> None:
+    def handle(self, intent: ask.Painting) -> None:
         """Do what an intent asks for.
 
         Raises:
             CartsError: with a text for people; the state is still a valid one.
         """
-        raise CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+        raise unknown(intent)
 
     @handle.register
-    def _(self, intent: SetTool) -> None:
+    def _(self, intent: ask.SetTool) -> None:
         self._hold(tool=intent.tool)
 
     @handle.register
-    def _(self, intent: ToggleTool) -> None:
+    def _(self, intent: ask.ToggleTool) -> None:
         self._hold(tool=Tool.OFF if self._controller.state.brush.tool is intent.tool else intent.tool)
 
     @handle.register
-    def _(self, intent: SetTarget) -> None:
+    def _(self, intent: ask.SetTarget) -> None:
         other = Target.IGNORE if self._controller.state.brush.target is Target.MASK else Target.MASK
         self._hold(target=intent.target or other)
 
     @handle.register
-    def _(self, intent: SetDiameter) -> None:
-        if not math.isfinite(intent.diameter):
-            raise CartsError(f"{intent.diameter} is no size of a brush. Give {DIAMETERS[0]} to {DIAMETERS[1]} pixels.")
-        self._hold(diameter=round(min(max(intent.diameter, DIAMETERS[0]), DIAMETERS[1])))
+    def _(self, intent: ask.SetDiameter) -> None:
+        self._hold(diameter=round(clamped(intent.diameter, *DIAMETERS)))
 
     @handle.register
-    def _(self, intent: ScaleBrush) -> None:
+    def _(self, intent: ask.ScaleBrush) -> None:
         now = self._controller.state.brush.diameter
-        least = 1 if intent.factor > 1 else -1
-        self.handle(SetDiameter(now + least * max(1, round(abs(now * intent.factor - now)))))
+        by = max(1, round(abs(now * intent.factor - now)))
+        self.handle(ask.SetDiameter(now + by if intent.factor > 1 else now - by))
 
     @handle.register
-    def _(self, intent: Paint) -> None:
+    def _(self, intent: ask.Paint) -> None:
         stroke = intent.stroke
         painted = {**self._controller.state.brush.painted, intent.client_id: stroke.number}
         try:
@@ -136,7 +78,7 @@ class Brushwork:
             self._hold(painted=painted)
 
     @handle.register
-    def _(self, intent: ClearLayer) -> None:
+    def _(self, intent: ask.ClearLayer) -> None:
         state = self._controller.state
         target = intent.target or state.brush.target
         make = Key.mask_correction if target is Target.MASK else Key.ignore_region

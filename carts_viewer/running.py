@@ -11,7 +11,17 @@ from jaxtyping import Bool
 
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, FreeParameters, Iterate, OptimizerSettings
+from carts_core.optimization import (
+    FrameEstimate,
+    FrameOptimizer,
+    FreeParameters,
+    Iterate,
+    OptimizerSettings,
+    SequenceOptimizer,
+    SequenceSettings,
+)
+from carts_core.optimization.sequence_settings import Direction
+from carts_core.optimization.sight import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.scene import Scene, SceneState
 from carts_viewer.state import Pose
@@ -103,6 +113,98 @@ class OptimizerFactory:
             free=free,
             cameras=list(cameras),
         )
+
+    def make_sequence(
+        self,
+        sequence: Recording,
+        calibration: SceneState,
+        frames: range,
+        domain: str,
+        cameras: Sequence[str],
+        settings: OptimizerSettings,
+        direction: Direction,
+        free: FreeParameters,
+        keyframes: Mapping[int, Mapping[str, np.ndarray]],
+        ignore: Ignore,
+    ) -> "SequenceRun":
+        """A run on frames together; joints are free as in a run on one frame, calibration is not.
+
+        Args:
+            sequence: Where joint positions are measured.
+            calibration: Base frames and cameras; its joint positions do not matter.
+            frames: Which ones.
+            domain: Of the images.
+            cameras: Whose images count.
+            settings: Of the optimizer.
+            direction: Where to begin.
+            free: Which joints may move.
+            keyframes: Frame -> arm -> joint positions [rad, m] that stay.
+            ignore: Frame -> camera -> pixels that show something else.
+
+        Raises:
+            CartsError: weights, an image or a setting is not usable.
+        """
+        extractor = self.prepare()
+        model = SequenceSettings(direction=direction)
+        free = replace(free, base_frames=False, extrinsics=False, intrinsics=False)
+        stamps = sequence.timestamps
+        optimizer = SequenceOptimizer(
+            scene_at(sequence.scene, calibration),
+            lambda index: sequence.frame(index, domain, list(cameras)),
+            {index: None if stamps is None else float(stamps[index]) for index in frames},
+            extractor,
+            settings=settings,
+            model=model,
+            free=free,
+            keyframes=keyframes,
+            ignore=ignore,
+            cameras=list(cameras),
+        )
+        used = {
+            **asdict(settings),
+            "model": asdict(model),
+            "free": asdict(free),
+            "cameras": list(cameras),
+            "frames": [frames[0], frames[-1]],
+            "keyframes": sorted(keyframes),
+        }
+        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.sha256, Source.PROPAGATED))
+
+
+class SequenceRun:
+    """One run on many frames: the optimizer, and what a project keeps about it."""
+
+    def __init__(self, optimizer: SequenceOptimizer, provenance: Provenance) -> None:
+        self.provenance = provenance
+        self.cancelled = False
+        self._optimizer = optimizer
+
+    @property
+    def done(self) -> int:
+        """Frames that were visited."""
+        return self._optimizer.progress[0]
+
+    def step(self) -> bool:
+        """Visit the next frame; False when there are no more."""
+        return self._optimizer.step() is not None
+
+    def cancel(self) -> None:
+        """Stop; what was reached stays in `estimates`."""
+        self.cancelled = True
+        self._optimizer.cancel()
+
+    def estimates(self) -> dict[int, FrameEstimate]:
+        """Of every frame that was visited, in the light of all of them."""
+        return self._optimizer.estimates
+
+    def status(self) -> str:
+        """How it goes, for people."""
+        done, total = self._optimizer.progress
+        if done == total:
+            return f"All {total} frames seen, looking again where they disagree"
+        seconds = (total - done) / self._optimizer.frames_per_second
+        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        return f"Frame {done} of {total}, about {left} left"
 
 
 class ActiveRun:

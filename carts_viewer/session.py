@@ -1,7 +1,7 @@
 """The recording that is open, and the poses that its project gives to its frames. No widgets, no optimizer."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -89,19 +89,37 @@ class Session:
         sources = {correction.provenance.source for correction in corrections.values()}
         return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
 
-    def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
-        regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
+    def ignored(
+        self, index: int, cameras: Iterable[str], project: ProjectState | None = None
+    ) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some.
+
+        They are those of a state of the project, by default the present one.
+        """
+        project = self.editor.view if project is None else project
+        regions = {camera: project.get(Key.ignore_region(index, camera)) for camera in cameras}
         return {camera: region.region() for camera, region in regions.items() if region is not None}
 
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
         return _calibrated(self.scene, self.scene.state(frame.measured), self.editor.view)
 
-    def edits(self, frame: Frame, state: SceneState, provenance: Provenance) -> dict[Key[Any], Any]:
+    def edits(
+        self,
+        frame: Frame,
+        state: SceneState,
+        provenance: Provenance,
+        joint_std: Mapping[str, Float[np.ndarray, " dofs"]] | None = None,
+    ) -> dict[Key[Any], Any]:
         """What a project must change so that the frame's pose is this state.
 
         What is as it was saved keeps its provenance, and what is as measured needs no correction.
+
+        Args:
+            frame: which one.
+            state: its pose.
+            provenance: of the change.
+            joint_std: arm -> standard deviations [rad, m], NaN where not known.
         """
         saved = self.editor.project.state
         before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured)
@@ -113,7 +131,7 @@ class Session:
             elif torch.equal(values, measured.joint_positions[row]):
                 edits[key] = None
             else:
-                edits[key] = JointCorrection(tuple(values.tolist()), provenance)
+                edits[key] = joint_correction(values.numpy(), provenance, (joint_std or {}).get(arm.name))
             if not torch.equal(state.T_world_base[row], before.T_world_base[row]):
                 edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
         for row, camera in enumerate(self.scene.cameras):
@@ -192,6 +210,16 @@ class Session:
             arm.name: values.numpy().astype(np.float64)
             for arm, values in zip(self.scene.arms, state.joint_positions, strict=True)
         }
+
+
+def joint_correction(
+    joint_positions: Float[np.ndarray, " dofs"],
+    provenance: Provenance,
+    joint_std: Float[np.ndarray, " dofs"] | None = None,
+) -> JointCorrection:
+    """A correction [rad, m] with its standard deviations, as far as any is known."""
+    std = None if joint_std is None or not np.isfinite(joint_std).any() else tuple(joint_std.tolist())
+    return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
 
 
 _TELLING_FIRST = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)

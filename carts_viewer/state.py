@@ -8,6 +8,7 @@ import torch
 from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
 from carts_core.optimization.keypoints import Pin
+from carts_core.optimization.sequence_settings import Direction
 from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
 from carts_core.scene import SceneState
 from carts_viewer.layers import Layer
@@ -80,6 +81,19 @@ class RunState:
 
 
 @dataclass(frozen=True)
+class SolveState:
+    """Solving many frames together, or how it ended."""
+
+    frames: range
+    """From the first to the last one, kept frames included."""
+    done: int = 0
+    """Frames that were visited."""
+    running: bool = True
+    text: str = ""
+    """How it goes, for people."""
+
+
+@dataclass(frozen=True)
 class ExportState:
     """A running export of all frames."""
 
@@ -125,6 +139,10 @@ class ViewState:
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
+    solve: SolveState | None = None
+    """The present or the last solving of many frames."""
+    direction: Direction = "forward"
+    """In which direction many frames are solved."""
     joint: tuple[str, int] | None = None
     """The joint that keys nudge: arm, index of the joint; None: the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
@@ -142,6 +160,11 @@ class ViewState:
     def undoable(self) -> int:
         """How many steps can be taken back."""
         return self.project.position
+
+    @property
+    def solving(self) -> bool:
+        """Whether many frames are being solved now."""
+        return self.solve is not None and self.solve.running
 
     @property
     def review(self) -> Review:

@@ -9,6 +9,7 @@ from .layers import MaskCorrection as MaskCorrection
 from .place import default_path as default_path
 from .project import Change as Change
 from .project import Project as Project
+from .queries import between_kept as between_kept
 from .queries import frames_in as frames_in
 from .queries import next_unreviewed as next_unreviewed
 from .queries import worst_first as worst_first

@@ -1,6 +1,7 @@
 """Which frame to look at next."""
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable
 
 from .state import ProjectState
@@ -26,6 +27,18 @@ def next_unreviewed(state: ProjectState, after: int, step: int = 1) -> int | Non
     frames = len(state.identity.frame_ids)
     around = ((after + step * offset) % frames for offset in range(1, frames + 1))
     return next((index for index in around if state.review(index).state in UNREVIEWED), None)
+
+
+def between_kept(state: ProjectState, frame: int) -> range:
+    """From the kept frame before this one to the kept frame after it, both included; see `ProjectState.kept_frames`.
+
+    Where there is none, the sequence's first or last frame takes its place.
+    """
+    kept = state.kept_frames
+    before, after = bisect_left(kept, frame), bisect_right(kept, frame)
+    first = kept[before - 1] if before else 0
+    last = kept[after] if after < len(kept) else len(state.identity.frame_ids) - 1
+    return range(first, last + 1)
 
 
 def worst_first(

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, Kind
-from .values import Figures, JointCorrection, Review, Source
+from .values import Figures, JointCorrection, Review, ReviewState, Source
 
 V = TypeVar("V")
 
@@ -99,6 +99,13 @@ class ProjectState:
         if said is not None:
             return said.held
         return any(correction.provenance.source is Source.HAND for correction in self.joints(frame).values())
+
+    @cached_property
+    def kept_frames(self) -> tuple[int, ...]:
+        """Frames that propagation must not change: keyframes and those that a person accepted; in order."""
+        known = sorted(index for index in self.records if index != WHOLE_PROJECT)
+        accepted = ReviewState.ACCEPTED
+        return tuple(index for index in known if self.is_keyframe(index) or self.review(index).state is accepted)
 
     def figures(self, frame: int) -> Figures | None:
         """Figures of a frame as it now is; None if they were not computed since it changed."""

@@ -4,7 +4,7 @@ import viser
 
 from carts_core.project import Source
 from carts_viewer import intents as ask
-from carts_viewer.controller import SPEEDS
+from carts_viewer.browsing import SPEEDS
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import viser
 
 from carts_viewer import intents as ask
-from carts_viewer.controller import LARGEST_PERTURBATION
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
+from carts_viewer.posing import LARGEST_PERTURBATION
 from carts_viewer.session import JointRange, Session
 from carts_viewer.state import ViewState
 

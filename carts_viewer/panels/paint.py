@@ -2,7 +2,7 @@
 
 import viser
 
-from carts_viewer import painting as ask
+from carts_viewer import intents as ask
 from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write

@@ -13,7 +13,6 @@ from carts_core.evaluation.metrics import dice
 from carts_core.optimization import OptimizerSettings
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
 from carts_viewer import intents as ask
-from carts_viewer import painting as paint
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.strokes import Stroke, Target, Tool
 
@@ -21,7 +20,7 @@ CORNERS = ((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0))
 
 
 def _polygon(target: Target, *, erase: bool = False, frame: int = 0, camera: str = "left", number: int = 1) -> Any:
-    return paint.Paint(7, Stroke(number, frame, camera, target, erase, True, 1, np.array(CORNERS)))
+    return ask.Paint(7, Stroke(number, frame, camera, target, erase, True, 1, np.array(CORNERS)))
 
 
 def _pixels(desk: Desk) -> np.ndarray:
@@ -152,12 +151,12 @@ def test_painting_ends_a_run_and_keeps_what_it_reached(desk: Desk) -> None:
 
 def test_clearing_is_one_step_and_touches_one_layer_of_one_frame(desk: Desk) -> None:
     desk.do(_polygon(Target.MASK), _polygon(Target.IGNORE, number=2), _polygon(Target.IGNORE, frame=1, number=3))
-    desk.do(paint.SetTarget(Target.IGNORE), paint.ClearLayer())
+    desk.do(ask.SetTarget(Target.IGNORE), ask.ClearLayer())
     assert _region(desk) is None and _correction(desk) is not None and _region(desk, 1) is not None
     assert desk.saved.steps[-1].name == "Clear the ignore region, frame 001"
-    desk.do(paint.ClearLayer())
+    desk.do(ask.ClearLayer())
     assert len(desk.saved.steps) == 4
-    desk.do(paint.ClearLayer(Target.MASK))
+    desk.do(ask.ClearLayer(Target.MASK))
     assert _correction(desk) is None
 
 
@@ -170,15 +169,15 @@ def test_painted_layers_survive_a_restart(desk: Desk) -> None:
 
 
 def test_the_brush_grows_and_shrinks_within_its_limits(desk: Desk) -> None:
-    assert desk.do(paint.ToggleTool(Tool.BRUSH)).brush.tool is Tool.BRUSH
-    assert desk.do(paint.ToggleTool(Tool.BRUSH)).brush.tool is Tool.OFF
-    assert desk.do(paint.SetDiameter(1e9)).brush.diameter == 300
-    assert desk.do(paint.SetDiameter(-5.0)).brush.diameter == 1
-    sizes = [desk.do(paint.ScaleBrush(1.25)).brush.diameter for _ in range(40)]
+    assert desk.do(ask.ToggleTool(Tool.BRUSH)).brush.tool is Tool.BRUSH
+    assert desk.do(ask.ToggleTool(Tool.BRUSH)).brush.tool is Tool.OFF
+    assert desk.do(ask.SetDiameter(1e9)).brush.diameter == 300
+    assert desk.do(ask.SetDiameter(-5.0)).brush.diameter == 1
+    sizes = [desk.do(ask.ScaleBrush(1.25)).brush.diameter for _ in range(40)]
     assert sizes[:3] == [2, 3, 4] and sizes[-1] == 300
-    assert [desk.do(paint.ScaleBrush(0.8)).brush.diameter for _ in range(40)][-1] == 1
-    assert desk.do(paint.SetTarget()).brush.target is Target.IGNORE
-    assert desk.do(paint.SetTarget()).brush.target is Target.MASK
+    assert [desk.do(ask.ScaleBrush(0.8)).brush.diameter for _ in range(40)][-1] == 1
+    assert desk.do(ask.SetTarget()).brush.target is Target.IGNORE
+    assert desk.do(ask.SetTarget()).brush.target is Target.MASK
 
 
 def test_a_project_that_takes_no_edits_shows_strokes_until_another_frame_is(desk: Desk) -> None:

@@ -1,0 +1,67 @@
+"""What is shown: frame, domain, camera, overlay, playing."""
+
+from dataclasses import dataclass
+
+from carts_viewer.intents.base import Intent, Latest
+from carts_viewer.layers import Layer
+
+
+@dataclass(frozen=True)
+class Browsing(Intent):
+    """An intent about what is shown: frame, domain, camera, overlay, playing."""
+
+
+@dataclass(frozen=True)
+class ShowFrame(Browsing, Latest):
+    """Show the frame of this index (0-based)."""
+
+    index: int
+
+
+@dataclass(frozen=True)
+class MoveFrame(Browsing):
+    """Show the frame that is `by` frames further."""
+
+    by: int
+
+
+@dataclass(frozen=True)
+class Play(Browsing):
+    """Start or stop playing; None changes over."""
+
+    on: bool | None = None
+
+
+@dataclass(frozen=True)
+class SetSpeed(Browsing, Latest):
+    """Frames per second while playing."""
+
+    fps: float
+
+
+@dataclass(frozen=True)
+class ShowDomain(Browsing, Latest):
+    """Show the images of this domain; joints stay as they are."""
+
+    domain: str
+
+
+@dataclass(frozen=True)
+class ShowCamera(Browsing, Latest):
+    """Look through this camera; joints stay as they are."""
+
+    camera: str
+
+
+@dataclass(frozen=True)
+class ShowLayer(Browsing, Latest):
+    """Draw this layer over the frame."""
+
+    layer: Layer
+
+
+@dataclass(frozen=True)
+class SetOpacity(Browsing, Latest):
+    """Opacity of the layer, 0..1."""
+
+    opacity: float

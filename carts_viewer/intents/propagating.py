@@ -1,0 +1,38 @@
+"""Keyframes, and solving the frames between them."""
+
+from dataclasses import dataclass
+
+from carts_core.optimization.sequence_settings import Direction
+from carts_viewer.intents.base import Intent
+
+
+@dataclass(frozen=True)
+class Propagating(Intent):
+    """An intent about keyframes and what follows from them."""
+
+
+@dataclass(frozen=True)
+class HoldKeyframe(Propagating):
+    """Make the shown frame a keyframe, or none; None changes over."""
+
+    on: bool | None = None
+
+
+@dataclass(frozen=True)
+class Solve(Propagating):
+    """Solve many frames together; those that are kept (keyframes, accepted frames) stay as they are."""
+
+    whole: bool = False
+    """All frames of the sequence, not only those between the kept frames around the shown one."""
+
+
+@dataclass(frozen=True)
+class StopSolving(Propagating):
+    """Stop, and keep the frames that are solved."""
+
+
+@dataclass(frozen=True)
+class SetDirection(Propagating):
+    """Choose where solving begins: at the first frame, or at the last one."""
+
+    direction: Direction

@@ -1,0 +1,87 @@
+"""Where the panels are on the page: browsing, overlay and joints on the left, tabs on the right."""
+
+from carts_viewer.mailbox import Mailbox
+from carts_viewer.page import Page
+from carts_viewer.panels.browse import BrowsePanel
+from carts_viewer.panels.curves import CurvesPanel
+from carts_viewer.panels.export import ExportPanel
+from carts_viewer.panels.help import HelpPanel
+from carts_viewer.panels.inputs import Panel
+from carts_viewer.panels.joints import JointsPanel
+from carts_viewer.panels.keyframes import KeyframesPanel
+from carts_viewer.panels.keypoints import KeypointsPanel
+from carts_viewer.panels.message import MessagePanel
+from carts_viewer.panels.optimize import OptimizePanel
+from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.paint import PaintPanel
+from carts_viewer.panels.project import HistoryPanel, SavedPanel
+from carts_viewer.panels.review import ReviewPanel
+from carts_viewer.panels.settings import FreePanel, SettingsPanel
+from carts_viewer.panels.timeline import TimelinePanel
+from carts_viewer.panels.values import ValuesPanel
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.storage import Storage
+
+_WIDTH = 312.0
+"""Of either side [px]."""
+
+
+class Layout:
+    """All panels of a page.
+
+    Attributes:
+        panels: in the order in which they are brought up to date.
+        joints: the one with the joints' sliders.
+    """
+
+    def __init__(self, page: Page, session: Session, storage: Storage, state: ViewState, mailbox: Mailbox) -> None:
+        """Build the panels.
+
+        Args:
+            page: where.
+            session: the open sequence.
+            storage: its project.
+            state: what is shown first.
+            mailbox: takes the intents.
+        """
+        emit, waits = mailbox.put, mailbox.waits
+        gui = page.server.gui
+        gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
+        gui.set_panel_label("CaRTS")
+        gui.main_panel.dock_left()
+        gui.main_panel.set_width(_WIDTH)
+        panels: list[Panel] = [
+            SavedPanel(page, storage),
+            MessagePanel(page, emit),
+            BrowsePanel(page, session, emit, waits),
+            OverlayPanel(page, session, state, emit, waits),
+            PaintPanel(page, session, state, emit, waits),
+        ]
+        with gui.add_folder("Joints"):
+            self.joints = JointsPanel(page, session, state, emit, waits)
+        right = gui.add_panel()
+        with right.add_tab("Optimize"):
+            panels += [
+                OptimizePanel(page, session, state, emit),
+                CurvesPanel(gui),
+                SettingsPanel(page, state, emit),
+                FreePanel(page, session, state, emit),
+            ]
+        with right.add_tab("Review"):
+            panels += [
+                TimelinePanel(gui),
+                ReviewPanel(page, emit, waits),
+                KeyframesPanel(page, session, emit),
+                KeypointsPanel(page, session, emit),
+                HistoryPanel(page, emit),
+            ]
+        with right.add_tab("Values"):
+            panels.append(ValuesPanel(gui, session))
+        with right.add_tab("Export"):
+            panels.append(ExportPanel(page, session, emit))
+        with right.add_tab("Help"):
+            HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
+        right.dock_right()
+        right.set_width(_WIDTH)
+        self.panels = [*panels, self.joints]

@@ -1,0 +1,222 @@
+"""What intents about the optimizer do: a run on the shown frame, its settings, and what it may move."""
+
+from dataclasses import replace
+from functools import singledispatchmethod
+from typing import TYPE_CHECKING, Any
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.project import Edits, Key, Review, ReviewState
+from carts_viewer import intents as ask
+from carts_viewer.checks import unknown
+from carts_viewer.layers import Layer
+from carts_viewer.running import ActiveRun, OptimizerFactory
+from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
+
+if TYPE_CHECKING:
+    from carts_viewer.controller import Controller
+
+_REASONS = {
+    "iterations": "Done, best iterate kept",
+    "not optimized": "Evaluated only, as the solver says",
+    "converged": "Converged",
+    "cancelled": "Cancelled",
+}
+
+
+class Runner:
+    """The part of the controller that drives the optimizer, an iteration at a time."""
+
+    def __init__(self, controller: "Controller", optimizers: OptimizerFactory) -> None:
+        self._controller = controller
+        self._session = controller.session
+        self._optimizers = optimizers
+        self._run: ActiveRun | None = None
+        self._before: Edits | None = None
+        """What brings the frame back to where the last run began."""
+
+    @singledispatchmethod
+    def handle(self, intent: ask.Optimizing) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    @property
+    def active(self) -> bool:
+        """Whether there is a run, paused or not."""
+        return self._run is not None
+
+    def patience(self) -> float | None:
+        """0 while iterations are due; None when there are none."""
+        return 0.0 if self._controller.state.run.phase is Phase.RUNNING else None
+
+    def advance(self) -> None:
+        """Do an iteration, if one is due."""
+        if self._controller.state.run.phase is Phase.RUNNING:
+            self._iterate()
+
+    def end(self, reason: str | None, *, save: bool = True) -> None:
+        """Drop the optimizer and save where it is; its curves stay until the next run.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if self._run is not None:
+            self._run = None
+            self._set(phase=Phase.IDLE, reason=reason)
+            if save:
+                self._controller.save()
+
+    def forget(self) -> None:
+        """Another frame is shown, where there is no run to go back to the start of."""
+        self._before = None
+
+    def map(self) -> None:
+        """Compute what the chosen layer shows beyond the pose, if that is not there yet.
+
+        Raises:
+            CartsError: it cannot be computed.
+        """
+        state = self._controller.state
+        if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
+            return
+        if state.maps is not None and state.camera in state.maps.cameras:
+            return
+        try:
+            run = self._make((state.camera,))
+            iterate = run.step()
+        except CartsError:
+            # Without weights, say, there is nothing to show, and trying again with every picture would not help.
+            self._controller.change(layer=Layer.MASK)
+            raise
+        self._controller.change(maps=None if iterate is None else Maps(iterate, run.cameras), busy=None)
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: ask.Run) -> None:
+        if self._run is None:
+            self._start()
+        self._set(phase=Phase.RUNNING, reason=None)
+
+    @handle.register
+    def _(self, intent: ask.Pause) -> None:
+        if self._controller.state.run.phase is Phase.RUNNING:
+            self._set(phase=Phase.PAUSED)
+
+    @handle.register
+    def _(self, intent: ask.RunOrPause) -> None:
+        self.handle(ask.Pause() if self._controller.state.run.phase is Phase.RUNNING else ask.Run())
+
+    @handle.register
+    def _(self, intent: ask.Step) -> None:
+        if self._run is None:
+            self._start()
+            self._iterate()
+        self._set(phase=Phase.PAUSED, reason=None)
+        self._iterate()
+
+    @handle.register
+    def _(self, intent: ask.Reset) -> None:
+        if self._run is not None:
+            # Nothing of the run was saved yet, so there is nothing to take back.
+            self._session.editor.drop()
+        self.end(None)
+        self._controller.change(run=RunState())
+        if self._before is not None:
+            self._controller.stage("Reset to the start of the run", self._before)
+
+    @handle.register
+    def _(self, intent: ask.SetSetting) -> None:
+        settings = self._controller.state.settings
+        try:
+            if intent.name == "loss":
+                settings = settings.with_loss(intent.value)
+            else:
+                settings = replace(settings, **{intent.name: intent.value})
+        except SettingsError as error:
+            # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
+            self._controller.change(settings_error=str(error))
+            return
+        self.end("Settings changed; Run starts anew from here")
+        self._controller.change(settings=settings, settings_error=None, maps=None)
+
+    @handle.register
+    def _(self, intent: ask.SetFreeJoint) -> None:
+        name = f"{intent.arm}/{intent.joint}"
+        locked = {*self._controller.state.free.locked_joints} - {name}
+        self._set_free(locked_joints=tuple(sorted(locked if intent.on else {*locked, name})))
+
+    @handle.register
+    def _(self, intent: ask.SetFreeGroup) -> None:
+        if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
+            raise SettingsError(f"There is no group of parameters called {intent.group!r}.")
+        self._set_free(**{intent.group: intent.on})
+
+    @handle.register
+    def _(self, intent: ask.SetCameras) -> None:
+        self.end("Cameras changed; Run starts anew from here")
+        self._controller.change(every_camera=intent.every)
+
+    # ---- The run ---------------------------------------------------------------------------------------------------
+
+    def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
+        state = self._controller.state
+        ignore = self._session.ignored(state.index, cameras)
+        optimizer = self._optimizers.make(
+            state.index, state.domain, cameras, state.pose, state.settings, state.free, ignore
+        )
+        provenance = self._optimizers.provenance(cameras, state.settings, state.free)
+        return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance)
+
+    def _start(self) -> None:
+        if self._controller.state.settings_error is not None:
+            raise SettingsError(self._controller.state.settings_error)
+        if self._controller.state.solving:
+            raise CartsError("Many frames are being solved. Wait, or stop that first.")
+        self._run = self._make(self._controller.cameras)
+        self._controller.save()
+        self._controller.forget_pins()
+        self._before = self._session.saved(self._controller.state.index)
+        self._controller.change(run=RunState(Phase.RUNNING), playing=False, error=None, busy=None)
+
+    def _iterate(self) -> None:
+        run = self._run
+        if run is None:
+            return
+        iterate = run.step()
+        if iterate is None:
+            best, reason = run.best(), run.stop_reason
+            if best is not None:
+                self._accept(run, best)
+            self.end(_REASONS.get(reason or "", reason))
+            return
+        self._accept(run, iterate)
+        self._controller.score()
+        curves = self._controller.state.run.curves
+        self._set(
+            curves=Curves(
+                (*curves.loss, float(iterate.loss)),
+                (*curves.scores, self._controller.state.scores or Scores()),
+                (*curves.seconds, float(iterate.seconds)),
+            )
+        )
+
+    def _accept(self, run: ActiveRun, iterate: Any) -> None:
+        """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
+        state = self._controller.state
+        edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
+        review = self._session.editor.project.state.review(state.index)
+        if review.state is ReviewState.UNTOUCHED:
+            edits[Key.review(state.index)] = Review(ReviewState.OPTIMIZED, review.note)
+        maps = Maps(iterate, run.cameras)
+        self._controller.stage("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
+
+    def _set_free(self, **changes: Any) -> None:
+        self.end("Free parameters changed; Run starts anew from here")
+        self._controller.change(free=replace(self._controller.state.free, **changes), maps=None)
+
+    def _set(self, **changes: Any) -> None:
+        self._controller.change(run=replace(self._controller.state.run, **changes))

@@ -1,0 +1,65 @@
+"""Keyframes, and solving the frames between them."""
+
+import viser
+
+from carts_core.optimization.sequence_settings import Direction
+from carts_core.project import ProjectState, between_kept
+from carts_viewer import intents as ask
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+
+_DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
+
+
+class KeyframesPanel:
+    """Marks keyframes and solves between them, with progress and a way to stop."""
+
+    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
+        gui = page.server.gui
+        self._ids = session.sequence.frame_ids
+        self._plan: tuple[ProjectState | None, int, str] = (None, 0, "")
+        with gui.add_folder("Keyframes"):
+            self._held = gui.add_checkbox(
+                "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
+            )
+            self._text = gui.add_html("")
+            self._between = gui.add_button("Solve between", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal")
+            self._all = gui.add_button("Solve all", color="gray")
+            page.row(self._between, self._all, weights=(3, 2))
+            self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
+            self._progress = gui.add_progress_bar(0.0, visible=False)
+            self._stop = gui.add_button("Stop and keep", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        on_input(self._held, lambda on: ask.HoldKeyframe(bool(on)), emit)
+        on_click(self._between, lambda _: ask.Solve(), emit)
+        on_click(self._all, lambda _: ask.Solve(whole=True), emit)
+        on_click(self._stop, lambda _: ask.StopSolving(), emit)
+        on_input(self._direction, lambda label: ask.SetDirection(_DIRECTIONS[label]), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        write(self._held, state.project.is_keyframe(state.index))
+        write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
+        self._between.disabled = self._all.disabled = self._direction.disabled = state.solving
+        self._progress.visible = self._stop.visible = state.solving
+        lines = [] if state.solving else [self._describe(state)]
+        if state.solve is not None:
+            self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
+            lines.append(f"<b>{escaped(state.solve.text)}</b>")
+        self._text.content = f'<p class="carts-caption">{"<br>".join(lines)}</p>'
+
+    def _describe(self, state: ViewState) -> str:
+        """What "between" means here."""
+        project, index, text = self._plan
+        if project is None or index != state.index or not (state.unsaved or project is state.project):
+            kept, frames = set(state.project.kept_frames), between_kept(state.project, state.index)
+            count = sum(frame not in kept for frame in frames)
+            first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
+            text = (
+                f"Between here is <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
+                if kept
+                else "No keyframe yet: correct a frame by hand, or solve all."
+            )
+            self._plan = (state.project, state.index, text)
+        return text

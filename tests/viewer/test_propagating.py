@@ -1,0 +1,175 @@
+"""Solving between keyframes, with the real optimizer and the shipped network."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_desk import Desk
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError, ProjectError
+from carts_core.optimization import OptimizerSettings
+from carts_core.project import (
+    CorrectedIntrinsics,
+    IgnoreRegion,
+    Key,
+    Keyframe,
+    Project,
+    Provenance,
+    ReviewState,
+    Source,
+)
+from carts_viewer import intents as ask
+from carts_viewer.running import OptimizerFactory
+
+FRAMES = 5
+
+
+@pytest.fixture
+def recording(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=FRAMES, width=160, height=120)
+
+
+@pytest.fixture
+def desk(recording: Path) -> Desk:
+    return opened(recording)
+
+
+def opened(recording: Path) -> Desk:
+    """A desk with the settings that a user begins with."""
+    sequence = Sequence.open(recording)
+    desk = Desk(sequence, Project.open(sequence), OptimizerFactory(sequence, report=lambda line: None))
+    desk.controller.change(settings=OptimizerSettings())
+    return desk
+
+
+def hand_made(desk: Desk, *frames: int) -> dict[int, float]:
+    """The first joint of these frames, put where the truth is by hand."""
+    truth = desk.session.sequence.truth
+    assert truth is not None
+    for frame in frames:
+        desk.do(ask.ShowFrame(frame), ask.SetJoint("PSM1", 0, float(truth["PSM1"][frame][0])), ask.Released())
+    return {frame: desk.saved.joints(frame)["PSM1"].joint_positions[0] for frame in frames}
+
+
+def sources(desk: Desk) -> list[Source | None]:
+    """Who made each frame's joints."""
+    found = [desk.saved.joints(frame).get("PSM1") for frame in range(FRAMES)]
+    return [None if correction is None else correction.provenance.source for correction in found]
+
+
+def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk: Desk) -> None:
+    kept = hand_made(desk, 0, 3)
+    desk.do(ask.ShowFrame(1), ask.Solve())
+    assert desk.state.solving
+    desk.finish()
+    assert sources(desk) == [Source.HAND, Source.PROPAGATED, Source.PROPAGATED, Source.HAND, None]
+    assert {frame: desk.saved.joints(frame)["PSM1"].joint_positions[0] for frame in kept} == kept
+    solved = desk.saved.joints(1)["PSM1"]
+    assert solved.standard_deviations is not None and min(value or 0.0 for value in solved.standard_deviations) > 0.0
+    assert '"keyframes": [0, 3]' in (solved.provenance.settings or "")
+    assert desk.saved.review(1).state is ReviewState.OPTIMIZED
+    figures = desk.saved.figures(2)
+    assert figures is not None and figures.loss is not None and figures.dice is not None
+    assert desk.state.pose.source is Source.PROPAGATED
+    assert desk.state.undoable == 3 and desk.state.project.steps[-1].name == "Solve 2 frames, 002 to 003"
+    desk.do(ask.Undo())
+    assert sources(desk) == [Source.HAND, None, None, Source.HAND, None]
+
+
+def test_solving_all_keeps_accepted_frames_and_needs_no_keyframe(desk: Desk) -> None:
+    measured = desk.session.sequence.measured["PSM1"]
+    desk.do(ask.ShowFrame(2), ask.SetReview(ReviewState.ACCEPTED), ask.Solve(whole=True))
+    desk.finish()
+    assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, Source.PROPAGATED, Source.PROPAGATED]
+    assert desk.joint() == pytest.approx(measured[2][0], abs=1e-6)
+
+
+def test_solving_backwards_begins_at_the_last_frame(desk: Desk) -> None:
+    hand_made(desk, 0)
+    desk.do(ask.SetDirection("backward"), ask.ShowFrame(2), ask.Solve())
+    desk.controller.advance()
+    desk.do(ask.StopSolving())
+    assert sources(desk) == [Source.HAND, None, None, None, Source.PROPAGATED]
+
+
+def test_stopping_keeps_what_is_solved_as_one_step(desk: Desk) -> None:
+    desk.do(ask.Solve(whole=True))
+    for _ in range(2):
+        desk.controller.advance()
+    state = desk.do(ask.StopSolving())
+    assert not state.solving and state.solve is not None and state.solve.text.startswith("Stopped: 2 frames solved")
+    assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, None, None] and state.undoable == 1
+    assert desk.controller.patience() is None
+
+
+def test_a_frame_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
+    desk.do(ask.Solve(whole=True))
+    desk.controller.advance()
+    kept = hand_made(desk, 1)
+    desk.finish()
+    assert sources(desk) == [Source.PROPAGATED, Source.HAND, *[Source.PROPAGATED] * 3]
+    assert desk.saved.joints(1)["PSM1"].joint_positions[0] == kept[1]
+
+
+def test_a_frame_that_a_person_freed_is_solved_although_it_was_made_by_hand(desk: Desk) -> None:
+    hand_made(desk, 0, 1)
+    desk.do(ask.HoldKeyframe(False))
+    assert desk.saved.get(Key.keyframe(1)) == Keyframe(False)
+    desk.do(ask.HoldKeyframe(), ask.HoldKeyframe(), ask.Solve())
+    desk.finish()
+    assert sources(desk) == [Source.HAND, *[Source.PROPAGATED] * 4]
+
+
+def test_ignored_pixels_are_not_looked_at(desk: Desk) -> None:
+    project = desk.session.editor.project
+    everything = np.ones((120, 160), bool)
+    project.apply("Ignore", {Key.ignore_region(frame, "left"): IgnoreRegion.of(everything) for frame in range(FRAMES)})
+    desk.do(ask.Solve(whole=True))
+    desk.finish()
+    measured = desk.session.sequence.measured["PSM1"]
+    solved = [desk.saved.joints(frame)["PSM1"].joint_positions for frame in range(FRAMES)]
+    assert np.abs(np.array(solved) - measured).max() < 1e-6
+
+
+def test_an_image_that_is_missing_does_not_cost_the_frames_before_it(recording: Path) -> None:
+    (recording.parent / "regular" / "left" / "005.png").write_bytes(b"no picture")
+    desk = opened(recording)
+    desk.do(ask.Solve(whole=True))
+    with pytest.raises(CartsError, match=r"005\.png"):
+        desk.finish()
+    assert sources(desk) == [*[Source.PROPAGATED] * 4, None] and not desk.state.solving
+
+
+@pytest.mark.parametrize(
+    ("before", "message"),
+    [
+        ((), "no keyframe yet"),
+        ((ask.SetSetting("loss", "acs"), ask.HoldKeyframe(True)), "needs gauss_newton and surface"),
+        ((ask.Solve(whole=True),), "already"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_with_the_reason(
+    desk: Desk, before: tuple[ask.Intent, ...], message: str
+) -> None:
+    desk.do(*before)
+    with pytest.raises(CartsError, match=message):
+        desk.do(ask.Solve())
+
+
+def test_a_project_that_takes_no_edits_is_not_solved(desk: Desk) -> None:
+    with pytest.raises(ProjectError, match="could not be saved"):
+        desk.reopened(read_only=True).do(ask.Solve(whole=True))
+
+
+def test_a_run_waits_for_solving_and_a_new_calibration_ends_it(desk: Desk) -> None:
+    desk.do(ask.Solve(whole=True))
+    with pytest.raises(CartsError, match="being solved"):
+        desk.do(ask.Run())
+    project, camera = desk.session.editor.project, desk.session.scene.cameras[0]
+    moved = CorrectedIntrinsics(tuple(value + 1 for value in camera.intrinsics), Provenance(Source.HAND))
+    project.apply("Calibrate", {Key.intrinsics("left"): moved})
+    with pytest.raises(CartsError, match="calibration was changed"):
+        desk.finish()
+    assert not desk.state.solving and sources(desk) == [None] * FRAMES
