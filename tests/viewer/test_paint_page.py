@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
 
@@ -96,11 +97,14 @@ def test_a_stroke_is_in_the_project_and_in_every_tab_and_undo_takes_it_out(
     open_marked: Open, open_tab: OpenTab
 ) -> None:
     app = open_marked()
-    tab, other = open_tab(app), open_tab(app, (1000, 900))
+    tab = open_tab(app)
     tab.page.get_by_text("Paint", exact=True).click()
     tab.button("Ignore region")
     tab.button("Brush")
     eventually(lambda: app.state.brush.tool, lambda tool: tool is Tool.BRUSH)
+    # A tab that joins later has the tool in hand, too.
+    other = open_tab(app, (1000, 900))
+    expect(other.page.locator("canvas.carts-paint")).to_have_css("pointer-events", "auto")
     hand = Hand(tab)
     points = [(30.0, 120.0), (120.0, 140.0), (200.0, 40.0), (290.0, 60.0)]
     hand.draw(*points)
@@ -155,8 +159,8 @@ def test_eraser_shift_and_polygon_change_the_mask_as_exported(open_marked: Open,
     tab.page.get_by_text("Export", exact=True).click()
     with tab.page.expect_download() as started:
         tab.button("Export mask")
-    exported = cv2.imread(str(Path(started.value.path())), cv2.IMREAD_UNCHANGED) > 0
-    assert np.array_equal(exported, _mask(app))
+    exported = cv2.imread(str(Path(started.value.path())), cv2.IMREAD_UNCHANGED)
+    assert exported is not None and np.array_equal(exported > 0, _mask(app))
 
 
 def _mask(app: ViewerApp) -> np.ndarray:

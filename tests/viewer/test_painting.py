@@ -111,7 +111,9 @@ def test_exports_hold_the_corrected_mask(desk: Desk) -> None:
 
 
 def _image(png: bytes) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) > 0
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image > 0
 
 
 def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
