@@ -1,20 +1,49 @@
-"""Files that people take away: a mask as PNG, or all masks and the kinematics table as one zip."""
+"""What intents about files do: the shown mask as a download, and frames in any format into the project's folder."""
 
-import io
-import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import singledispatchmethod
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carts_core.export import KinematicsRow, file_name, kinematics_csv, mask_png
-from carts_core.project import Key, MaskCorrection
+import numpy as np
+from jaxtyping import Bool
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, file_name, mask_png
+from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
+from carts_core.scene import SceneState
 from carts_viewer import intents as ask
+from carts_viewer.archive import zipped
 from carts_viewer.checks import unknown
 from carts_viewer.picture import Painter
+from carts_viewer.running import scene_at
 from carts_viewer.session import Session
-from carts_viewer.state import ExportState, Pose
+from carts_viewer.state import ExportState
+from carts_viewer.stepping import Stepped
 
 if TYPE_CHECKING:
     from carts_viewer.controller import Controller
+
+FRAME_CHOICES = {
+    "All": frozenset(ReviewState),
+    "All but rejected": frozenset(ReviewState) - {ReviewState.REJECTED},
+    "Accepted": frozenset({ReviewState.ACCEPTED}),
+    "Accepted and optimized": frozenset({ReviewState.ACCEPTED, ReviewState.OPTIMIZED}),
+    "Needs work": frozenset({ReviewState.NEEDS_WORK}),
+}
+"""What people can choose: review states of the frames that are exported."""
+_STEMS = {"csv": "kinematics", "npz": "kinematics", "json": "kinematics", "dvrk": "base_frames"}
+"""How a file is called where the format's own name would say nothing."""
+_SOURCES = {
+    Source.MEASURED: "measured",
+    Source.HAND: "edited",
+    Source.OPTIMIZER: "optimized",
+    Source.PROPAGATED: "propagated",
+}
+"""As the tables of `carts optimize` say it, so that `--keyframes` finds what was made by hand."""
+_BIT = 0.05
+"""How long the page waits for an export at a time [s]; a step that takes longer is finished."""
 
 
 class Exporter:
@@ -23,7 +52,8 @@ class Exporter:
     def __init__(self, controller: "Controller") -> None:
         self._controller = controller
         self._session = controller.session
-        self._export: tuple[ZipExport, int] | None = None
+        self._job: Stepped[Path] | None = None
+        self._intent: ask.Export | None = None
 
     @singledispatchmethod
     def handle(self, intent: ask.Exporting) -> None:
@@ -36,79 +66,153 @@ class Exporter:
 
     def patience(self) -> float | None:
         """0 while there is something to write; None when there is not."""
-        return None if self._export is None else 0.0
+        return None if self._job is None else 0.0
 
     def advance(self) -> None:
-        """Write the next frame, if there is one to write."""
-        if self._export is None:
+        """Write on for a moment, if there is something to write.
+
+        Raises:
+            CartsError: it cannot be written; nothing of it is left.
+        """
+        if self._job is None or self._intent is None:
             return
-        export, client_id = self._export
-        if export.step():
-            self._controller.change(export=ExportState(export.done, export.total))
-            return
-        self.cancel()
-        self._controller.deliver(client_id, file_name(self._session.sequence.name) + ".zip", export.finish())
+        job, intent = self._job, self._intent
+        try:
+            path = job.advance(_BIT)
+        except Exception as error:
+            self.cancel()
+            if not isinstance(error, ImportError):
+                raise
+            raise CartsError(
+                f"{FORMATS[intent.format].label} needs the package {error.name}, which is not installed. "
+                f"Install it (pip install {error.name}), then export again."
+            ) from error
+        self._tell(done=job.done, total=job.total)
+        if path is not None:
+            self._job = None
+            self._tell(path=path)
+            self._log(intent, path)
 
     def cancel(self) -> None:
-        """Forget the export that is going on, if there is one."""
-        self._export = None
-        self._controller.change(export=None)
+        """Stop the export that is going on, if there is one; nothing of it is left."""
+        if self._job is not None:
+            job, self._job = self._job, None
+            job.cancel()
+            self._controller.change(export=None)
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
     def _(self, intent: ask.ExportMask) -> None:
         state = self._controller.state
         name = file_name(f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
-        mask = frame_mask(self._controller.painter, state.pose, state.camera, state.mask_correction)
-        self._controller.deliver(intent.client_id, name, mask)
+        correction = state.project.get(Key.mask_correction(state.index, state.camera))
+        mask = self._controller.painter.mask(state.pose.scene, state.camera, correction)
+        self._controller.deliver(intent.client_id, name, mask_png(mask))
 
     @handle.register
-    def _(self, intent: ask.ExportAll) -> None:
-        export = ZipExport(self._session, self._controller.painter)
-        self._export = (export, intent.client_id)
-        self._controller.change(export=ExportState(0, export.total))
+    def _(self, intent: ask.Export) -> None:
+        if self._job is not None:
+            raise CartsError("Something is being exported already. Wait, or cancel that first.")
+        if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in ("arms", "links"):
+            raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
+        self._controller.end_run("Stopped: frames are exported")
+        self._controller.save()
+        dataset = self._dataset(intent)
+        target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
+        self._intent = intent
+        self._job = Stepped(lambda monitor: _write(dataset, intent, target, monitor))
+        self._controller.change(export=ExportState(FORMATS[intent.format].label, len(dataset.frames)), error=None)
 
     @handle.register
     def _(self, intent: ask.CancelExport) -> None:
         self.cancel()
 
+    @handle.register
+    def _(self, intent: ask.Download) -> None:
+        export_state = self._controller.state.export
+        if export_state is None or export_state.path is None:
+            raise CartsError("Nothing has been exported yet.")
+        self._controller.deliver(intent.client_id, *zipped(export_state.path))
 
-def frame_mask(painter: Painter, pose: Pose, camera: str, correction: MaskCorrection | None) -> bytes:
-    """The corrected mask of a pose in one camera, as a PNG file of the camera's own size."""
-    return mask_png(painter.mask(pose.scene, camera, correction))
+    # ---- The export ------------------------------------------------------------------------------------------------
+
+    def _dataset(self, intent: ask.Export) -> Dataset:
+        state, session = self._controller.state, self._session
+        view = session.editor.view
+        chosen = frames_in(view, FRAME_CHOICES[intent.frames])
+        if not chosen:
+            raise SettingsError(
+                f"No frame is in this choice ({intent.frames.lower()}). Review frames, or choose others."
+            )
+        cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
+        frames = export_frames(session, self._controller.painter, view, chosen, cameras)
+        scene = scene_at(session.scene, state.pose.scene).with_cameras(cameras)
+        return Dataset(
+            session.sequence, tuple(frames), scene, state.domain, parts=intent.parts, images=bool(intent.images)
+        )
+
+    def _log(self, intent: ask.Export, path: Path) -> None:
+        project, export_state = self._session.editor.project, self._controller.state.export
+        if project.writable and export_state is not None:
+            settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images}
+            project.log_export(intent.format, path, export_state.frames, settings)
+            self._controller.change(project=self._session.editor.view)
+
+    def _tell(self, **changes: object) -> None:
+        if self._controller.state.export is not None:
+            self._controller.change(export=replace(self._controller.state.export, **changes))
 
 
-class ZipExport:
-    """Masks of every frame and camera and the kinematics table, built one frame at a time.
+class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
+    """Camera -> the corrected mask of a frame, for the cameras that have a correction; made when it is asked for."""
 
-    Corrected frames are written as corrected, the others as measured; the table's column `source` says which.
-    """
+    def __init__(self, painter: Painter, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
+        self._painter, self._pose, self._corrections = painter, pose, corrections
 
-    def __init__(self, session: Session, painter: Painter) -> None:
-        self.total = len(session.sequence)
-        self.done = 0
-        self._session = session
-        self._painter = painter
-        # The project as it is now, so that an edit during the export cannot make files and table disagree.
-        self._project = session.editor.view
-        self._file = io.BytesIO()
-        self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_DEFLATED)
-        self._rows: list[KinematicsRow] = []
+    def __getitem__(self, camera: str) -> Bool[np.ndarray, "height width"]:
+        return self._painter.mask(self._pose, camera, self._corrections[camera])
 
-    def step(self) -> bool:
-        """Add the next frame; False when there are no more after it."""
-        sequence = self._session.sequence
-        frame = sequence.frame(self.done, cameras=[])
-        pose = self._session.pose(frame, self._project)
-        for camera in sequence.scene.cameras:
-            name = f"masks/{file_name(camera.name)}/{file_name(frame.frame_id)}.png"
-            correction = self._project.get(Key.mask_correction(frame.index, camera.name))
-            self._zip.writestr(name, frame_mask(self._painter, pose, camera.name, correction), zipfile.ZIP_STORED)
-        self._rows.append(KinematicsRow(frame.frame_id, str(pose.source), self._session.joints(pose.scene)))
-        self.done += 1
-        return self.done < self.total
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._corrections)
 
-    def finish(self) -> bytes:
-        """The zip file."""
-        self._zip.writestr("kinematics.csv", kinematics_csv(self._session.scene, self._rows))
-        self._zip.close()
-        return self._file.getvalue()
+    def __len__(self) -> int:
+        return len(self._corrections)
+
+
+def export_frames(
+    session: Session, painter: Painter, project: ProjectState, indices: list[int], cameras: list[str]
+) -> list[ExportFrame]:
+    """Frames as a project has them: joint positions, their deviations and source, and masks that were painted on."""
+    frames = []
+    for index in indices:
+        frame = session.sequence.frame(index, cameras=[])
+        pose = session.pose(frame, project)
+        corrections = project.joints(index)
+        known = {name: value.standard_deviations for name, value in corrections.items()}
+        painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
+        frames.append(
+            ExportFrame(
+                frame.frame_id,
+                _SOURCES[pose.source],
+                session.joints(pose.scene),
+                {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
+                index=index,
+                masks=CorrectedMasks(painter, pose.scene, {name: p for name, p in painted.items() if p is not None}),
+            )
+        )
+    return frames
+
+
+def free_path(project: Path, stem: str, intent: ask.Export) -> Path:
+    """Where an export goes: into a folder beside the project, under a name that nothing has yet."""
+    folder, suffix = project.with_name(f"{project.stem}_exports"), FORMATS[intent.format].suffix
+    number, path = 1, folder / f"{stem}{suffix}"
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}-{number}{suffix}"
+    return path
+
+
+def _write(dataset: Dataset, intent: ask.Export, target: Path, monitor: Monitor) -> Path:
+    return export(dataset, intent.format, target, monitor=monitor)

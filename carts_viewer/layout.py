@@ -79,7 +79,7 @@ class Layout:
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
         with right.add_tab("Export"):
-            panels.append(ExportPanel(page, session, emit))
+            panels.append(ExportPanel(page, session, storage, emit))
         with right.add_tab("Help"):
             HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
         right.dock_right()

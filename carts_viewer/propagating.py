@@ -124,19 +124,19 @@ class Propagator:
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
-        state, sequence = self._controller.state, self._session.sequence
+        state, sequence, cameras = self._controller.state, self._session.sequence, self._controller.cameras
         poses = {index: self._session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
         return self._optimizers.make_sequence(
             sequence,
             state.pose.scene,
             frames,
             state.domain,
-            self._controller.cameras,
+            cameras,
             state.settings,
             state.direction,
             state.free,
             keyframes={index: self._session.joints(pose.scene) for index, pose in poses.items()},
-            ignore=lambda index: self._session.ignored(index, self._controller.cameras, self._before),
+            ignore=lambda index: self._session.ignored(index, cameras),
         )
 
     def _bits(self, run: SequenceRun) -> Iterator[None]:

@@ -89,15 +89,9 @@ class Session:
         sources = {correction.provenance.source for correction in corrections.values()}
         return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
 
-    def ignored(
-        self, index: int, cameras: Iterable[str], project: ProjectState | None = None
-    ) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some.
-
-        They are those of a state of the project, by default the present one.
-        """
-        project = self.editor.view if project is None else project
-        regions = {camera: project.get(Key.ignore_region(index, camera)) for camera in cameras}
+    def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
+        regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
         return {camera: region.region() for camera, region in regions.items() if region is not None}
 
     def measured(self, frame: Frame) -> SceneState:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 
 import torch
 
@@ -95,10 +96,17 @@ class SolveState:
 
 @dataclass(frozen=True)
 class ExportState:
-    """A running export of all frames."""
+    """The present or the last export."""
 
-    done: int
-    total: int
+    format: str
+    """For people."""
+    frames: int
+    """How many frames are exported."""
+    done: int = 0
+    total: int = 0
+    """Steps of the export; 0 until the first is done."""
+    path: Path | None = None
+    """What was written; None while it is being written."""
 
 
 @dataclass(frozen=True)

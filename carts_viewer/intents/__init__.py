@@ -34,7 +34,8 @@ from .browsing import ShowDomain as ShowDomain
 from .browsing import ShowFrame as ShowFrame
 from .browsing import ShowLayer as ShowLayer
 from .exporting import CancelExport as CancelExport
-from .exporting import ExportAll as ExportAll
+from .exporting import Download as Download
+from .exporting import Export as Export
 from .exporting import Exporting as Exporting
 from .exporting import ExportMask as ExportMask
 from .optimizing import Optimizing as Optimizing

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from carts_core.export import FormatName, Parts
 from carts_viewer.intents.base import Intent
 
 
@@ -18,12 +19,27 @@ class ExportMask(Exporting):
 
 
 @dataclass(frozen=True)
-class ExportAll(Exporting):
-    """Send all masks and the kinematics, as a zip, to the tab that asked."""
+class Export(Exporting):
+    """Write frames in a format into a new folder or file beside the project."""
 
-    client_id: int
+    format: FormatName
+    frames: str
+    """Which ones, one of `exporting.FRAME_CHOICES`."""
+    parts: Parts = "arms"
+    """What gets a category of its own."""
+    images: bool = True
+    """Write the images beside their labels."""
+    shown_camera: bool = False
+    """Only the camera that is shown, not all."""
 
 
 @dataclass(frozen=True)
 class CancelExport(Exporting):
-    """Stop the export that is going on."""
+    """Stop the export that is going on; nothing of it is left."""
+
+
+@dataclass(frozen=True)
+class Download(Exporting):
+    """Send what was exported last to the tab that asked."""
+
+    client_id: int

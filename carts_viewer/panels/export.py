@@ -2,37 +2,93 @@
 
 import viser
 
+from carts_core.export import FORMATS
+from carts_core.project import ProjectState, ReviewState, frames_in
 from carts_viewer import intents as ask
+from carts_viewer.exporting import FRAME_CHOICES
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, on_click
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.storage import Storage
+
+_PARTS = {"Arm": "arms", "Link": "links"}
+_WITHOUT_IMAGES = ("masks", "csv", "npz", "json", "dvrk", "video")
+"""Formats with no images beside their labels."""
+_WITHOUT_PARTS = ("masks", "csv", "npz", "json", "dvrk", "video")
+"""Formats that have no categories, or always both kinds."""
+_NOT_KEPT = "This project ends with the viewer, and its exports with it: download them."
 
 
 class ExportPanel:
-    """The mask of this frame, or everything as one zip, with progress and a way to stop it."""
+    """The mask of this frame, or frames in any format, with progress, a way to stop it and where it is."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
+    def __init__(self, page: Page, session: Session, storage: Storage, emit: Emit) -> None:
         gui = page.server.gui
         cameras = len(session.scene.cameras)
-        gui.add_markdown("**This frame**: the mask of the shown camera, as PNG (255 = arm, 0 = background).")
-        mask = gui.add_button("Export mask", icon=viser.Icon.PHOTO_DOWN)
-        gui.add_markdown(
-            f"**All {len(session.sequence)} frames**: a zip with the masks of "
-            f"{'all cameras' if cameras > 1 else 'every frame'} and `kinematics.csv`. Frames that you optimized or "
-            "edited are written as corrected, the others as measured; column `source` says which."
-        )
-        self._all = gui.add_button("Export all", icon=viser.Icon.FILE_ZIP)
-        self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = gui.add_button("Cancel export", icon=viser.Icon.X, color="gray", visible=False)
+        self._kept = storage.scratch is None
+        self._formats = {known.label: name for name, known in FORMATS.items()}
+        self._counted: ProjectState | None = None
+        self._chosen = ""
+        with gui.add_folder("Frames"):
+            self._format = gui.add_dropdown("Format", list(self._formats))
+            self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
+            self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
+            self._parts = gui.add_dropdown("Category per", list(_PARTS))
+            self._images = gui.add_checkbox("With images", True)
+            self._count = gui.add_html("")
+            self._export = gui.add_button("Export", icon=viser.Icon.FILE_EXPORT, color="teal")
+            self._progress = gui.add_progress_bar(0.0, visible=False)
+            self._cancel = gui.add_button("Cancel export", icon=viser.Icon.X, color="gray", visible=False)
+            self._result = gui.add_html("", visible=False)
+            self._download = gui.add_button("Download it", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        with gui.add_folder("This frame"):
+            gui.add_html('<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background.</p>')
+            mask = gui.add_button("Export mask", icon=viser.Icon.PHOTO_DOWN, color="gray")
         on_click(mask, ask.ExportMask, emit)
-        on_click(self._all, ask.ExportAll, emit)
+        on_click(self._export, lambda _: self._intent(), emit)
         on_click(self._cancel, lambda _: ask.CancelExport(), emit)
+        on_click(self._download, ask.Download, emit)
+        for widget in (self._format, self._frames):
+            on_input(widget, lambda _: ask.Refresh(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
+        name = self._formats.get(self._format.value)
+        self._parts.visible = name not in _WITHOUT_PARTS
+        self._images.visible = name not in _WITHOUT_IMAGES
+        self._show_count(state)
         export = state.export
-        self._all.disabled = export is not None
-        self._progress.visible = self._cancel.visible = export is not None
-        if export is not None:
+        running = export is not None and export.path is None
+        self._export.disabled = running
+        self._progress.visible = self._cancel.visible = running
+        self._result.visible = export is not None
+        self._download.visible = export is not None and not running
+        if export is None:
+            return
+        if export.path is None:
             self._progress.value = 100.0 * export.done / max(export.total, 1)
+            text = f"{escaped(export.format)}: {export.done} of {export.total or '…'}"
+        else:
+            where = f"<code>{escaped(str(export.path))}</code>"
+            text = f"<b>{export.frames} frames</b> as {escaped(export.format)} in<br>{where}"
+            text += "" if self._kept else f"<br>{_NOT_KEPT}"
+        self._result.content = f'<p class="carts-caption" role="status">{text}</p>'
+
+    def _intent(self) -> ask.Export:
+        """What the widgets say; the controller refuses what they cannot say."""
+        return ask.Export(
+            self._formats.get(self._format.value, self._format.value),  # type: ignore[arg-type]
+            self._frames.value,
+            _PARTS.get(self._parts.value, self._parts.value),  # type: ignore[arg-type]
+            bool(self._images.value),
+            self._cameras.value == "Shown one",
+        )
+
+    def _show_count(self, state: ViewState) -> None:
+        if state.unsaved or (state.project is self._counted and self._frames.value == self._chosen):
+            return
+        self._counted, self._chosen = state.project, self._frames.value
+        count = len(frames_in(state.project, FRAME_CHOICES.get(self._chosen, frozenset[ReviewState]())))
+        frames = len(state.project.identity.frame_ids)
+        self._count.content = f'<p class="carts-caption"><b>{count}</b> of {frames} frames</p>'

@@ -1,6 +1,7 @@
 """The whole thing, as a person uses it: in headless Chromium, with real pixels."""
 
 import io
+import json
 import math
 import zipfile
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from playwright.sync_api import Browser, expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
 
+from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture import Painter
 from carts_viewer.state import Phase
@@ -167,13 +169,73 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
     shown = Painter(app.sequence).arm_ids(app.state.pose.scene, "left") >= 0
     assert started.value.suggested_filename == "tiny_001_left.png"
     assert np.array_equal(mask > 0, shown)
+    tab.button("Export")
+    eventually(lambda: app.state.export, lambda export: export is not None and export.path is not None)
+    assert app.state.export is not None
+    expect(tab.page.get_by_role("status").filter(has_text=str(app.state.export.path))).to_be_visible()
     with tab.page.expect_download() as started:
-        tab.button("Export all")
+        tab.button("Download it")
+    assert started.value.suggested_filename == "masks.zip"
     with zipfile.ZipFile(io.BytesIO(Path(started.value.path()).read_bytes())) as archive:
-        again = cv2.imdecode(np.frombuffer(archive.read("masks/left/001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
-        table = archive.read("kinematics.csv").decode().splitlines()
+        again = cv2.imdecode(np.frombuffer(archive.read("masks/binary/left_001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+        views = json.loads(archive.read("masks/export.json"))["views"]
     assert np.array_equal(again, mask)
-    assert [line.split(",")[1] for line in table] == ["source", "hand", "measured", "measured"]
+    assert [view["source"] for view in views] == ["edited", "measured", "measured"]
+
+
+def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_cancelled(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    tab = open_tab(app)
+    tab.page.keyboard.press("g")
+    eventually(lambda: app.state.index, lambda index: index == 1)
+    tab.page.get_by_text("Export", exact=True).click()
+    tab.choose("Format", "COCO")
+    tab.choose("Frames", "Accepted")
+    expect(tab.page.get_by_text("1 of 3 frames")).to_be_visible()
+    tab.button("Export")
+    path = eventually(lambda: app.state.export and app.state.export.path, bool)
+    content = json.loads((path / "annotations" / "instances_default.json").read_text())
+    assert path.parent == app.project.path.with_name("sequence_exports") and len(content["images"]) == 1
+    tab.choose("Format", "Overlay video")
+    expect(tab.page.get_by_text("Category per")).to_be_hidden()
+    tab.button("Export")
+    app.mailbox.put(ask.CancelExport())
+    eventually(lambda: app.state.export, lambda export: export is None)
+    assert [folder.name for folder in path.parent.iterdir()] == ["coco"]
+
+
+def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(frames=8, width=160, height=120)
+    tab, other = open_tab(app), open_tab(app, (1000, 900))
+    tab.page.get_by_text("Review", exact=True).first.click()
+    tab.page.keyboard.press("k")
+    expect(tab.page.get_by_text("001 to 008")).to_be_visible()
+    app.mailbox.put(ask.MoveFrame(1))
+    expect(tab.page.get_by_text("7 to solve, 1 kept")).to_be_visible()
+    tab.button("Solve between")
+    stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
+    expect(stop).to_be_visible()
+    expect(tab.page.locator("rect.carts-solving")).to_be_visible()
+    # Another tab goes on browsing meanwhile.
+    other.page.keyboard.press("n")
+    eventually(lambda: app.state.index, lambda index: index == 2)
+    expect(tab.page.get_by_text("7 frames solved")).to_be_visible(timeout=60_000)
+    expect(stop).to_be_hidden()
+    assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 7
+    assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 8))
+    steps = app.state.undoable
+    tab.button("Solve all")
+    eventually(lambda: app.state.solve, lambda solve: solve is not None and solve.running and solve.done >= 2)
+    tab.button("Stop and keep")
+    expect(tab.page.get_by_text("Stopped: ")).to_be_visible()
+    assert app.state.undoable == steps + 1
+    tab.page.keyboard.press("Control+z")
+    tab.page.keyboard.press("Control+z")
+    eventually(lambda: app.state.project.joints(3), lambda joints: not joints)
 
 
 def test_an_error_is_shown_in_the_page_and_can_be_dismissed(

@@ -1,16 +1,11 @@
 """What intents do to the state, with the real optimizer, without threads or a page."""
 
-import io
-import zipfile
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import read_kinematics_csv
 from carts_core.optimization import FreeParameters
 from carts_core.project import Source
 from carts_viewer import intents as ask
@@ -196,34 +191,6 @@ def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
     assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)
 
 
-def test_export_all_holds_every_mask_and_says_where_each_row_comes_from(desk: Desk, tmp_path: Path) -> None:
-    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.MoveFrame(1), ask.Run())
-    desk.finish()
-    desk.do(ask.ExportAll(3))
-    assert desk.state.export is not None and desk.state.export.total == 3
-    desk.finish()
-    assert desk.state.export is None
-    client, name, content = desk.delivered[0]
-    assert (client, name) == (3, "tiny.zip")
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        masks = {f"masks/{camera}/00{number}.png" for camera in ("left", "right") for number in (1, 2, 3)}
-        assert set(archive.namelist()) == masks | {"kinematics.csv"}
-        archive.extract("kinematics.csv", tmp_path)
-        mask = cv2.imdecode(np.frombuffer(archive.read("masks/right/002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
-    rows = read_kinematics_csv(tmp_path / "kinematics.csv", desk.session.scene)
-    assert [row.source for row in rows] == ["hand", "optimizer", "measured"]
-    assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
-    assert rows[2].joint_positions["PSM1"] == pytest.approx(desk.session.sequence.measured["PSM1"][2], abs=1e-6)
-    assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)
-
-
-def test_an_export_can_be_cancelled(desk: Desk) -> None:
-    desk.do(ask.ExportAll(3))
-    desk.controller.advance()
-    desk.do(ask.CancelExport())
-    assert desk.state.export is None and desk.controller.patience() is None and not desk.delivered
-
-
 def test_playing_goes_round(desk: Desk) -> None:
     desk.do(ask.ShowFrame(2), ask.SetSpeed(60.0), ask.Play(True))
     desk.controller.advance()
@@ -232,7 +199,7 @@ def test_playing_goes_round(desk: Desk) -> None:
 
 
 def test_an_error_of_what_is_going_on_stops_it_and_is_part_of_the_state(desk: Desk) -> None:
-    desk.do(ask.Run(), ask.Play(True), ask.ExportAll(1))
+    desk.do(ask.Export("masks", "All"), ask.Run(), ask.Play(True))
     desk.controller.fail(CartsError("the disk is on fire"), stop=True)
     state = desk.state
     assert state.error == "the disk is on fire" and not state.playing and state.export is None

@@ -1,7 +1,5 @@
 """What painting does: layers in the project, steps of undo, corrected masks, and what the optimizer is given."""
 
-import io
-import zipfile
 from typing import Any
 
 import cv2
@@ -99,15 +97,15 @@ def test_exports_hold_the_corrected_mask(desk: Desk) -> None:
     desk.do(_polygon(Target.MASK), _polygon(Target.MASK, erase=True, frame=1, number=2), ask.ExportMask(3))
     wanted = desk.painter.mask(desk.state.pose.scene, "left") | _pixels(desk)
     assert np.array_equal(_image(desk.delivered[-1][2]), wanted)
-    desk.do(ask.ExportAll(3))
-    desk.finish()
-    with zipfile.ZipFile(io.BytesIO(desk.delivered[-1][2])) as archive:
-        assert np.array_equal(_image(archive.read("masks/left/001.png")), wanted)
-        rendered = desk.painter.mask(desk.session.pose(desk.session.frame(1, "regular", "left")).scene, "left")
-        assert np.array_equal(_image(archive.read("masks/left/002.png")), rendered & ~_pixels(desk))
-        # The other camera's masks are as rendered.
-        other = desk.painter.mask(desk.state.pose.scene, "right")
-        assert np.array_equal(_image(archive.read("masks/right/001.png")), other)
+    desk.do(ask.Export("masks", "All", "arms", False, False))
+    export = desk.finish().export
+    assert export is not None and export.path is not None
+    found = {path.stem: _image(path.read_bytes()) for path in (export.path / "binary").iterdir()}
+    assert np.array_equal(found["left_001"], wanted)
+    rendered = desk.painter.mask(desk.session.pose(desk.session.frame(1, "regular", "left")).scene, "left")
+    assert np.array_equal(found["left_002"], rendered & ~_pixels(desk))
+    # The other camera's masks are as rendered.
+    assert np.array_equal(found["right_001"], desk.painter.mask(desk.state.pose.scene, "right"))
 
 
 def _image(png: bytes) -> np.ndarray:

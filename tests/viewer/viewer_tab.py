@@ -23,6 +23,12 @@ class Tab:
         self.page.wait_for_timeout(80)
         self.page.get_by_role("button", name=name, exact=True).click()
 
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list, as a person does."""
+        self.page.wait_for_timeout(80)
+        self.page.locator(f"[id='{self.app.page.element_id(self.app.page.find(label))}']").click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
     def type_value(self, handle: object, value: float) -> None:
         """Type into the number field beside a slider, as a person does."""
         field = self.page.locator(f"[id='{self.app.page.element_id(handle)}'] + * input")
