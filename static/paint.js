@@ -151,13 +151,13 @@
   }
 
   function path(context, stroke, image, closed) {
-    const scale = image.width / brush.width;
+    const [x, y] = [image.width / brush.width, image.height / brush.height];
     context.beginPath();
-    for (const [u, v] of stroke.points) context.lineTo(u * scale, (v * image.height) / brush.height);
-    // A path of a single point is drawn by its round ends.
-    if (stroke.points.length === 1) context.lineTo(stroke.points[0][0] * scale, (stroke.points[0][1] * image.height) / brush.height);
+    // A single point twice: it is drawn by the round ends of the line.
+    const points = stroke.points.length === 1 ? [...stroke.points, ...stroke.points] : stroke.points;
+    for (const [u, v] of points) context.lineTo(u * x, v * y);
     if (closed) context.closePath();
-    return scale;
+    return x;
   }
 
   function paint(context, stroke, image, finished) {

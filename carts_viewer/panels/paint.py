@@ -33,7 +33,6 @@ class PaintPanel:
         gui = page.server.gui
         self._page, self._scene, self._waits = page, session.scene, waits
         self._told: dict[str, object] = self._message(state)
-        self._counted: tuple[object, object] = (None, None)
         with gui.add_folder("Paint", expand_by_default=False):
             self._tools = {tool: gui.add_button(str(tool), icon=icon) for tool, icon in _ICONS.items()}
             for first in range(0, len(Tool), 2):
@@ -70,27 +69,12 @@ class PaintPanel:
         hint = f"{_HINTS[brush.tool]} {_MOVING}" if brush.tool is not Tool.OFF else _HINTS[brush.tool]
         if brush.target is Target.IGNORE and state.settings.loss != "surface":
             hint += f" The loss <b>{state.settings.loss}</b> does not use the ignore region; <b>surface</b> does."
-        self._text.content = f'<p class="carts-caption">{hint}<br>{self._counts(state)}</p>'
+        self._text.content = f'<p class="carts-caption">{hint}<br>{_counts(state)}</p>'
         message = self._message(state)
         if message != self._told:
             self._told = message
             for client in self._page.server.get_clients().values():
                 self._page.tell(client, "setBrush", message)
-
-    def _counts(self, state: ViewState) -> str:
-        """How many pixels of which colour there are."""
-        correction, region = state.mask_correction, state.ignore_region
-        if self._counted[0] != (correction, region):
-            numbers = (
-                (ADDED_COLOR, "added", 0 if correction is None else int(correction.added().sum())),
-                (REMOVED_COLOR, "removed", 0 if correction is None else int(correction.removed().sum())),
-                (IGNORED_COLOR, "ignored", 0 if region is None else int(region.region().sum())),
-            )
-            self._counted = (
-                (correction, region),
-                " ".join(swatch(color, f"{n} px {name}") for color, name, n in numbers),
-            )
-        return str(self._counted[1])
 
     def _message(self, state: ViewState) -> dict[str, object]:
         """What a page must know to draw strokes by itself."""
@@ -112,3 +96,18 @@ def _press(button: viser.GuiButtonHandle, on: bool) -> None:
     color = "teal" if on else "gray"
     if button.color != color:
         button.color = color
+
+
+def _counts(state: ViewState) -> str:
+    """How many pixels of which colour there are."""
+    correction, region = state.mask_correction, state.ignore_region
+    added, removed = (0, 0) if correction is None else (correction.added().sum(), correction.removed().sum())
+    ignored = 0 if region is None else region.region().sum()
+    return " ".join(
+        swatch(color, f"{count} px {name}")
+        for color, count, name in (
+            (ADDED_COLOR, added, "added"),
+            (REMOVED_COLOR, removed, "removed"),
+            (IGNORED_COLOR, ignored, "ignored"),
+        )
+    )

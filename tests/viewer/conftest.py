@@ -12,7 +12,7 @@ import torch
 from playwright.sync_api import Browser, sync_playwright
 from viewer_canvas import Canvas, mark_frames
 from viewer_desk import Desk
-from viewer_tab import WINDOW, Tab
+from viewer_tab import Tab
 
 from carts_core.data import Sequence
 from carts_core.features.network import Architecture, FeatureNetwork
@@ -79,15 +79,14 @@ def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
     """Opens a tab of a viewer, in a window of any size, when the first picture is there."""
     with ExitStack() as stack:
 
-        def make(app: ViewerApp, window: tuple[int, int] = WINDOW) -> Tab:
+        def make(app: ViewerApp, window: tuple[int, int] = (1280, 800)) -> Tab:
             context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
             stack.callback(context.close)
             page = context.new_page()
             page.goto(app.url)
-            page.wait_for_function("window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
-            # viser warns that this browser has no graphics card, on top of our tool bar.
-            page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
-            return Tab(app, page, Canvas(app, page))
+            tab = Tab(app, page, Canvas(app, page))
+            tab.wait_until_ready()
+            return tab
 
         yield make
 

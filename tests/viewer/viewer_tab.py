@@ -1,4 +1,4 @@
-"""A real tab of the viewer, and what a person does with it."""
+"""One tab of the viewer in a real browser."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,6 @@ from playwright.sync_api import Page
 from viewer_canvas import Canvas
 
 from carts_viewer.app import ViewerApp
-
-WINDOW = (1280, 800)
 
 
 @dataclass
@@ -36,3 +34,10 @@ class Tab:
         field.press("Control+a")
         field.press_sequentially(f"{value:g}", delay=60)
         field.press("Tab")
+
+    def wait_until_ready(self) -> None:
+        """Wait for the first picture, and take away viser's warning that this browser has no graphics card."""
+        self.page.wait_for_function(
+            "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000
+        )
+        self.page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
