@@ -74,7 +74,7 @@ class ViewerApp:
         self._painter = Painter(sequence, device)
         state = self._first_state()
         self.mailbox = Mailbox()
-        self._optimizers = OptimizerFactory(sequence, weights=weights, device=device, report=self._say)
+        self._optimizers = OptimizerFactory(weights=weights, device=device, report=self._say)
         self._controller = Controller(state, self._session, self._painter, self._optimizers, self._deliver)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")

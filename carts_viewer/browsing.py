@@ -5,8 +5,10 @@ from dataclasses import replace
 from functools import singledispatchmethod
 from typing import TYPE_CHECKING
 
+from carts_core.errors import SequenceError
+from carts_core.project import Key, TimeOffset
 from carts_viewer import intents as ask
-from carts_viewer.checks import clamped, one_of, unknown
+from carts_viewer.checks import clamped, finite, one_of, unknown
 from carts_viewer.state import RunState
 
 if TYPE_CHECKING:
@@ -93,6 +95,20 @@ class Browser:
     @handle.register
     def _(self, intent: ask.SetSpeed) -> None:
         self._controller.change(fps=clamped(intent.fps, *SPEEDS))
+
+    @handle.register
+    def _(self, intent: ask.SetTimeOffset) -> None:
+        seconds = finite(intent.seconds)
+        try:
+            self._session.sequence.with_time_offset(seconds)
+        except SequenceError as error:
+            # Half-typed numbers are often far off, so this is no occasion for an alarm.
+            self._controller.change(time_error=str(error))
+            return
+        self._controller.end_run("Stopped: the time offset was changed")
+        self._controller.change(time_error=None)
+        gesture = ask.SetTimeOffset
+        self._controller.stage("Time offset", {Key.time_offset(): TimeOffset(seconds)}, gesture=gesture)
 
     @handle.register
     def _(self, intent: ask.ShowDomain) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_core.project import Edits, Figures, Key, Provenance, Review, Source
+from carts_core.project.keys import WHOLE_PROJECT
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
 from carts_viewer.annotating import Annotator
@@ -192,7 +193,6 @@ class Controller:
         gesture: object = None,
         loss: float | None = None,
         maps: Maps | None = None,
-        frame: int | None = None,
     ) -> None:
         """Change the project; arguments and errors as `edit`, for any edits.
 
@@ -202,13 +202,13 @@ class Controller:
             gesture: see `edit`.
             loss: the optimizer's, at the new pose.
             maps: what the optimizer saw there.
-            frame: index of the frame that changes; the shown one if None.
         """
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
-        frame_id = self.session.sequence.frame_ids[self.state.index if frame is None else frame]
-        self._editor.draft(f"{name}, frame {frame_id}", edits, gesture or object())
+        frames = sorted({key.frame for key in edits} - {WHOLE_PROJECT})
+        where = "".join(f", frame {self.session.sequence.frame_ids[index]}" for index in frames)
+        self._editor.draft(f"{name}{where}", edits, gesture or object())
         self.refresh(maps)
         if gesture is None:
             self.save()
@@ -244,7 +244,11 @@ class Controller:
 
     def refresh(self, maps: Maps | None = None) -> None:
         """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
-        before, pose = self.state, self.session.pose(self.state.frame)
+        before = self.state
+        if not self.session.matched(self.state.frame):
+            frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
+            self.change(frame=frame, scores=None, maps=None)
+        pose = self.session.pose(self.state.frame)
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)
         self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)

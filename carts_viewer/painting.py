@@ -88,7 +88,7 @@ class Brushwork:
         """Save a layer as one step of undo, if it is another one."""
         if self._session.editor.view.get(key) != layer:
             self._controller.end_run("Stopped: something was painted; Run starts anew from here")
-            self._controller.stage(name, {key: layer}, loss=self._loss(key), frame=key.frame)
+            self._controller.stage(name, {key: layer}, loss=self._loss(key))
 
     def _loss(self, key: Key[Any]) -> float | None:
         """The optimizer's loss that still holds after this layer changes: a corrected mask changes nothing for it."""

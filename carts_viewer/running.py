@@ -43,19 +43,15 @@ class Optimizer(Protocol):
 
 
 class OptimizerFactory:
-    """Makes optimizers for frames of one sequence; loads the networks once, when it is first needed."""
+    """Makes optimizers; loads the networks once, when they are first needed."""
 
-    def __init__(
-        self, sequence: Recording, *, weights: Sequence[Path] = (), device: str = "cpu", report: Callable[[str], None]
-    ) -> None:
+    def __init__(self, *, weights: Sequence[Path] = (), device: str = "cpu", report: Callable[[str], None]) -> None:
         """
         Args:
-            sequence: The recording.
             weights: Weights files; a network that none is given of is the shipped one.
             device: Where to compute.
             report: Told, for people, what takes long.
         """
-        self._sequence = sequence
         self._weights = weights
         self._device = device
         self._report = report
@@ -83,6 +79,7 @@ class OptimizerFactory:
 
     def make(
         self,
+        sequence: Recording,
         index: int,
         domain: str,
         cameras: Sequence[str],
@@ -98,9 +95,9 @@ class OptimizerFactory:
         """
         extractor = self.prepare()
         self._report("Preparing the frame")
-        frame = self._sequence.frame(index, domain, list(cameras))
-        backgrounds = {camera: self._sequence.background(camera, domain) for camera in cameras}
-        scene = scene_at(self._sequence.scene, pose.scene)
+        frame = sequence.frame(index, domain, list(cameras))
+        backgrounds = {camera: sequence.background(camera, domain) for camera in cameras}
+        scene = scene_at(sequence.scene, pose.scene)
         start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
         return FrameOptimizer(
             scene,

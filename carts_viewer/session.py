@@ -47,14 +47,14 @@ class Session:
     A frame's pose is the measured one until somebody corrects it; neither camera nor domain touches corrections.
 
     Attributes:
-        sequence: the recording.
         scene: its arms and cameras.
         editor: its project, and what is on the way there.
         ranges: what each joint may be set to, arm by arm.
     """
 
     def __init__(self, sequence: Sequence, project: Project) -> None:
-        self.sequence = sequence
+        self._sequence = sequence
+        self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
         self.editor = Editor(project)
         self.ranges = tuple(
@@ -62,12 +62,34 @@ class Session:
         )
         self._reader = FrameReader(sequence)
 
+    @property
+    def time_offset(self) -> float | None:
+        """Time in the kinematics table minus time of the image [s]; None where rows are not matched by time."""
+        chosen = self.editor.view.get(Key.time_offset())
+        return self._own_offset if chosen is None or self._own_offset is None else chosen.seconds
+
+    @property
+    def sequence(self) -> Sequence:
+        """The recording, its joint positions matched with frames as `time_offset` says.
+
+        Raises:
+            SequenceError: with this offset, a frame has no joint positions.
+        """
+        self._follow()
+        return self._sequence
+
+    def matched(self, frame: Frame) -> bool:
+        """Whether the frame has the joint positions that it has with the present time offset."""
+        measured = self.sequence.measured
+        return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
+
     def frame(self, index: int, domain: str, camera: str) -> Frame:
         """The frame with the image of that camera; those ahead of it are read in advance.
 
         Raises:
             SequenceError: the image is not usable.
         """
+        self._follow()
         return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
@@ -204,6 +226,14 @@ class Session:
             arm.name: values.numpy().astype(np.float64)
             for arm, values in zip(self.scene.arms, state.joint_positions, strict=True)
         }
+
+    def _follow(self) -> None:
+        """Match joint positions with frames as `time_offset` says, if they are not."""
+        matching, offset = self._sequence.matching, self.time_offset
+        if matching is not None and offset is not None and offset != matching.time_offset:
+            self._sequence = self._sequence.with_time_offset(offset)
+            self._reader.close()
+            self._reader = FrameReader(self._sequence)
 
 
 def joint_correction(

@@ -142,6 +142,8 @@ class ViewState:
     """Whether the last step of `project` is a gesture that is not saved yet."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
+    time_error: str | None = None
+    """Why the last time offset was not accepted."""
     every_camera: bool = False
     """Whether a run uses all cameras or only the shown one."""
     playing: bool = False

@@ -107,7 +107,10 @@ class Sequence:
                 "Describe the images' times under [frames] (docs/sequence_format.md)."
             )
         matching = replace(self.matching, time_offset=time_offset)
-        return Sequence(replace(self._description, matching=matching))
+        moved = Sequence(replace(self._description, matching=matching))
+        # Images and masks do not depend on it.
+        moved._cache = self._cache
+        return moved
 
     def __len__(self) -> int:
         return len(self.frame_ids)

@@ -25,3 +25,4 @@ from .values import Provenance as Provenance
 from .values import Review as Review
 from .values import ReviewState as ReviewState
 from .values import Source as Source
+from .values import TimeOffset as TimeOffset

@@ -55,7 +55,11 @@ CREATE VIEW current AS            -- the last change of every value that is done
     ) USING (kind, frame, name, step);
 """
 
-MIGRATIONS: tuple[str, ...] = (VERSION_1,)
+VERSION_2 = """
+-- The same tables. Changes may be of the kind time_offset, which version 1 would take for damage.
+"""
+
+MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2)
 """Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from ..errors import ProjectError
 from .identity import SequenceIdentity
 from .layers import IgnoreRegion, Layer, MaskCorrection
-from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review
+from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review, TimeOffset
 
 V_co = TypeVar("V_co", covariant=True)
 
@@ -26,6 +26,7 @@ class Kind(StrEnum):
     BASE_FRAME = "base_frame"
     EXTRINSICS = "extrinsics"
     INTRINSICS = "intrinsics"
+    TIME_OFFSET = "time_offset"
     KEYFRAME = "keyframe"
     REVIEW = "review"
 
@@ -37,12 +38,13 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.BASE_FRAME: CorrectedTransform,
     Kind.EXTRINSICS: CorrectedTransform,
     Kind.INTRINSICS: CorrectedIntrinsics,
+    Kind.TIME_OFFSET: TimeOffset,
     Kind.KEYFRAME: Keyframe,
     Kind.REVIEW: Review,
 }
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.KEYFRAME, Kind.REVIEW}
-_OF_NOBODY = {Kind.KEYFRAME, Kind.REVIEW}
+_OF_NOBODY = {Kind.KEYFRAME, Kind.REVIEW, Kind.TIME_OFFSET}
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,11 @@ class Key(Generic[V_co]):
     def intrinsics(camera: str) -> "Key[CorrectedIntrinsics]":
         """Intrinsics of a camera, in all frames."""
         return Key(Kind.INTRINSICS, WHOLE_PROJECT, camera)
+
+    @staticmethod
+    def time_offset() -> "Key[TimeOffset]":
+        """How far the clocks of images and kinematics are apart, in all frames."""
+        return Key(Kind.TIME_OFFSET, WHOLE_PROJECT, "")
 
 
 Edits = Mapping[Key[Any], Any]

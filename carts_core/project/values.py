@@ -158,6 +158,21 @@ class CorrectedIntrinsics(JsonValue):
 
 
 @dataclass(frozen=True)
+class TimeOffset(JsonValue):
+    """Time in the kinematics table minus time of the image, in place of the sequence's own; see `TimeMatching`.
+
+    Raises:
+        ProjectError: it is not finite.
+    """
+
+    seconds: float
+    """[s]"""
+
+    def __post_init__(self) -> None:
+        _set(self, "seconds", _finite([self.seconds], "the time offset")[0])
+
+
+@dataclass(frozen=True)
 class Keyframe(JsonValue):
     """Whether a frame is a keyframe, where a person said so; see `ProjectState.is_keyframe`."""
 

@@ -29,6 +29,7 @@ from .browsing import MoveFrame as MoveFrame
 from .browsing import Play as Play
 from .browsing import SetOpacity as SetOpacity
 from .browsing import SetSpeed as SetSpeed
+from .browsing import SetTimeOffset as SetTimeOffset
 from .browsing import ShowCamera as ShowCamera
 from .browsing import ShowDomain as ShowDomain
 from .browsing import ShowFrame as ShowFrame

@@ -40,6 +40,13 @@ class SetSpeed(Browsing, Latest):
 
 
 @dataclass(frozen=True)
+class SetTimeOffset(Browsing, Latest):
+    """Say how far the clocks of images and kinematics are apart: time in the table minus time of the image."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
 class ShowDomain(Browsing, Latest):
     """Show the images of this domain; joints stay as they are."""
 

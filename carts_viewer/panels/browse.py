@@ -24,9 +24,9 @@ class BrowsePanel:
     def __init__(self, page: Page, session: Session, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         sequence = session.sequence
+        self._session = session
         self._waits = waits
         self._count = len(sequence)
-        self._matching = sequence.matching
         # Shown on while those of a newer pose are being computed, or the line would jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
@@ -41,12 +41,22 @@ class BrowsePanel:
             self._domain = gui.add_dropdown("Domain", list(self._domains), visible=len(self._domains) > 1)
             cameras = [camera.name for camera in sequence.scene.cameras]
             self._camera = gui.add_dropdown("Camera", cameras, visible=len(cameras) > 1)
+            offset = session.time_offset
+            self._offset = gui.add_number(
+                "Time offset [s]",
+                offset or 0.0,
+                step=0.005,
+                visible=offset is not None,
+                hint="Clock of the kinematics minus clock of the images. Make it smaller when the overlay runs ahead.",
+            )
+            self._error = gui.add_html("", visible=False)
             self._caption = gui.add_html("")
         on_input(self._frame, lambda value: ask.ShowFrame(int(value) - 1), emit)
         on_click(back, lambda _: ask.MoveFrame(-1), emit)
         on_click(forward, lambda _: ask.MoveFrame(1), emit)
         on_click(self._play, lambda _: ask.Play(), emit)
         on_input(self._speed, ask.SetSpeed, emit)
+        on_input(self._offset, ask.SetTimeOffset, emit)
         on_input(self._domain, lambda label: ask.ShowDomain(self._domains[label]), emit)
         on_input(self._camera, ask.ShowCamera, emit)
 
@@ -56,6 +66,12 @@ class BrowsePanel:
             write(self._frame, state.index + 1)
         if not self._waits(ask.SetSpeed):
             write(self._speed, state.fps)
+        self._error.visible = state.time_error is not None
+        self._error.content = f'<p class="carts-error">{escaped(state.time_error or "")}</p>'
+        offset = self._session.time_offset
+        # What could not be used stays in the field, where it is being typed.
+        if offset is not None and state.time_error is None and not self._waits(ask.SetTimeOffset):
+            write(self._offset, offset)
         write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
         write(self._camera, state.camera)
         self._play.label = "Stop" if state.playing else "Play"
@@ -68,9 +84,8 @@ class BrowsePanel:
             f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})",
             _SOURCES[state.pose.source],
         ]
-        if self._matching is not None:
-            # Joint positions and images have clocks of their own; an offset that is wrong looks like a calibration.
-            parts.append(f"{state.frame.timestamp:.3f} s, time offset <b>{self._matching.time_offset:+.3f} s</b>")
+        if state.frame.timestamp is not None:
+            parts.append(f"at {state.frame.timestamp:.3f} s")
         scores = self._scores = state.scores or self._scores
         if scores.dice is not None:
             parts.append(f"Dice <b>{scores.dice:.3f}</b>")

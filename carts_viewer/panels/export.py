@@ -30,7 +30,7 @@ class ExportPanel:
         self._formats = {known.label: name for name, known in FORMATS.items()}
         self._counted: ProjectState | None = None
         self._chosen = ""
-        with gui.add_folder("Frames"):
+        with gui.add_folder("Export frames"):
             self._format = gui.add_dropdown("Format", list(self._formats))
             self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
             self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)

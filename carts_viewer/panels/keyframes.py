@@ -57,7 +57,7 @@ class KeyframesPanel:
             count = sum(frame not in kept for frame in frames)
             first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
             text = (
-                f"Between here is <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
+                f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
                 if kept
                 else "No keyframe yet: correct a frame by hand, or solve all."
             )

@@ -10,6 +10,8 @@ _COLUMNS = 140
 _HEIGHT = 36
 _STRIP = 4
 """Height of the line below the bars."""
+_FULL = 0.2
+"""Badness of a bar of full height, unless a frame is worse still."""
 _LEAST = 3.0
 """Height of a frame that is known to fit, so that it can be seen."""
 SOURCE_COLORS = {Source.HAND: "#facc15", Source.OPTIMIZER: "#60a5fa", Source.PROPAGATED: "#e879f9"}
@@ -57,6 +59,7 @@ def _bars(project: ProjectState) -> str:
     frames = len(project.identity.frame_ids)
     columns = min(frames, _COLUMNS)
     bad = badness(project)
+    full = max([_FULL, *bad.values()])
     worst: dict[int, int] = {}
     for index in (index for index in project.records if index >= 0):
         column = index * columns // frames
@@ -65,7 +68,7 @@ def _bars(project: ProjectState) -> str:
     width = 100 / columns
     bars = []
     for column, index in worst.items():
-        height = max(_LEAST, min(bad.get(index, 0.0), 1.0) * _HEIGHT)
+        height = max(_LEAST, bad.get(index, 0.0) / full * _HEIGHT)
         color = STATE_COLORS[project.review(index).state]
         bars.append(
             f'<rect x="{column * width:.3f}" y="{_HEIGHT - height:.2f}" width="{0.85 * width:.3f}" '

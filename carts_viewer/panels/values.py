@@ -4,7 +4,7 @@ import viser
 
 from carts_viewer.panels.inputs import escaped, humanized
 from carts_viewer.panels.joints import to_shown
-from carts_viewer.session import Session
+from carts_viewer.session import JointRange, Session
 from carts_viewer.state import ViewState
 
 
@@ -19,7 +19,8 @@ class ValuesPanel:
         """Bring the table up to date."""
         shown = self._session.joints(state.pose.scene)
         truth = state.frame.truth or {}
-        columns = ["", "Measured", "Now", "Change", *(["Error"] if truth else [])]
+        known = {arm: value.standard_deviations for arm, value in state.project.joints(state.index).items()}
+        columns = ["", "Measured", "Now", "Change", "±", *(["Error"] if truth else [])]
         rows = ["".join(f"<th>{name}</th>" for name in columns)]
         for arm in self._session.scene.arms:
             rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
@@ -27,11 +28,25 @@ class ValuesPanel:
             for joint, limits in enumerate(ranges):
                 measured = to_shown(limits, float(state.frame.measured[arm.name][joint]))
                 now = to_shown(limits, float(shown[arm.name][joint]))
-                cells = [f"{measured:.2f}", f"{now:.2f}", f"{now - measured:+.2f}"]
+                cells = [
+                    f"{measured:.2f}",
+                    f"{now:.2f}",
+                    f"{now - measured:+.2f}",
+                    _deviation(limits, known.get(arm.name), joint),
+                ]
                 if arm.name in truth:
                     cells.append(f"{now - to_shown(limits, float(truth[arm.name][joint])):+.2f}")
                 unit = "°" if limits.revolute else "mm"
                 name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
                 rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
         body = "".join(f"<tr>{row}</tr>" for row in rows)
-        self._table.content = f'<table class="carts-values">{body}</table>'
+        self._table.content = (
+            f'<table class="carts-values">{body}</table>'
+            '<p class="carts-caption">± is the standard deviation of what the optimizer found.</p>'
+        )
+
+
+def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
+    """Standard deviation of a joint as people read it; nothing where it is not known."""
+    value = known[joint] if known else None
+    return "" if value is None else f"{to_shown(limits, value):.2f}"

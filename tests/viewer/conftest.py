@@ -58,7 +58,7 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
 def desk(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Desk:
     """A controller with three frames of two cameras in two domains."""
     sequence = Sequence.open(tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke")))
-    factory = OptimizerFactory(sequence, weights=(untrained_weights,), report=lambda line: None)
+    factory = OptimizerFactory(weights=(untrained_weights,), report=lambda line: None)
     return Desk(sequence, Project.open(sequence), factory)
 
 

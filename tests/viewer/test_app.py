@@ -136,7 +136,9 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
     assert state.index == state.frame.index == 5 and app.stage.sent(FRAME) != sent
 
 
-def test_the_offset_between_the_clocks_is_shown(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
+    open_viewer: Callable[..., ViewerApp],
+) -> None:
     def describe(text: str) -> str:
         frames = '[frames]\ntable = "frames.csv"\nframe_id = "{frame:03d}"\ntime_offset = -0.035\n'
         return text.replace('frame_id = "{frame:03d}"\n', "").replace("[[arms]]", frames + "[[arms]]", 1)
@@ -148,7 +150,13 @@ def test_the_offset_between_the_clocks_is_shown(open_viewer: Callable[..., Viewe
     app.mailbox.put(ask.ShowFrame(1))
     app.wait_until_shown()
     captions = [panel._caption.content for panel in app.display._panels if isinstance(panel, BrowsePanel)]
-    assert ["0.150 s, time offset <b>-0.035 s</b>" in caption for caption in captions] == [True]
+    assert ["at 0.150 s" in caption for caption in captions] == [True]
+    offset = app.page.find("Time offset [s]")
+    assert offset.visible and offset.value == -0.035
+    app.mailbox.put(ask.SetTimeOffset(-0.02))
+    app.wait_until_shown()
+    assert offset.value == -0.02
+    assert not open_viewer().page.find("Time offset [s]").visible
 
 
 def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[..., ViewerApp]) -> None:

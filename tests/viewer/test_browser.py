@@ -186,22 +186,23 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
 def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_cancelled(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    app = open_viewer()
+    app = open_viewer(frames=40, width=320, height=240, domains=("regular",))
     tab = open_tab(app)
     tab.page.keyboard.press("g")
     eventually(lambda: app.state.index, lambda index: index == 1)
     tab.page.get_by_text("Export", exact=True).click()
     tab.choose("Format", "COCO")
     tab.choose("Frames", "Accepted")
-    expect(tab.page.get_by_text("1 of 3 frames")).to_be_visible()
+    expect(tab.page.get_by_text("1 of 40 frames")).to_be_visible()
     tab.button("Export")
     path = eventually(lambda: app.state.export and app.state.export.path, bool)
     content = json.loads((path / "annotations" / "instances_default.json").read_text())
     assert path.parent == app.project.path.with_name("sequence_exports") and len(content["images"]) == 1
     tab.choose("Format", "Overlay video")
+    tab.choose("Frames", "All")
     expect(tab.page.get_by_text("Category per")).to_be_hidden()
     tab.button("Export")
-    app.mailbox.put(ask.CancelExport())
+    tab.button("Cancel export")
     eventually(lambda: app.state.export, lambda export: export is None)
     assert [folder.name for folder in path.parent.iterdir()] == ["coco"]
 
@@ -213,7 +214,7 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     tab, other = open_tab(app), open_tab(app, (1000, 900))
     tab.page.get_by_text("Review", exact=True).first.click()
     tab.page.keyboard.press("k")
-    expect(tab.page.get_by_text("001 to 008")).to_be_visible()
+    expect(tab.page.get_by_text("from 001 to 008")).to_be_visible()
     app.mailbox.put(ask.MoveFrame(1))
     expect(tab.page.get_by_text("7 to solve, 1 kept")).to_be_visible()
     tab.button("Solve between")

@@ -39,7 +39,7 @@ def desk(recording: Path) -> Desk:
 def opened(recording: Path) -> Desk:
     """A desk with the settings that a user begins with."""
     sequence = Sequence.open(recording)
-    desk = Desk(sequence, Project.open(sequence), OptimizerFactory(sequence, report=lambda line: None))
+    desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
     desk.controller.change(settings=OptimizerSettings())
     return desk
 

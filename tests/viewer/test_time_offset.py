@@ -1,0 +1,85 @@
+"""The offset between the clocks of images and kinematics, as a part of the project."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_desk import Desk
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.project import Key, Project, TimeOffset
+from carts_viewer import intents as ask
+from carts_viewer.running import OptimizerFactory
+
+
+@pytest.fixture
+def desk(tiny_sequence: Callable[..., Path]) -> Desk:
+    """Frames 0.05 s after the rows of the table, which are 0.1 s apart."""
+
+    def describe(text: str) -> str:
+        frames = '[frames]\ntable = "frames.csv"\nframe_id = "{frame:03d}"\n'
+        return text.replace('frame_id = "{frame:03d}"\n', "").replace("[[arms]]", frames + "[[arms]]", 1)
+
+    path = tiny_sequence(edit=describe)
+    (path.parent / "frames.csv").write_text("frame,timestamp\n1,0.05\n2,0.15\n3,0.2\n")
+    sequence = Sequence.open(path)
+    return Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
+
+
+def rows(desk: Desk) -> np.ndarray:
+    """The table's joint positions."""
+    return desk.session.sequence.with_time_offset(0.05).measured["PSM1"]
+
+
+def test_a_new_offset_moves_the_measured_joints_of_the_shown_frame_and_the_truth(desk: Desk) -> None:
+    image, truth = desk.state.frame.images["left"], (desk.state.frame.truth or {})["PSM1"]
+    desk.controller.score()
+    state = desk.do(ask.SetTimeOffset(0.05))
+    assert state.pose.scene.joint_positions[0].numpy() == pytest.approx(rows(desk)[0], abs=1e-6)
+    assert state.frame.measured["PSM1"] == pytest.approx(rows(desk)[0]) and state.scores is None
+    assert not np.allclose((state.frame.truth or {})["PSM1"], truth)
+    assert np.array_equal(state.frame.images["left"], image)
+
+
+def test_typing_an_offset_is_one_step_that_undo_takes_back_and_a_restart_keeps(desk: Desk) -> None:
+    before = desk.joint()
+    desk.do(ask.SetTimeOffset(0.0), ask.SetTimeOffset(0.03), ask.SetTimeOffset(0.035), ask.Released())
+    assert [step.name for step in desk.saved.steps] == ["Time offset"] and desk.joint() != before
+    desk.do(ask.Undo())
+    assert desk.joint() == before and desk.session.time_offset == 0.0
+    desk.do(ask.Redo())
+    moved = desk.joint()
+    again = desk.reopened()
+    assert again.session.time_offset == 0.035 and again.joint() == moved
+
+
+def test_corrections_by_hand_stay_where_they_are(desk: Desk) -> None:
+    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.SetTimeOffset(0.05), ask.Released())
+    assert desk.joint() == pytest.approx(0.2)
+
+
+def test_an_offset_without_joint_positions_is_told_without_an_alarm_and_changes_nothing(desk: Desk) -> None:
+    before = desk.joint()
+    state = desk.do(ask.SetTimeOffset(17.0))
+    assert "has no joint positions" in (state.time_error or "") and state.error is None and desk.joint() == before
+    assert not desk.saved.steps and desk.do(ask.SetTimeOffset(0.01)).time_error is None
+    with pytest.raises(CartsError, match="not a number"):
+        desk.do(ask.SetTimeOffset(float("nan")))
+
+
+def test_figures_of_another_offset_do_not_count(desk: Desk) -> None:
+    desk.controller.score()
+    before = desk.saved.figures(0)
+    desk.do(ask.SetTimeOffset(0.05), ask.Released())
+    after = desk.saved.figures(0)
+    assert desk.saved.get(Key.time_offset()) == TimeOffset(0.05)
+    assert before is not None and after is not None and after.dice != before.dice
+
+
+def test_a_recording_without_times_has_no_offset(tiny_sequence: Callable[..., Path]) -> None:
+    sequence = Sequence.open(tiny_sequence())
+    desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
+    assert desk.session.time_offset is None
+    assert "no time to offset" in (desk.do(ask.SetTimeOffset(0.1)).time_error or "")
