@@ -265,6 +265,7 @@
         }
       }
     },
+    brush: () => brush,
     pendingStrokes: () => pending.length,
   });
   everyFrame();
