@@ -220,14 +220,19 @@
     }
   }
 
+  /** With a tool in hand the pointer is ours, without one it moves the picture. */
+  function takePointer(on) {
+    canvas.style.pointerEvents = on ? "auto" : "none";
+    canvas.style.cursor = brush.tool === "polygon" ? "crosshair" : "none";
+  }
+
   function everyFrame() {
     requestAnimationFrame(everyFrame);
     build();
     if (!canvas) return;
     const image = window.carts.imageOnScreen();
     const on = active();
-    canvas.style.pointerEvents = on ? "auto" : "none";
-    canvas.style.cursor = brush.tool === "polygon" ? "crosshair" : "none";
+    takePointer(on);
     const now = performance.now();
     const texture = window.carts.drawnOverlay();
     const left = pending.filter((stroke) => {
@@ -255,6 +260,7 @@
       }
       brush = message;
       dirty = true;
+      if (canvas) takePointer(active());
     },
     /** The server has dealt with all strokes up to this one, and sent the overlay that shows them. */
     painted(number) {
