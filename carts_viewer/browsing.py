@@ -1,5 +1,6 @@
 """What intents about the picture do: which frame, domain, camera and layer are shown, and playing."""
 
+import logging
 import time
 from dataclasses import replace
 from functools import singledispatchmethod
@@ -14,6 +15,7 @@ from carts_viewer.state import RunState
 if TYPE_CHECKING:
     from carts_viewer.controller import Controller
 
+_log = logging.getLogger(__name__)
 SPEEDS = (0.5, 60.0)
 """Slowest and fastest playing [frames/s]."""
 
@@ -98,12 +100,17 @@ class Browser:
 
     @handle.register
     def _(self, intent: ask.SetTimeOffset) -> None:
-        seconds = finite(intent.seconds)
+        seconds, sequence = finite(intent.seconds), self._session.sequence
         try:
-            self._session.sequence.with_time_offset(seconds)
+            sequence.with_time_offset(seconds)
         except SequenceError as error:
-            # Half-typed numbers are often far off, so this is no occasion for an alarm.
-            self._controller.change(time_error=str(error))
+            if sequence.matching is None:
+                raise
+            # Half-typed numbers are often far off, so there is no alarm before the field is left.
+            now = f"{sequence.matching.time_offset:g} s"
+            text = f"With {seconds:g} s there are no joint positions near some frames in time, so it stays at {now}."
+            _log.info("%s %s", text, error)
+            self._controller.change(time_error=text)
             return
         self._controller.end_run("Stopped: the time offset was changed")
         self._controller.change(time_error=None)

@@ -4,6 +4,7 @@ Runs on the worker's thread alone, knows neither threads nor widgets.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -110,7 +111,9 @@ class Controller:
         self.change(error=text, busy=None)
         if stop:
             self._runner.end("Stopped by an error", save=False)
-            self._propagator.drop("Stopped by an error")
+            # What is solved is not lost to an error of something else; its own errors have saved it already.
+            with suppress(CartsError):
+                self._propagator.finish()
             self._exporter.cancel()
             self.change(playing=False)
 
@@ -264,6 +267,9 @@ class Controller:
 
     def _released(self) -> None:
         self._annotator.released()
+        if self.state.time_error is not None:
+            # Whoever leaves the field means what is in it.
+            self.change(error=self.state.time_error, time_error=None)
         # A run is no gesture of a hand, so nobody's letting go of something ends it.
         if not self._runner.active:
             self.save()

@@ -143,7 +143,7 @@ class ViewState:
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
     time_error: str | None = None
-    """Why the last time offset was not accepted."""
+    """Why the time offset that is being typed cannot be used."""
     every_camera: bool = False
     """Whether a run uses all cameras or only the shown one."""
     playing: bool = False

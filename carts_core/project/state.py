@@ -1,7 +1,7 @@
 """Everything a project says at one moment, as an immutable snapshot."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -55,6 +55,30 @@ class Record:
     figures: Mapping[int, Figures]
     """By revision; see `ProjectState.revision`."""
 
+    # Computed once per record, and records outlive states: whoever asks for all frames again asks for few anew.
+    @cached_property
+    def review(self) -> Review:
+        """Review state and note; untouched at first."""
+        return next(self._values(Kind.REVIEW), Review())
+
+    @cached_property
+    def sources(self) -> frozenset[Source]:
+        """Who made the corrected joint positions."""
+        return frozenset(correction.provenance.source for correction in self._values(Kind.JOINTS))
+
+    @cached_property
+    def is_keyframe(self) -> bool:
+        """See `ProjectState.is_keyframe`."""
+        return next((said.held for said in self._values(Kind.KEYFRAME)), Source.HAND in self.sources)
+
+    @cached_property
+    def is_kept(self) -> bool:
+        """Whether propagation must not change it: a keyframe, or accepted by a person."""
+        return self.is_keyframe or self.review.state is ReviewState.ACCEPTED
+
+    def _values(self, kind: Kind) -> Iterator[Any]:
+        return (e.value for key, e in self.entries.items() if key.kind is kind and e.value is not None)
+
 
 _EMPTY = Record({}, {})
 _MARKS = (Kind.KEYFRAME, Kind.REVIEW)
@@ -91,21 +115,16 @@ class ProjectState:
 
     def review(self, frame: int) -> Review:
         """Review state and note of a frame; untouched at first."""
-        return self.get(Key.review(frame)) or Review()
+        return self._record(frame).review
 
     def is_keyframe(self, frame: int) -> bool:
         """Whether propagation must keep the frame: a person said so, or made its joint positions and said nothing."""
-        said = self.get(Key.keyframe(frame))
-        if said is not None:
-            return said.held
-        return any(correction.provenance.source is Source.HAND for correction in self.joints(frame).values())
+        return self._record(frame).is_keyframe
 
     @cached_property
     def kept_frames(self) -> tuple[int, ...]:
         """Frames that propagation must not change: keyframes and those that a person accepted; in order."""
-        known = sorted(index for index in self.records if index != WHOLE_PROJECT)
-        accepted = ReviewState.ACCEPTED
-        return tuple(index for index in known if self.is_keyframe(index) or self.review(index).state is accepted)
+        return tuple(sorted(i for i, record in self.records.items() if i != WHOLE_PROJECT and record.is_kept))
 
     def figures(self, frame: int) -> Figures | None:
         """Figures of a frame as it now is; None if they were not computed since it changed."""

@@ -14,7 +14,7 @@ _SOURCES = {
     Source.MEASURED: "joints as measured",
     Source.HAND: "joints moved by hand",
     Source.OPTIMIZER: "joints optimized",
-    Source.PROPAGATED: "joints taken from other frames",
+    Source.PROPAGATED: "joints from other frames",
 }
 
 

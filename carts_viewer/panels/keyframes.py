@@ -19,7 +19,8 @@ class KeyframesPanel:
     def __init__(self, page: Page, session: Session, emit: Emit) -> None:
         gui = page.server.gui
         self._ids = session.sequence.frame_ids
-        self._plan: tuple[ProjectState | None, int, str] = (None, 0, "")
+        self._seen: tuple[ProjectState | None, int] = (None, -1)
+        self._any_kept, self._plan = False, ""
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
                 "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
@@ -41,25 +42,27 @@ class KeyframesPanel:
         """Bring the widgets up to date."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
-        self._between.disabled = self._all.disabled = self._direction.disabled = state.solving
+        self._all.disabled = self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
-        lines = [] if state.solving else [self._describe(state)]
+        self._plan_ahead(state)
+        self._between.disabled = state.solving or not self._any_kept
+        lines = [] if state.solving else [self._plan]
         if state.solve is not None:
             self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
             lines.append(f"<b>{escaped(state.solve.text)}</b>")
         self._text.content = f'<p class="carts-caption">{"<br>".join(lines)}</p>'
 
-    def _describe(self, state: ViewState) -> str:
-        """What "between" means here."""
-        project, index, text = self._plan
-        if project is None or index != state.index or not (state.unsaved or project is state.project):
-            kept, frames = set(state.project.kept_frames), between_kept(state.project, state.index)
-            count = sum(frame not in kept for frame in frames)
-            first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
-            text = (
-                f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
-                if kept
-                else "No keyframe yet: correct a frame by hand, or solve all."
-            )
-            self._plan = (state.project, state.index, text)
-        return text
+    def _plan_ahead(self, state: ViewState) -> None:
+        """Find out what "between" means here; while somebody is moving a joint, what it meant before."""
+        if self._seen == (state.project, state.index) or (state.unsaved and self._seen[1] == state.index):
+            return
+        self._seen = (state.project, state.index)
+        kept, frames = set(state.project.kept_frames), between_kept(state.project, state.index)
+        self._any_kept = bool(kept)
+        count = sum(frame not in kept for frame in frames)
+        first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
+        self._plan = (
+            f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
+            if kept
+            else "No keyframe yet: correct a frame by hand, or solve all."
+        )

@@ -100,7 +100,9 @@ def _widget(gui: Any, name: str, value: Any, hints: dict[str, str]) -> Any:
     unit = re.search(r"\[([^\]]*)\]", hint or "")
     # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
     short = unit.group(1).split()[0] if unit else "1"
-    label = humanized(name) if short == "1" else f"{humanized(name)} [{short}]"
+    # `prior_deg` in degrees needs its unit once only.
+    words = humanized(name.removesuffix(f"_{short}"))
+    label = words if short == "1" else f"{words} [{short.replace('^2', '²')}]"
     if isinstance(value, tuple):
         return gui.add_text(label, _listed(value), hint=hint)
     if choices:

@@ -83,9 +83,9 @@ def _strip(project: ProjectState) -> str:
     columns = min(frames, _COLUMNS)
     ranks = list(SOURCE_COLORS)
     made: dict[int, Source] = {}
-    for index in (index for index in project.records if index >= 0):
-        for correction in project.joints(index).values():
-            source, column = correction.provenance.source, index * columns // frames
+    for index, record in project.records.items():
+        column = index * columns // frames
+        for source in record.sources:
             if source in ranks and (column not in made or ranks.index(source) < ranks.index(made[column])):
                 made[column] = source
     width = 100 / columns

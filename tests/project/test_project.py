@@ -24,6 +24,7 @@ from carts_core.project import (
     Review,
     ReviewState,
     Source,
+    TimeOffset,
 )
 
 JOINTS = JointCorrection((0.1, 0.2, 0.03), HAND)
@@ -55,6 +56,19 @@ def test_values_keep_every_bit_and_who_made_them(project: Project, project_path:
     assert np.array_equal(found.joint_positions, positions)
     assert found.standard_deviations == (1e-5, None, None)
     assert found.provenance == OPTIMIZER
+
+
+def test_a_time_offset_holds_for_all_frames_and_makes_their_figures_void(project: Project, project_path: Path) -> None:
+    project.record_figures({0: Figures(dice=0.5)}, project.state)
+    project.apply("Time offset", {Key.time_offset(): TimeOffset(-0.035)})
+    assert project.state.figures(0) is None
+    project.close()
+    with Project(IDENTITY, project_path) as again:
+        assert again.state.get(Key.time_offset()) == TimeOffset(-0.035)
+        again.undo()
+        assert again.state.get(Key.time_offset()) is None and again.state.figures(0) == Figures(dice=0.5)
+    with pytest.raises(ProjectError, match="the time offset are"):
+        TimeOffset(np.nan)
 
 
 def test_a_gesture_over_many_frames_is_one_step_of_undo_even_after_a_restart(tmp_path: Path) -> None:

@@ -6,9 +6,11 @@ from carts_core.project import (
     Figures,
     JointCorrection,
     Key,
+    Keyframe,
     Project,
     Review,
     ReviewState,
+    between_kept,
     frames_in,
     next_unreviewed,
     worst_first,
@@ -47,3 +49,16 @@ def test_frames_are_found_by_their_review_state(project: Project) -> None:
     project.apply("Mark", {Key.review(2): Review(ReviewState.ACCEPTED)})
     assert frames_in(project.state, {ReviewState.ACCEPTED}) == [2]
     assert frames_in(project.state, {ReviewState.UNTOUCHED, ReviewState.REJECTED}) == [0, 1]
+
+
+def test_kept_frames_are_keyframes_and_accepted_ones_and_say_where_between_is(project: Project) -> None:
+    assert project.state.kept_frames == () and between_kept(project.state, 1) == range(3)
+    project.apply("Drag", {Key.joints(2, "PSM2"): JointCorrection((0.0, 0.0), HAND)})
+    project.apply("Mark", {Key.review(0): Review(ReviewState.ACCEPTED), Key.review(1): Review(ReviewState.REJECTED)})
+    assert project.state.kept_frames == (0, 2)
+    # From a kept frame, between reaches to either side of it.
+    assert [between_kept(project.state, frame) for frame in range(3)] == [range(3), range(3), range(3)]
+    project.apply("Mark", {Key.keyframe(1): Keyframe(True)})
+    assert [between_kept(project.state, frame) for frame in range(3)] == [range(2), range(3), range(1, 3)]
+    project.apply("Mark", {Key.keyframe(2): Keyframe(False)})
+    assert project.state.kept_frames == (0, 1)

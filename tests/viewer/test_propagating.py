@@ -142,6 +142,21 @@ def test_an_image_that_is_missing_does_not_cost_the_frames_before_it(recording: 
     assert sources(desk) == [*[Source.PROPAGATED] * 4, None] and not desk.state.solving
 
 
+def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> None:
+    desk.do(ask.Solve(whole=True))
+    desk.controller.advance()
+    desk.controller.fail(CartsError("the export failed"), stop=True)
+    assert not desk.state.solving and sources(desk) == [Source.PROPAGATED, *[None] * 4]
+    assert desk.state.error == "the export failed"
+
+
+def test_closing_saves_what_is_solved(desk: Desk) -> None:
+    desk.do(ask.Solve(whole=True))
+    desk.controller.advance()
+    desk.controller.close()
+    assert sources(desk) == [Source.PROPAGATED, *[None] * 4]
+
+
 @pytest.mark.parametrize(
     ("before", "message"),
     [

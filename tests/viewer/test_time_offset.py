@@ -63,8 +63,10 @@ def test_corrections_by_hand_stay_where_they_are(desk: Desk) -> None:
 def test_an_offset_without_joint_positions_is_told_without_an_alarm_and_changes_nothing(desk: Desk) -> None:
     before = desk.joint()
     state = desk.do(ask.SetTimeOffset(17.0))
-    assert "has no joint positions" in (state.time_error or "") and state.error is None and desk.joint() == before
+    assert "it stays at 0 s" in (state.time_error or "") and state.error is None and desk.joint() == before
     assert not desk.saved.steps and desk.do(ask.SetTimeOffset(0.01)).time_error is None
+    state = desk.do(ask.SetTimeOffset(17.0), ask.Released())
+    assert "it stays at 0.01 s" in (state.error or "") and state.time_error is None
     with pytest.raises(CartsError, match="not a number"):
         desk.do(ask.SetTimeOffset(float("nan")))
 
@@ -82,4 +84,5 @@ def test_a_recording_without_times_has_no_offset(tiny_sequence: Callable[..., Pa
     sequence = Sequence.open(tiny_sequence())
     desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
     assert desk.session.time_offset is None
-    assert "no time to offset" in (desk.do(ask.SetTimeOffset(0.1)).time_error or "")
+    with pytest.raises(CartsError, match="no time to offset"):
+        desk.do(ask.SetTimeOffset(0.1))
