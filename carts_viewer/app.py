@@ -26,7 +26,10 @@ from carts_viewer.session import Session
 from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage, open_storage
+from carts_viewer.strokes import read_stroke
 from carts_viewer.worker import Worker
+
+_log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
 """Told, line by line, what takes long."""
@@ -85,6 +88,7 @@ class ViewerApp:
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.mailbox.put(ask.Released()))
         self.page.on_pointed(self._on_pointed)
+        self.page.on_painted(self._on_painted)
         self.page.on_picked(lambda share: self.mailbox.put(ask.ShowFrame(int(_unit(share) * len(sequence)))))
         self._worker = Worker(self.mailbox, self._controller, self.display)
         self._worker.start(self._prepare)
@@ -203,6 +207,16 @@ class ViewerApp:
     def _on_pointed(self, u: float, v: float) -> None:
         camera = self.scene.camera(self.state.camera)
         self.mailbox.put(ask.PointAt(u * camera.width, v * camera.height))
+
+    def _on_painted(self, tab: int, text: str) -> None:
+        try:
+            cameras = {camera.name: camera for camera in self.scene.cameras}
+            stroke = read_stroke(text, len(self.sequence), cameras)
+        except CartsError as error:
+            # Our page sends no such thing, and others that look on did nothing wrong.
+            _log.info("Refused: %s", error)
+        else:
+            self.mailbox.put(ask.Paint(tab, stroke))
 
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:
         client = self.page.server.get_clients().get(client_id)

@@ -18,6 +18,7 @@ from carts_viewer.browsing import Browser
 from carts_viewer.checks import unknown
 from carts_viewer.exporting import Exporter
 from carts_viewer.optimizing import Runner
+from carts_viewer.painting import Brushwork
 from carts_viewer.picture import Painter
 from carts_viewer.posing import Poser
 from carts_viewer.propagating import Propagator
@@ -60,6 +61,7 @@ class Controller:
             ask.Annotation: self._annotator.handle,
             ask.Propagating: self._propagator.handle,
             ask.Exporting: self._exporter.handle,
+            ask.Painting: Brushwork(self).handle,
             ask.Refresh: lambda _: self.change(),
             # Nothing to do: it has woken the worker, which now may send the next overlay.
             ask.Drawn: lambda _: None,
@@ -134,7 +136,7 @@ class Controller:
         state = self.state
         if state.scores is not None:
             return
-        scores = self.painter.scores(state.pose.scene, state.frame, state.camera)
+        scores = self.painter.scores(state.pose.scene, state.frame, state.camera, state.mask_correction)
         self.change(scores=scores)
         project = self._editor.project
         known = scores.dice is None or state.unsaved or project.state.figures(state.index) is not None
@@ -207,8 +209,8 @@ class Controller:
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
-        everywhere = all(key.frame == WHOLE_PROJECT for key in edits)
-        where = "" if everywhere else f", frame {self.state.frame.frame_id}"
+        frames = sorted({key.frame for key in edits} - {WHOLE_PROJECT})
+        where = "".join(f", frame {self.session.sequence.frame_ids[index]}" for index in frames)
         self._editor.draft(f"{name}{where}", edits, gesture or object())
         self.refresh(maps)
         if gesture is None:
@@ -245,6 +247,7 @@ class Controller:
 
     def refresh(self, maps: Maps | None = None) -> None:
         """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
+        before = self.state
         if not self.session.matched(self.state.frame):
             frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
             self.change(frame=frame, scores=None, maps=None)
@@ -252,6 +255,10 @@ class Controller:
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)
         self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
+        if self.state.mask_correction != before.mask_correction:
+            self.change(scores=None)
+        if self.state.ignore_region != before.ignore_region:
+            self.change(maps=None)
 
     def forget_pins(self) -> None:
         """Drop what was said about where keypoints are."""

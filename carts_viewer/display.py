@@ -1,7 +1,8 @@
 """Puts states on the page: pictures into the stage, values into the panels, only what changed and only when asked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from carts_viewer.layers import Layer, Rgba, paint_over
 from carts_viewer.marks import draw_keypoints, labelled_keypoints
 from carts_viewer.pace import Pace
 from carts_viewer.page import Page
@@ -10,6 +11,7 @@ from carts_viewer.picture import Painter
 from carts_viewer.session import Session
 from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
+from carts_viewer.strokes import Tool
 
 
 class PageDisplay:
@@ -38,8 +40,15 @@ class PageDisplay:
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
             overlay = self._painter.overlay(
-                state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
+                state.pose.scene,
+                state.frame,
+                state.camera,
+                state.layer,
+                state.opacity,
+                state.maps,
+                state.mask_correction,
             )
+            _draw_paint(overlay, state)
             if state.keypoints.shown:
                 draw_keypoints(
                     overlay, self._scene, state.pose.scene, state.camera, self._keypoints, state.keypoints.pins
@@ -50,11 +59,19 @@ class PageDisplay:
                     self._stage.show_frame(state.frame.images[state.camera], camera)
                 self._stage.show_overlay(overlay, camera)
             self._page.server.flush()
+            self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
             self._pace.sent()
             # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
             if new_pose:
                 self._stage.show_pose(state.pose.scene, state.camera)
         self._shown = state
+
+    def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
+        """Tell tabs that their strokes are in the overlay that was just sent, and need not be drawn any more."""
+        clients = self._page.server.get_clients()
+        for tab, number in new.items():
+            if old.get(tab) != number and tab in clients:
+                self._page.tell(clients[tab], "painted", number)
 
     def show_panels(self, state: ViewState) -> None:
         """Bring every widget up to date."""
@@ -63,4 +80,16 @@ class PageDisplay:
 
 
 def _picture(state: ViewState) -> tuple:
-    return state.layer, state.opacity, id(state.maps), state.keypoints.shown, state.keypoints.pins
+    brush = state.brush
+    keypoints = state.keypoints.shown, state.keypoints.pins
+    painted = state.mask_correction, state.ignore_region, brush.tool is Tool.OFF, brush.target, brush.painted
+    return state.layer, state.opacity, id(state.maps), keypoints, painted
+
+
+def _draw_paint(overlay: Rgba, state: ViewState) -> None:
+    """Draw what was painted, unless somebody wants to see nothing but the frame."""
+    at_work = state.brush.tool is not Tool.OFF
+    if at_work or state.layer is not Layer.NONE:
+        # The comparison with the truth shows the corrected mask itself.
+        correction = None if state.layer is Layer.TRUTH else state.mask_correction
+        paint_over(overlay, correction, state.ignore_region, max(state.opacity, 0.4) if at_work else state.opacity)

@@ -14,9 +14,11 @@ from typing import Literal
 from carts_core.project import ReviewState
 from carts_viewer import intents as ask
 from carts_viewer.layers import Layer
+from carts_viewer.strokes import Tool
 
 FINE, COARSE = 0.1, 1.0
 """Steps of nudging [deg or mm]."""
+_GROWTH = 1.25
 _BEGIN, _END = "<!-- keys: written by python -m carts_viewer.keys -->", "<!-- end of keys -->"
 
 Special = Literal["perturb", "view"]
@@ -74,6 +76,13 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("M", "Back to measured joints", ask.BackToMeasured()),
         Shortcut("Z", "Undo", ask.Undo(), "cmd/ctrl"),
         Shortcut("Z", "Redo", ask.Redo(), "cmd/ctrl+shift"),
+        Shortcut("B", "Brush, or put it away", ask.ToggleTool(Tool.BRUSH), "shift"),
+        Shortcut("X", "Eraser, or put it away", ask.ToggleTool(Tool.ERASER), "shift"),
+        Shortcut("P", "Polygon, or put it away", ask.ToggleTool(Tool.POLYGON), "shift"),
+        Shortcut("M", "Paint on the mask or on the ignore region", ask.SetTarget(), "shift"),
+        Shortcut("[", "Smaller brush", ask.ScaleBrush(1 / _GROWTH)),
+        Shortcut("]", "Larger brush", ask.ScaleBrush(_GROWTH)),
+        Shortcut("escape", "Drop the polygon, or put the tool away", ask.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
             Shortcut(str(number), f"Overlay: {layer.lower()}", ask.ShowLayer(layer))

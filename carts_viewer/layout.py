@@ -13,6 +13,7 @@ from carts_viewer.panels.keypoints import KeypointsPanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
 from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
@@ -55,6 +56,7 @@ class Layout:
             MessagePanel(page, emit),
             BrowsePanel(page, session, emit, waits),
             OverlayPanel(page, session, state, emit, waits),
+            PaintPanel(page, session, state, emit, waits),
         ]
         with gui.add_folder("Joints"):
             self.joints = JointsPanel(page, session, state, emit, waits)

@@ -30,6 +30,9 @@ from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 from carts_viewer.guard import check_loopback, refusal
 
+OWN_KEYS = ("[", "]", "escape")
+"""Keys that viser's shortcuts do not know, or that our script must hear first."""
+
 _TITLE = "<title>Viser</title>"
 _SERVER_CONSTRUCTION = threading.Lock()
 
@@ -60,6 +63,9 @@ class Page:
         self._released = self.server.gui.add_text("released", "", visible=False)
         # Into this one which share of the timeline somebody clicked.
         self._picked = self.server.gui.add_text("picked", "", visible=False)
+        # Into these strokes over the picture, and keys that viser's shortcuts do not know.
+        self._painted = self.server.gui.add_text("painted", "", visible=False)
+        self._pressed = self.server.gui.add_text("pressed", "", visible=False)
         # And into this one where somebody points in the picture.
         self._pointed = self.server.gui.add_text("pointed", "", visible=False)
 
@@ -91,6 +97,14 @@ class Page:
         """
 
         _on_numbers(self._pointed, 2, callback)
+
+    def on_painted(self, callback: Callable[[int, str], None]) -> None:
+        """Call `callback(client_id, text)` on the event loop whenever a tab says that it has painted; any text."""
+        _on_text(self._painted, callback)
+
+    def on_pressed(self, callback: Callable[[str], None]) -> None:
+        """Call `callback(key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
+        _on_text(self._pressed, lambda _, key: callback(key))
 
     def on_picked(self, callback: Callable[[float], None]) -> None:
         """Call `callback(share)` on the event loop whenever somebody clicks the timeline; any number, as above."""
@@ -185,6 +199,9 @@ class Page:
                 "released": self._released._impl.uuid,
                 "picked": self._picked._impl.uuid,
                 "pointed": self._pointed._impl.uuid,
+                "painted": self._painted._impl.uuid,
+                "pressed": self._pressed._impl.uuid,
+                "keys": OWN_KEYS,
             }
         )
         return (
@@ -195,7 +212,8 @@ class Page:
                 '<link rel="icon" href="/static/icon.svg" />'
                 '<link rel="stylesheet" href="/static/page.css" />'
                 f"<script>window.cartsConfiguration = {configuration};</script>"
-                '<script src="/static/page.js" defer></script>',
+                '<script src="/static/page.js" defer></script>'
+                '<script src="/static/paint.js" defer></script>',
                 1,
             )
             .encode()
@@ -213,6 +231,16 @@ def _on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., 
             return
         if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
             callback(*numbers)
+
+
+def _on_text(field: viser.GuiTextHandle, callback: Callable[[int, str], None]) -> None:
+    """Call back with the tab's number and what it has written into a field behind its own name and a counter."""
+
+    @field.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        parts = str(field.value).split(maxsplit=2)
+        if event.client_id is not None and len(parts) == 3:
+            callback(event.client_id, parts[2])
 
 
 @functools.cache

@@ -41,7 +41,14 @@ class Painter:
         return rendered if correction is None else correction.applied_to(rendered)
 
     def overlay(
-        self, state: SceneState, frame: Frame, camera: str, layer: Layer, opacity: float, maps: Maps | None
+        self,
+        state: SceneState,
+        frame: Frame,
+        camera: str,
+        layer: Layer,
+        opacity: float,
+        maps: Maps | None,
+        correction: MaskCorrection | None = None,
     ) -> layers.Rgba:
         """The layer over one camera's image.
 
@@ -52,6 +59,7 @@ class Painter:
             layer: What to draw.
             opacity: Opacity, 0..1.
             maps: Where attention and similarity come from; without them these layers are empty.
+            correction: Of the mask that is compared with the truth.
         """
         size = self._scene.camera(camera).height, self._scene.camera(camera).width
         if layer is Layer.SHADED:
@@ -62,7 +70,7 @@ class Painter:
             return layers.contour(self.arm_ids(state, camera), opacity)
         if layer is Layer.TRUTH:
             truth = None if frame.masks is None else frame.masks.get(camera)
-            predicted = self.arm_ids(state, camera) >= 0
+            predicted = self.mask(state, camera, correction)
             return layers.nothing(*size) if truth is None else layers.against_truth(predicted, truth, opacity)
         if layer in (Layer.ATTENTION, Layer.SIMILARITY) and maps is not None and camera in maps.cameras:
             # Features are not negative, so their similarity is not either.
@@ -70,10 +78,10 @@ class Painter:
             return layers.heat(values[maps.cameras.index(camera)], 0.0, 1.0, size, opacity)
         return layers.nothing(*size)
 
-    def scores(self, state: SceneState, frame: Frame, camera: str) -> Scores:
-        """How close the pose is to the frame's truth, as far as there is one."""
+    def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
+        """How close the pose and its corrected mask are to the frame's truth, as far as there is one."""
         mask = None if frame.masks is None else frame.masks.get(camera)
-        overlap = None if mask is None else dice(self.arm_ids(state, camera) >= 0, mask)
+        overlap = None if mask is None else dice(self.mask(state, camera, correction), mask)
         values = (joints.double().numpy() for joints in state.joint_positions)
         estimate = {arm.name: joints for arm, joints in zip(self._scene.arms, values, strict=True)}
         return Scores(overlap, joint_mae_deg(self._scene, estimate, frame.truth or {}, self._measured_joints))

@@ -165,7 +165,8 @@ class Propagator:
             return None
         frame = sequence.frame(estimate.index, state.domain, [state.camera])
         scene = self._session.with_joints(state.pose.scene, estimate.joint_positions)
-        return self._controller.painter.scores(scene, frame, state.camera).dice
+        correction = self._session.editor.view.get(Key.mask_correction(estimate.index, state.camera))
+        return self._controller.painter.scores(scene, frame, state.camera, correction).dice
 
     def _check_calibration(self) -> None:
         now = self._session.editor.view

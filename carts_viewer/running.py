@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
@@ -85,8 +86,9 @@ class OptimizerFactory:
         pose: Pose,
         settings: OptimizerSettings,
         free: FreeParameters,
+        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> Optimizer:
-        """An optimizer that starts at the pose.
+        """An optimizer that starts at the pose; `ignore` says which pixels of which camera show an occluder.
 
         Raises:
             CartsError: weights, an image or a setting is not usable.
@@ -99,7 +101,15 @@ class OptimizerFactory:
         scene = scene_at(sequence.scene, pose.scene)
         start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
         return FrameOptimizer(
-            scene, frame, backgrounds, extractor, start=start, settings=settings, free=free, cameras=list(cameras)
+            scene,
+            frame,
+            backgrounds,
+            extractor,
+            ignore=ignore,
+            start=start,
+            settings=settings,
+            free=free,
+            cameras=list(cameras),
         )
 
     def make_sequence(

@@ -10,9 +10,10 @@ from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
 from carts_core.optimization.keypoints import Pin
 from carts_core.optimization.sequence_settings import Direction
-from carts_core.project import ProjectState, Review, Source
+from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
 from carts_core.scene import SceneState
 from carts_viewer.layers import Layer
+from carts_viewer.strokes import Brush
 
 
 class Phase(StrEnum):
@@ -155,6 +156,7 @@ class ViewState:
     joint: tuple[str, int] | None = None
     """The joint that keys nudge: arm, index of the joint; None: the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
+    brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
     """Of the shown pose, frame and domain; None while nobody needs them."""
     scores: Scores | None = None
@@ -178,3 +180,13 @@ class ViewState:
     def review(self) -> Review:
         """Of the shown frame."""
         return self.project.review(self.index)
+
+    @property
+    def mask_correction(self) -> MaskCorrection | None:
+        """What was painted on the mask of the shown frame and camera."""
+        return self.project.get(Key.mask_correction(self.index, self.camera))
+
+    @property
+    def ignore_region(self) -> IgnoreRegion | None:
+        """The pixels of the shown frame and camera that the optimizer leaves out."""
+        return self.project.get(Key.ignore_region(self.index, self.camera))

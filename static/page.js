@@ -39,6 +39,19 @@
     };
   }
 
+  /** The image's rectangle on the canvas in the endoscope view [CSS px], or null. */
+  function imageOnScreen() {
+    const image = view.endoscope ? imageRectangle() : null;
+    const { camera, canvas } = viser() ?? {};
+    if (!image || !camera || !canvas) return null;
+    const shown = visibleRectangle(image, camera.aspect);
+    const [x, y] = [canvas.clientWidth / shown.width, canvas.clientHeight / shown.height];
+    return {
+      left: (image.left - shown.left) * x, top: (image.top - shown.top) * y,
+      width: image.width * x, height: image.height * y,
+    };
+  }
+
   /** Keep the image in sight: centred along a side that fits, without a gap along one that does not. */
   function clampPan(image, aspect) {
     const shown = visibleRectangle(image, aspect);
@@ -161,7 +174,10 @@
   }
 
   function listen() {
-    const inPicture = (event) => view.endoscope && viser()?.canvas && event.target === viser().canvas;
+    // paint.js lays its canvas over viser's; the wheel and the other buttons do there what they always do.
+    const painting = (event) => event.target instanceof Element && event.target.classList.contains("carts-paint");
+    const inPicture = (event) =>
+      view.endoscope && viser()?.canvas && (event.target === viser().canvas || painting(event));
     const share = (event) => {
       const box = viser().canvas.getBoundingClientRect();
       return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
@@ -188,7 +204,7 @@
       zoomAt(Math.exp(-event.deltaY * (event.deltaMode === 1 ? 0.05 : 0.0015)), ...share(event));
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
-      if (!inPicture(event)) return;
+      if (!inPicture(event) || (painting(event) && event.button === 0)) return;
       pointing = event.shiftKey && event.button === 0;
       if (pointing) point(event);
       else last = share(event);
@@ -215,7 +231,7 @@
       const box = timeline.getBoundingClientRect();
       report("picked", String((event.clientX - box.left) / box.width));
     }, { capture: true });
-    window.addEventListener("dblclick", (event) => { if (inPicture(event)) showEndoscope(); }, { capture: true });
+    window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }
 
   // ---- Tell the server what has been drawn, and when a drag is over ------------------------------------------------
@@ -292,6 +308,7 @@
   window.carts = {
     view, showEndoscope, showScene,
     toggleView: () => (view.endoscope ? showScene() : showEndoscope()),
-    zoomAt,
+    zoomAt, imageOnScreen, report,
+    drawnOverlay: () => drawnTexture,
   };
 })();

@@ -2,6 +2,7 @@
 
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import cv2
@@ -47,15 +48,12 @@ class Layer:
         return cls(bytes(data))
 
     def pixels(self) -> UInt8[np.ndarray, "height width"]:
-        """The PNG's values.
+        """The PNG's values, not to be written to.
 
         Raises:
             ProjectError: the PNG is damaged.
         """
-        image = cv2.imdecode(np.frombuffer(self.png, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape[::-1] != self.size:
-            raise ProjectError("a painted layer is damaged. Undo to before it was painted, or paint it anew.")
-        return image.astype(np.uint8, copy=False)
+        return _decoded(self.png, self.size)
 
 
 class MaskCorrection(Layer):
@@ -108,6 +106,17 @@ class IgnoreRegion(Layer):
     def region(self) -> Bool[np.ndarray, "height width"]:
         """True where pixels are ignored."""
         return self.pixels() == _IGNORED
+
+
+@lru_cache(maxsize=8)
+def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+    """A layer is read several times for each stroke, by the overlay, the scores and the panels."""
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape[::-1] != size:
+        raise ProjectError("a painted layer is damaged. Undo to before it was painted, or paint it anew.")
+    image = image.astype(np.uint8, copy=False)
+    image.flags.writeable = False
+    return image
 
 
 def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:

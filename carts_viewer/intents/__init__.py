@@ -49,6 +49,14 @@ from .optimizing import SetFreeGroup as SetFreeGroup
 from .optimizing import SetFreeJoint as SetFreeJoint
 from .optimizing import SetSetting as SetSetting
 from .optimizing import Step as Step
+from .painting import ClearLayer as ClearLayer
+from .painting import Paint as Paint
+from .painting import Painting as Painting
+from .painting import ScaleBrush as ScaleBrush
+from .painting import SetDiameter as SetDiameter
+from .painting import SetTarget as SetTarget
+from .painting import SetTool as SetTool
+from .painting import ToggleTool as ToggleTool
 from .posing import BackToMeasured as BackToMeasured
 from .posing import ChooseJoint as ChooseJoint
 from .posing import Nudge as Nudge

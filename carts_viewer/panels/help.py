@@ -8,7 +8,7 @@ from carts_core.resources import static_dir
 from carts_viewer import intents as ask
 from carts_viewer.keys import Shortcut, key_table, shortcuts
 from carts_viewer.layers import Layer
-from carts_viewer.page import Page
+from carts_viewer.page import OWN_KEYS, Page
 from carts_viewer.panels.inputs import Emit
 
 
@@ -17,9 +17,14 @@ class HelpPanel:
 
     def __init__(self, page: Page, layers: list[Layer], perturb: Callable[[], ask.Intent], emit: Emit) -> None:
         gui = page.server.gui
+        own = {}
         for shortcut in shortcuts(layers):
-            command = gui.add_command(shortcut.label, hotkey=shortcut.hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
+            hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
+            command = gui.add_command(shortcut.label, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             _listen(page, command, shortcut, perturb, emit)
+            if hotkey is None and isinstance(shortcut.action, ask.Intent):
+                own[shortcut.hotkey] = shortcut.action
+        page.on_pressed(lambda key: emit(own[key]) if key in own else None)
         text = (static_dir() / "help.md").read_text(encoding="utf-8")
         gui.add_markdown(text.replace("{shortcuts}", key_table(layers)))
 

@@ -70,6 +70,12 @@ def escaped(text: str) -> str:
     return html.escape(text, quote=True)
 
 
+def swatch(color: tuple[int, int, int], name: str) -> str:
+    """An entry of a legend, as HTML."""
+    square = f'<span class="carts-swatch" style="background: rgb{color}"></span>'
+    return f'<span class="carts-key">{square}{escaped(name)}</span>'
+
+
 def humanized(name: str) -> str:
     """A joint's or field's identifier as people write it: `outer_yaw_joint` -> `Outer yaw`."""
     words = name.removesuffix("_joint").replace("_", " ").replace("-", " ").strip()

@@ -3,7 +3,7 @@
 from carts_viewer import intents as ask
 from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
 from carts_viewer.page import Page
-from carts_viewer.panels.inputs import Emit, Waits, escaped, on_input, write
+from carts_viewer.panels.inputs import Emit, Waits, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
@@ -34,12 +34,12 @@ class OverlayPanel:
     def _explain(self, state: ViewState) -> str:
         if state.layer in (Layer.MASK, Layer.CONTOUR):
             return " ".join(
-                _swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
+                swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
             )
         if state.layer is Layer.TRUTH:
             if state.frame.masks is None or state.camera not in state.frame.masks:
                 return "This frame has no true mask to compare with."
-            return " ".join(_swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
+            return " ".join(swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
         if state.layer is Layer.ATTENTION:
             return '<span class="carts-ramp"></span> 0 (left out) to 1 (counts fully)'
         if state.layer is Layer.SIMILARITY:
@@ -53,8 +53,3 @@ def offered_layers(session: Session) -> list[Layer]:
     cameras = [camera.name for camera in sequence.scene.cameras]
     truth = any(sequence.has_masks(camera, domain) for camera in cameras for domain in sequence.domains)
     return [layer for layer in Layer if truth or layer is not Layer.TRUTH]
-
-
-def _swatch(color: tuple[int, int, int], name: str) -> str:
-    square = f'<span class="carts-swatch" style="background: rgb{color}"></span>'
-    return f'<span class="carts-key">{square}{escaped(name)}</span>'

@@ -1,0 +1,113 @@
+"""Brush, eraser and polygon: which one is in hand, what it paints on, and what was painted on this frame."""
+
+import viser
+
+from carts_viewer import intents as ask
+from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR
+from carts_viewer.page import Page
+from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.strokes import DIAMETERS, Target, Tool
+
+_ICONS = {
+    Tool.OFF: viser.Icon.POINTER,
+    Tool.BRUSH: viser.Icon.BRUSH,
+    Tool.ERASER: viser.Icon.ERASER,
+    Tool.POLYGON: viser.Icon.POLYGON,
+}
+_HINTS = {
+    Tool.OFF: "Take a tool to correct the mask, or to hide occluders from the optimizer.",
+    Tool.BRUSH: "<b>Drag</b> to paint, with <b>Shift</b> to erase.",
+    Tool.ERASER: "<b>Drag</b> to erase, with <b>Shift</b> to paint.",
+    Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
+    "<b>Backspace</b> takes back a corner.",
+}
+_MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
+
+
+class PaintPanel:
+    """Tools and layers; it also tells every tab's page what is in hand."""
+
+    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+        gui = page.server.gui
+        self._page, self._scene, self._waits = page, session.scene, waits
+        self._told: dict[str, object] = self._message(state)
+        with gui.add_folder("Paint", expand_by_default=False):
+            self._tools = {tool: gui.add_button(str(tool), icon=icon) for tool, icon in _ICONS.items()}
+            for first in range(0, len(Tool), 2):
+                page.row(*list(self._tools.values())[first : first + 2])
+            self._targets = {target: gui.add_button(str(target)) for target in Target}
+            page.row(*self._targets.values(), weights=(2, 3))
+            self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
+            self._text = gui.add_html("")
+            self._clear = gui.add_button("Clear", icon=viser.Icon.TRASH, color="gray")
+        for tool, button in self._tools.items():
+            on_click(button, lambda _, tool=tool: ask.SetTool(tool), emit)
+        for target, button in self._targets.items():
+            on_click(button, lambda _, target=target: ask.SetTarget(target), emit)
+        on_input(self._size, ask.SetDiameter, emit)
+        on_click(self._clear, lambda _: ask.ClearLayer(), emit)
+
+        @page.server.on_client_connect
+        async def _(client: viser.ClientHandle) -> None:
+            page.tell(client, "setBrush", self._told)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets, and the pages' scripts, up to date."""
+        brush = state.brush
+        for tool, button in self._tools.items():
+            _press(button, tool is brush.tool)
+        for target, button in self._targets.items():
+            _press(button, target is brush.target)
+        if not self._waits(ask.SetDiameter):
+            write(self._size, brush.diameter)
+        self._size.disabled = brush.tool is Tool.POLYGON
+        layer = state.mask_correction if brush.target is Target.MASK else state.ignore_region
+        self._clear.label = "Clear the correction" if brush.target is Target.MASK else "Clear the ignore region"
+        self._clear.disabled = layer is None
+        hint = f"{_HINTS[brush.tool]} {_MOVING}" if brush.tool is not Tool.OFF else _HINTS[brush.tool]
+        if brush.target is Target.IGNORE and state.settings.loss != "surface":
+            hint += f" The loss <b>{state.settings.loss}</b> does not use the ignore region; <b>surface</b> does."
+        self._text.content = f'<p class="carts-caption">{hint}<br>{_counts(state)}</p>'
+        message = self._message(state)
+        if message != self._told:
+            self._told = message
+            for client in self._page.server.get_clients().values():
+                self._page.tell(client, "setBrush", message)
+
+    def _message(self, state: ViewState) -> dict[str, object]:
+        """What a page must know to draw strokes by itself."""
+        camera, brush = self._scene.camera(state.camera), state.brush
+        add, erase = (ADDED_COLOR, REMOVED_COLOR) if brush.target is Target.MASK else (IGNORED_COLOR, (255, 255, 255))
+        return {
+            "tool": brush.tool.lower(),
+            "target": brush.target,
+            "diameter": brush.diameter,
+            "frame": state.index,
+            "camera": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "colors": {"add": f"rgb{add}", "erase": f"rgb{erase}"},
+        }
+
+
+def _press(button: viser.GuiButtonHandle, on: bool) -> None:
+    color = "teal" if on else "gray"
+    if button.color != color:
+        button.color = color
+
+
+def _counts(state: ViewState) -> str:
+    """How many pixels of which colour there are."""
+    correction, region = state.mask_correction, state.ignore_region
+    added, removed = (0, 0) if correction is None else (correction.added().sum(), correction.removed().sum())
+    ignored = 0 if region is None else region.region().sum()
+    return " ".join(
+        swatch(color, f"{count} px {name}")
+        for color, count, name in (
+            (ADDED_COLOR, added, "added"),
+            (REMOVED_COLOR, removed, "removed"),
+            (IGNORED_COLOR, ignored, "ignored"),
+        )
+    )

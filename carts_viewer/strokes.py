@@ -1,0 +1,165 @@
+"""What people draw over a frame: tools, strokes as a browser sends them, and what strokes do to painted layers."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from carts_core.camera import Camera
+from carts_core.errors import SettingsError
+from carts_core.project import IgnoreRegion, MaskCorrection
+
+DIAMETERS = (1, 300)
+"""Thinnest and thickest brush [px]."""
+LONGEST_STROKE = 20_000
+"""Points; the page begins another stroke there."""
+_LONGEST_TEXT = 32 * LONGEST_STROKE
+_FRACTION_BITS = 4
+"""OpenCV draws to 1/16 of a pixel."""
+
+Mask = Bool[np.ndarray, "height width"]
+
+
+class Tool(StrEnum):
+    """What the pointer does to the picture; the value is what people read."""
+
+    OFF = "Off"
+    BRUSH = "Brush"
+    ERASER = "Eraser"
+    POLYGON = "Polygon"
+
+
+class Target(StrEnum):
+    """The layer that a stroke changes; the value is what people read."""
+
+    MASK = "Mask"
+    IGNORE = "Ignore region"
+
+
+@dataclass(frozen=True)
+class Brush:
+    """What is in everybody's hand."""
+
+    tool: Tool = Tool.OFF
+    target: Target = Target.MASK
+    diameter: int = 20
+    """[px]"""
+    painted: Mapping[int, int] = field(default_factory=dict)
+    """Number of each tab's last stroke that has been dealt with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """One stroke or polygon, checked and clamped."""
+
+    number: int
+    """The tab's own count of its strokes."""
+    frame: int
+    """Index of the frame that it was drawn over, whatever is shown now."""
+    camera: str
+    target: Target
+    erase: bool
+    polygon: bool
+    diameter: int
+    """[px]; a polygon has none."""
+    points: Float[np.ndarray, "points 2"]
+    """(u, v) [px], at most one image size beyond the image."""
+
+    def covers(self, camera: Camera) -> Mask:
+        """The pixels of the camera's image that it covers."""
+        canvas = np.zeros((camera.height, camera.width), np.uint8)
+        # OpenCV counts from the centre of a pixel, we from its corner.
+        line = np.rint((self.points - 0.5) * 2**_FRACTION_BITS).astype(np.int32)
+        if self.polygon:
+            cv2.fillPoly(canvas, [line], 1, cv2.LINE_8, _FRACTION_BITS)
+        elif len(line) == 1:
+            radius = round(self.diameter / 2 * 2**_FRACTION_BITS)
+            cv2.circle(canvas, line[0].tolist(), radius, 1, cv2.FILLED, cv2.LINE_8, _FRACTION_BITS)
+        else:
+            cv2.polylines(canvas, [line], False, 1, self.diameter, cv2.LINE_8, _FRACTION_BITS)
+        return canvas.astype(bool)
+
+
+def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera]) -> Stroke:
+    """A stroke as a browser sends it, JSON text, which is not trusted.
+
+    Args:
+        text: what came.
+        frames: how many frames there are.
+        cameras: by name.
+
+    Raises:
+        SettingsError: it is no stroke over one of these frames and cameras. Points beyond the image and a brush that
+            is too thick are clamped instead.
+    """
+    if len(text) > _LONGEST_TEXT:
+        raise SettingsError(
+            f"a stroke of {len(text)} characters came; at most {_LONGEST_TEXT} are taken. Draw it in parts."
+        )
+    try:
+        values = json.loads(text)
+        camera = cameras[values["camera"]]
+        return Stroke(
+            number=_whole(values["number"], 2**53),
+            frame=_whole(values["frame"], frames),
+            camera=camera.name,
+            target=Target(values["target"]),
+            erase=values["erase"] is True,
+            polygon=values["polygon"] is True,
+            diameter=_diameter(values["diameter"]),
+            points=_points(values["points"], camera, 3 if values["polygon"] is True else 1),
+        )
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise SettingsError(
+            f"what came is no stroke over one of {frames} frames of {', '.join(cameras)} "
+            f"({type(error).__name__}: {str(error)[:200]}). Draw it with the page of this viewer."
+        ) from error
+
+
+def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase: bool) -> MaskCorrection | None:
+    """The correction after a stroke that adds pixels to the mask or takes them out; None if none is left.
+
+    What is rendered anyway needs no adding, and what is not rendered no removing.
+    """
+    nothing = np.zeros_like(stroke)
+    added, removed = (nothing, nothing) if old is None else (old.added(), old.removed())
+    if erase:
+        added, removed = added & ~stroke, removed | (stroke & rendered)
+    else:
+        added, removed = added | (stroke & ~rendered), removed & ~stroke
+    return MaskCorrection.of(added & ~removed, removed) if added.any() or removed.any() else None
+
+
+def ignored(old: IgnoreRegion | None, stroke: Mask, *, erase: bool) -> IgnoreRegion | None:
+    """The ignore region after a stroke; None if none is left."""
+    region = np.zeros_like(stroke) if old is None else old.region()
+    region = region & ~stroke if erase else region | stroke
+    return IgnoreRegion.of(region) if region.any() else None
+
+
+def _whole(value: Any, end: int) -> int:
+    if type(value) is not int or not 0 <= value < end:
+        raise ValueError(f"{value!r:.40} is not a whole number from 0 to {end - 1}")
+    return value
+
+
+def _diameter(value: Any) -> int:
+    if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
+        raise ValueError(f"{value!r:.40} is no diameter")
+    return round(min(max(value, DIAMETERS[0]), DIAMETERS[1]))
+
+
+def _points(value: Any, camera: Camera, fewest: int) -> Float[np.ndarray, "points 2"]:
+    if not isinstance(value, list) or not fewest <= len(value) <= LONGEST_STROKE:
+        raise ValueError(f"not a list of {fewest} to {LONGEST_STROKE} points")
+    points = np.array(value, float)
+    if points.shape != (len(value), 2) or not np.isfinite(points).all():
+        raise ValueError("a point is not a pair of finite numbers")
+    size = np.array([camera.width, camera.height], float)
+    return np.clip(points, -size, 2 * size)

@@ -1,0 +1,278 @@
+// Brush, eraser and polygon. A stroke is drawn here at once and sent when it is finished; as soon as the server's
+// overlay shows it, it is drawn here no more. Needs page.js.
+(() => {
+  "use strict";
+
+  const SPACING = 0.7; // between points that are kept [px of the image]
+  const LONGEST = 15000; // points, then another stroke begins; the server takes 20,000
+  const NEAR = 9; // of the first corner, where a click closes the polygon [px of the screen]
+  const SHOWN_BY_NOW = 250; // [ms] after the server's word, if no new overlay is noticed
+  const FORGOTTEN = 60000; // [ms] a stroke that the server has never answered
+
+  let brush = { tool: "off" }; // what the server says
+  let canvas = null;
+  let drawing = null; // the stroke under the pointer, or the polygon that is not closed yet
+  let pending = []; // sent, and not seen in an overlay yet
+  let count = 0;
+  let pointer = null; // in the image [px]
+  let shift = false;
+  let drawn = "";
+  let dirty = true;
+
+  const active = () => brush.tool !== "off" && window.carts?.view.endoscope;
+  const place = () => window.carts?.imageOnScreen();
+
+  function inImage(event) {
+    const image = place();
+    if (!image) return null;
+    const box = canvas.getBoundingClientRect();
+    return [
+      ((event.clientX - box.left - image.left) / image.width) * brush.width,
+      ((event.clientY - box.top - image.top) / image.height) * brush.height,
+    ];
+  }
+
+  /** Distance of two places of the image on the screen [px]. */
+  function apart(a, b) {
+    const image = place();
+    return Math.hypot(((a[0] - b[0]) * image.width) / brush.width, ((a[1] - b[1]) * image.height) / brush.height);
+  }
+
+  function begin(point) {
+    const { frame, camera, target, diameter, tool, colors } = brush;
+    drawing = {
+      frame, camera, target, diameter, polygon: tool === "polygon", erase: (tool === "eraser") !== shift,
+      points: [point], colors,
+    };
+  }
+
+  function add(point) {
+    const last = drawing.points[drawing.points.length - 1];
+    if (Math.hypot(point[0] - last[0], point[1] - last[1]) < SPACING) return;
+    drawing.points.push(point);
+    if (drawing.points.length >= LONGEST && !drawing.polygon) {
+      finish();
+      begin(point);
+    }
+  }
+
+  /** Send what was drawn. */
+  function finish() {
+    const stroke = drawing;
+    drawing = null;
+    dirty = true;
+    if (!stroke) return;
+    if (stroke.polygon) {
+      if (stroke.points.length < 3) return;
+      stroke.erase = shift;
+    }
+    stroke.number = ++count;
+    stroke.sent = performance.now();
+    pending.push(stroke);
+    const { number, frame, camera, target, erase, polygon, diameter } = stroke;
+    const points = stroke.points.map((point) => point.map((value) => Math.round(value * 10) / 10));
+    window.carts.report("painted", JSON.stringify({ number, frame, camera, target, erase, polygon, diameter, points }));
+  }
+
+  function drop() {
+    drawing = null;
+    dirty = true;
+  }
+
+  // ---- Pointer and keys --------------------------------------------------------------------------------------------
+
+  function press(event) {
+    if (event.button !== 0) return;
+    const point = inImage(event);
+    if (!point) return;
+    event.preventDefault();
+    document.activeElement?.blur?.();
+    shift = event.shiftKey;
+    if (brush.tool !== "polygon") {
+      canvas.setPointerCapture(event.pointerId);
+      begin(point);
+    } else if (!drawing) {
+      begin(point);
+    } else if (drawing.points.length > 2 && apart(point, drawing.points[0]) < NEAR) {
+      finish();
+    } else if (apart(point, drawing.points[drawing.points.length - 1]) > 3) {
+      add(point);
+    }
+    dirty = true;
+  }
+
+  function move(event) {
+    pointer = inImage(event);
+    shift = event.shiftKey;
+    dirty = true;
+    if (!drawing || drawing.polygon) return;
+    const moves = event.getCoalescedEvents?.() ?? [];
+    for (const one of moves.length ? moves : [event]) add(inImage(one));
+  }
+
+  function release(event) {
+    if (event.button === 0 && drawing && !drawing.polygon) finish();
+  }
+
+  function onKey(event) {
+    const typing = event.target instanceof Element && event.target.closest("input, textarea, [role=dialog]");
+    if (event.key === "Shift") { shift = event.type === "keydown"; dirty = true; }
+    if (event.type !== "keydown" || typing || event.ctrlKey || event.metaKey) return;
+    const key = event.key.toLowerCase();
+    if (drawing && ["escape", "enter", "backspace"].includes(key)) {
+      if (key === "escape") drop();
+      else if (key === "enter" && drawing.polygon) finish();
+      else if (key === "backspace" && drawing.polygon && drawing.points.pop() && !drawing.points.length) drop();
+      dirty = true;
+    } else if (!window.cartsConfiguration.keys.includes(key) || (key === "escape" && !active())) {
+      return;
+    } else {
+      window.carts.report("pressed", key);
+    }
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  // ---- Drawing -----------------------------------------------------------------------------------------------------
+
+  function build() {
+    const below = window.__viserMutable?.canvas;
+    if (!below || canvas?.isConnected) return;
+    canvas = document.createElement("canvas");
+    canvas.className = "carts-paint";
+    canvas.addEventListener("pointerdown", press);
+    canvas.addEventListener("pointermove", move);
+    canvas.addEventListener("pointerup", release);
+    canvas.addEventListener("pointercancel", finish);
+    canvas.addEventListener("pointerleave", () => { pointer = null; dirty = true; });
+    canvas.addEventListener("dblclick", () => { if (drawing?.polygon) finish(); });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    below.parentElement.append(canvas);
+  }
+
+  function path(context, stroke, image, closed) {
+    const [x, y] = [image.width / brush.width, image.height / brush.height];
+    context.beginPath();
+    // A single point twice: it is drawn by the round ends of the line.
+    const points = stroke.points.length === 1 ? [...stroke.points, ...stroke.points] : stroke.points;
+    for (const [u, v] of points) context.lineTo(u * x, v * y);
+    if (closed) context.closePath();
+    return x;
+  }
+
+  function paint(context, stroke, image, finished) {
+    const color = stroke.erase ? stroke.colors.erase : stroke.colors.add;
+    context.globalAlpha = 0.55;
+    context.fillStyle = context.strokeStyle = color;
+    context.lineCap = context.lineJoin = "round";
+    const scale = path(context, stroke, image, stroke.polygon && finished);
+    if (!stroke.polygon) {
+      context.lineWidth = stroke.diameter * scale;
+      context.stroke();
+      return;
+    }
+    context.fill();
+    if (finished) return;
+    context.globalAlpha = 1;
+    context.lineWidth = 1.5;
+    context.stroke();
+    const [u, v] = stroke.points[0];
+    ring(context, u * scale, (v * image.height) / brush.height, 4);
+  }
+
+  function ring(context, x, y, radius) {
+    context.globalAlpha = 1;
+    for (const [color, width] of [["rgba(0, 0, 0, 0.7)", 3], ["white", 1.25]]) {
+      context.strokeStyle = color;
+      context.lineWidth = width;
+      context.beginPath();
+      context.arc(x, y, Math.max(radius, 1), 0, 2 * Math.PI);
+      context.stroke();
+    }
+  }
+
+  function redraw(image) {
+    const ratio = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    }
+    const context = canvas.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    if (!image || !brush.width) return;
+    context.translate(image.left, image.top);
+    context.save();
+    context.beginPath();
+    context.rect(0, 0, image.width, image.height);
+    context.clip();
+    for (const stroke of pending) {
+      if (stroke.frame === brush.frame && stroke.camera === brush.camera) paint(context, stroke, image, true);
+    }
+    if (drawing) {
+      const towards = drawing.polygon && pointer ? [...drawing.points, pointer] : drawing.points;
+      paint(context, { ...drawing, points: towards, erase: drawing.polygon ? shift : drawing.erase }, image, false);
+    }
+    context.restore();
+    if (pointer && active() && brush.tool !== "polygon") {
+      const scale = image.width / brush.width;
+      ring(context, pointer[0] * scale, (pointer[1] * image.height) / brush.height, (brush.diameter / 2) * scale);
+    }
+  }
+
+  /** With a tool in hand the pointer is ours, without one it moves the picture. */
+  function takePointer(on) {
+    canvas.style.pointerEvents = on ? "auto" : "none";
+    canvas.style.cursor = brush.tool === "polygon" ? "crosshair" : "none";
+  }
+
+  function everyFrame() {
+    requestAnimationFrame(everyFrame);
+    build();
+    if (!canvas) return;
+    const image = window.carts.imageOnScreen();
+    const on = active();
+    takePointer(on);
+    const now = performance.now();
+    const texture = window.carts.drawnOverlay();
+    const left = pending.filter((stroke) => {
+      if (!stroke.done) return now - stroke.sent < FORGOTTEN;
+      return texture === stroke.texture && now - stroke.done < SHOWN_BY_NOW;
+    });
+    const where = JSON.stringify([image, on, canvas.clientWidth, canvas.clientHeight, window.devicePixelRatio]);
+    if (left.length !== pending.length || where !== drawn) dirty = true;
+    pending = left;
+    if (!dirty) return;
+    [dirty, drawn] = [false, where];
+    redraw(image);
+  }
+
+  window.addEventListener("keydown", onKey, { capture: true });
+  window.addEventListener("keyup", onKey, { capture: true });
+  Object.assign(window.carts, {
+    /** What is in hand, over which frame. */
+    setBrush(message) {
+      const other = message.frame !== brush.frame || message.camera !== brush.camera;
+      if (drawing && (other || message.tool !== brush.tool)) {
+        // A stroke belongs to the frame that it was begun on; a polygon without its last corners is nothing.
+        if (drawing.polygon) drop();
+        else finish();
+      }
+      brush = message;
+      dirty = true;
+      if (canvas) takePointer(active());
+    },
+    /** The server has dealt with all strokes up to this one, and sent the overlay that shows them. */
+    painted(number) {
+      for (const stroke of pending) {
+        if (stroke.number <= number) {
+          stroke.done ??= performance.now();
+          stroke.texture ??= window.carts.drawnOverlay();
+        }
+      }
+    },
+    brush: () => brush,
+    pendingStrokes: () => pending.length,
+  });
+  everyFrame();
+})();
