@@ -46,7 +46,7 @@ def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source:
         source: fingerprint of the images and kinematics.
     """
     method = METHODS[run.method]
-    settings = asdict(method.settings(scope.paper_iterations)) if method.settings else {}
+    settings = asdict(method.settings(scope.steps(run))) if method.settings else {}
     company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
     parts = (settings, company, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from .measurement import Measurement
+from .scope import PAPERS_STEPS
 from .statistics import Measurements
 
-PAPERS_STEPS = 50
 GAINED = 0.01
 """Dice that the paper's setting has to gain, or there is nothing to be faster at."""
 

@@ -121,7 +121,7 @@ class _Bench:
         background = {} if len(cameras) > 1 or covered else {camera: recording.background(camera, run.domain)}
         ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
-        settings = method.settings(scope.paper_iterations)
+        settings = method.settings(scope.steps(run))
         scene = known.with_cameras(cameras)
         return optimize(run, scene, frame, background, extractor, settings, truth, renderer, ignore)
 

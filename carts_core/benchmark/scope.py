@@ -7,6 +7,8 @@ from ..synthesis.config import DOMAINS
 
 SYNTHETIC = "synthetic"
 REAL = "real"
+PAPERS_STEPS = 50
+"""The paper's number of steps."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Scope:
     samples: int
     """Paths per pixel of the synthetic sequence."""
     paper_iterations: int
-    """Steps in the paper's setting. Its schedule does not depend on their number, so one run holds all shorter ones."""
+    """Steps in the paper's setting from the measured joint positions, `PAPERS_STEPS` at most from others. Its schedule
+    does not depend on their number, so one run holds all shorter ones."""
     error_domains: tuple[str, ...]
     """Synthetic domains in which the start is put off on purpose."""
     errors_deg: tuple[float, ...]
@@ -55,6 +58,10 @@ class Scope:
     calibration_frames: int
     """Frames of a real sequence that are calibrated with, evenly spread."""
 
+    def steps(self, run: Run) -> int:
+        """Steps in the paper's setting for a run."""
+        return self.paper_iterations if run.error_deg is None else min(self.paper_iterations, PAPERS_STEPS)
+
     def with_frames(self, frames: int) -> "Scope":
         """The same with another number of evaluated frames.
 
@@ -70,10 +77,10 @@ class Scope:
 
 
 QUICK = Scope(
-    frames=3,
+    frames=2,
     sequence_frames=3,
     samples=4,
-    paper_iterations=50,
+    paper_iterations=PAPERS_STEPS,
     error_domains=("regular",),
     errors_deg=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
     paper_errors_deg=(2.0,),
@@ -84,8 +91,8 @@ QUICK = Scope(
     calibration_frames=8,
 )
 FULL = Scope(
-    frames=12,
-    sequence_frames=24,
+    frames=6,
+    sequence_frames=12,
     samples=8,
     paper_iterations=100,
     error_domains=DOMAINS,

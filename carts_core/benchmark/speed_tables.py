@@ -6,7 +6,8 @@ from statistics import median
 from .measurement import Measurement
 from .methods import METHODS
 from .occlusion import OCCLUSION
-from .pairing import GAINED, PAPERS_STEPS, pairs
+from .pairing import GAINED, pairs
+from .scope import PAPERS_STEPS
 from .speed_targets import NEAR_FINAL, steps_to_final
 from .statistics import Measurements, Spread
 from .tables import DOMAIN_LABELS, NOTHING, Cell, Table, begun
@@ -17,8 +18,8 @@ def speed_table(data: Measurements) -> Table:
     rows = []
     for source in data.sources():
         for method, entry in METHODS.items():
-            # Sequence mode has a table of its own: its frames are of several kinds.
-            if entry.together:
+            # These have tables of their own: a frame's time is not the whole of it.
+            if entry.together or entry.calibrated:
                 continue
             chosen = data.of(source=source, method=method)
             if not chosen:
