@@ -3,12 +3,11 @@
 from statistics import mean
 
 from ..synthesis.config import DOMAINS
-from .methods import METHODS
 from .occlusion import OCCLUSION, SHARE
 from .scope import REAL, SYNTHETIC
 from .statistics import Measurements
 from .tables import DOMAIN_LABELS
-from .target import Target, make_target
+from .target import Target, counted, make_target
 
 _RECOVERED = 0.95
 
@@ -62,7 +61,7 @@ def _joint_error(data: Measurements, error: float, most: float) -> Target:
         f"synthetic, {error:g}° off: joint MAE, visible joints",
         most,
         mean(visible) if visible else None,
-        (f"mean over {len(visible)} runs" if visible else "which joints are visible is not reported") + also,
+        (f"mean over {counted(len(visible), 'run')}" if visible else "which joints are visible is not reported") + also,
         at_least=False,
         text=lambda value: f"{value:.2f}°",
         reference=f"paper, S-Reg: {paper}",
@@ -75,7 +74,7 @@ def _recovery(data: Measurements) -> Target:
         f"synthetic, 5° off: frames recovered to a Dice of {_RECOVERED}",
         0.8,
         mean(recovered) if recovered else None,
-        f"{sum(recovered)} of {len(recovered)} runs",
+        f"{sum(recovered)} of {counted(len(recovered), 'run')}",
         at_least=True,
         text=lambda value: f"{100 * value:.0f} %",
         reference="paper: falls below an initial Dice of 75",
@@ -95,7 +94,7 @@ def _real_dice(data: Measurements, what: str, method: str, least: float) -> Targ
         what,
         least,
         mean(m.final.dice for m in runs) if runs else None,
-        f"mean over {len(runs)} frames of the first camera",
+        f"mean over {counted(len(runs), 'frame')} of the first camera",
         at_least=True,
         text=lambda value: f"{value:.3f}",
         reference=f"{without}mask as target: 0.968",
@@ -130,27 +129,34 @@ def _made_worse(data: Measurements) -> Target:
         "frames made worse than their start",
         0.01,
         len(worse) / len(runs) if runs else None,
-        f"{len(worse)} of {len(runs)} runs lost more than 0.01 Dice; {from_truth} of them started at the true joints, "
-        f"{covered} had occluders",
+        f"{len(worse)} of {counted(len(runs), 'run')} lost more than 0.01 Dice; {from_truth} of them started at the "
+        f"true joints, {covered} had occluders",
         at_least=False,
         text=lambda value: f"{100 * value:.1f} %",
     )
 
 
 def _occlusion(data: Measurements) -> Target:
+    told = {"ours": "nothing said", "ours_told": "occluder given", "ours_proposed": "mask proposed"}
     means = {
-        (source, method): mean(m.final.dice for m in runs)
+        source: {
+            method: mean(m.final.dice for m in runs)
+            for method in told
+            if (runs := data.of(source=source, domain=OCCLUSION, method=method, error_deg=None))
+        }
         for source in (SYNTHETIC, REAL)
-        for method in ("ours", "ours_told", "ours_proposed")
-        if (runs := data.of(source=source, domain=OCCLUSION, method=method, error_deg=None))
     }
-    alone = [value for (_, method), value in means.items() if method == "ours"]
+    alone = [found["ours"] for found in means.values() if "ours" in found]
+    texts = (
+        f"{source}: " + ", ".join(f"{told[method]} {value:.3f}" for method, value in found.items())
+        for source, found in means.items()
+        if found
+    )
     return make_target(
         f"{100 * SHARE:.0f} % of the visible instrument occluded: mean Dice of the rest",
         0.95,
         min(alone) if alone else None,
-        "nothing said of the occluder, the worse of synthetic and real frames; "
-        + ", ".join(f"{source}, {METHODS[method].label}: {value:.3f}" for (source, method), value in means.items()),
+        "; ".join(("nothing said of the occluder, the worse of synthetic and real frames", *texts)),
         at_least=True,
         text=lambda value: f"{value:.3f}",
         reference="paper: excludes occlusion",

@@ -51,7 +51,14 @@ class Truth:
         return Score(None, *self._overlap(mask), None, None, None, seconds)
 
     def score(
-        self, state: SceneState, known: Uncertainty | None, loss: float | None, renderer: Renderer, seconds: float
+        self,
+        state: SceneState,
+        known: Uncertainty | None,
+        loss: float | None,
+        renderer: Renderer,
+        seconds: float,
+        *,
+        depth: bool = True,
     ) -> Score:
         """The score of an estimate.
 
@@ -61,6 +68,7 @@ class Truth:
             loss: the optimizer's.
             renderer: of the camera, at its size.
             seconds: until the estimate was known [s].
+            depth: whether to look for the tips, too, which takes longer than all the rest.
         """
         state, scene = state.to("cpu"), renderer.scene
         names = [arm.name for arm in scene.arms]
@@ -73,7 +81,9 @@ class Truth:
             visible_joint_mae_deg=None
             if visible is None
             else joint_mae_deg(scene, estimate, self.joint_positions, visible),
-            tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions),
+            tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
+            if depth
+            else None,
             seconds=seconds,
         )
 
@@ -169,7 +179,8 @@ def optimize(
         if iterate is None:
             break
         best.append(len(trace) if optimizer.best is iterate else best[-1])
-        trace.append(truth.score(iterate.state, iterate.uncertainty, iterate.loss, renderer, seconds))
+        known, first = iterate.uncertainty, not trace
+        trace.append(truth.score(iterate.state, known, iterate.loss, renderer, seconds, depth=first))
     assert optimizer.best is not None and optimizer.stop_reason is not None
     end = optimizer.best
     final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)

@@ -98,11 +98,11 @@ def sequence_table(data: Measurements) -> Table | None:
         *("s per warm frame", "also alone", "Dice alone", "Dice together"),
     )
     caption = (
-        "The first frames of each sequence from the measured kinematics, one knowing what the others found; see "
-        "docs/sequences.md. Seconds: median over frames that started at their neighbour's correction, reading the "
-        "image included. At the right the frames that were corrected alone, too."
+        "The first frames of each sequence from the measured kinematics, one knowing what the others found. Seconds: "
+        "median over frames that started at their neighbour's correction, reading the image included. At the right the "
+        "frames that were corrected alone, too."
     )
-    return Table("Sequence mode", caption, header, tuple(rows)) if rows else None
+    return Table("Frames corrected together", caption, header, tuple(rows)) if rows else None
 
 
 def _table(

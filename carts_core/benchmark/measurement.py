@@ -21,7 +21,8 @@ class Score:
     visible_joint_mae_deg: float | None
     """The same over those that the image determines; None where the optimizer does not report which."""
     tip_depth_mm: float | None
-    """Mean absolute error of the jaw tips along the camera's axis [mm]; None without true joint positions."""
+    """Mean absolute error of the jaw tips along the camera's axis [mm]; None without true joint positions, and on the
+    way from start to end."""
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
 

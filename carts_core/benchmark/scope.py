@@ -91,7 +91,7 @@ QUICK = Scope(
     calibration_frames=8,
 )
 FULL = Scope(
-    frames=6,
+    frames=8,
     sequence_frames=12,
     samples=8,
     paper_iterations=100,

@@ -35,7 +35,7 @@ def speed_table(data: Measurements) -> Table:
                     Cell(source),
                     Cell(entry.label),
                     Cell(str(len(chosen))),
-                    Cell(f"{steps.mean:.1f}"),
+                    Cell(f"{steps.mean:.1f}" if steps.mean else NOTHING),
                     Cell(f"{seconds.mean:.2f}"),
                     Cell(NOTHING if each is None else f"{1e3 * each:.0f}"),
                     Cell(NOTHING if worse is None or method == "start" else f"{100 * worse.mean:.1f} %"),

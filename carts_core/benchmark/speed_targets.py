@@ -5,9 +5,9 @@ from statistics import mean, median
 from .machine import on_gpu
 from .measurement import Measurement
 from .pairing import GAINED, pairs
-from .scope import SYNTHETIC
+from .scope import PAPERS_STEPS, SYNTHETIC
 from .statistics import Measurements
-from .target import Target, make_target
+from .target import Target, counted, make_target
 
 NEAR_FINAL = 0.005
 
@@ -30,8 +30,9 @@ def _speedup(data: Measurements) -> Target:
         "times faster than the paper's setting to equal Dice, same frames, same run",
         8.0,
         median(pair.ratio for pair in found) if found else None,
-        f"median over {len(found)} pairs of runs in which the paper's setting gained at least {GAINED} Dice: time to "
-        f"the Dice of its best of 50; {sum(pair.ours is None for pair in found)} never reach it and count as 0",
+        f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {GAINED} Dice: "
+        f"time to the Dice of its best of {PAPERS_STEPS}; {sum(pair.ours is None for pair in found)} never reach it and "
+        "count as 0",
         at_least=True,
         text=lambda value: f"{value:.1f}",
     )
@@ -43,7 +44,7 @@ def _iterations(data: Measurements) -> Target:
         f"iterations to within {NEAR_FINAL} of the final Dice, 2° off",
         10.0,
         float(median(counts)) if counts else None,
-        f"median over {len(counts)} runs",
+        f"median over {counted(len(counts), 'run')}",
         at_least=False,
         text=lambda value: f"{value:g}",
         reference="paper: 30 to 50",
@@ -56,7 +57,7 @@ def _seconds(data: Measurements) -> Target:
         "seconds per frame, cold start, 2° off, two arms, 640x480",
         1.0,
         mean(values) if values else None,
-        f"mean over {len(values)} runs",
+        f"mean over {counted(len(values), 'run')}",
         at_least=False,
         text=lambda value: f"{value:.2f} s",
         reference="original implementation: 30 iterations of 3.5 to 13.8 s",
@@ -64,17 +65,17 @@ def _seconds(data: Measurements) -> Target:
 
 
 def _warm_seconds(data: Measurements, *, gpu: bool) -> list[float]:
-    chosen = data.of(method="sequence")
+    chosen = data.of(source=SYNTHETIC, method="sequence")
     return [m.final.seconds for m in chosen if m.stopped == "warm" and on_gpu(m.machine) == gpu]
 
 
 def _sequence_seconds(data: Measurements) -> Target:
     seconds = _warm_seconds(data, gpu=False)
     return make_target(
-        "sequence mode, seconds per warm frame, CPU",
+        "sequence mode, seconds per warm frame, two arms, 640x480, CPU",
         0.3,
         median(seconds) if seconds else None,
-        f"median over {len(seconds)} frames, reading the image included",
+        f"median over {counted(len(seconds), 'frame')}, reading the image included",
         at_least=False,
         text=lambda value: f"{value:.2f} s",
     )
@@ -83,7 +84,7 @@ def _sequence_seconds(data: Measurements) -> Target:
 def _frames_per_second(data: Measurements) -> Target:
     seconds = _warm_seconds(data, gpu=True)
     return make_target(
-        "sequence mode, frames per second, GPU",
+        "sequence mode, frames per second, two arms, 640x480, GPU",
         30.0,
         1.0 / median(seconds) if seconds else None,
         f"from the median over {len(seconds)} warm frames, reading the image included",

@@ -46,3 +46,8 @@ def make_target(
         return Target(what, bound, "not measured", None, reference, basis)
     met = value >= least_or_most if at_least else value <= least_or_most
     return Target(what, bound, text(value), met if complete or not met else None, reference, basis)
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things, such as `1 run` and `2 runs`."""
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -37,7 +37,8 @@ def test_far_from_occluders_the_picture_is_what_it_was(picture) -> None:
 
 
 def test_the_same_seed_gives_the_same_occluders_and_another_one_others(picture) -> None:
-    first, again, other = (occlude(*picture, np.random.default_rng(seed)) for seed in (5, 5, 6))
+    image, mask = picture
+    first, again, other = (occlude(image, mask, np.random.default_rng(seed)) for seed in (5, 5, 6))
     assert np.array_equal(first.image, again.image) and np.array_equal(first.hidden, again.hidden)
     assert not np.array_equal(first.hidden, other.hidden)
 
