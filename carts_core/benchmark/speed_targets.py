@@ -30,9 +30,9 @@ def _speedup(data: Measurements) -> Target:
         "times faster than the paper's setting to equal Dice, same frames, same run",
         8.0,
         median(pair.ratio for pair in found) if found else None,
-        f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {GAINED} Dice: "
-        f"time to the Dice of its best of {PAPERS_STEPS}; {sum(pair.ours is None for pair in found)} never reach it and "
-        "count as 0",
+        f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {GAINED} "
+        f"Dice: time to the Dice of its best of {PAPERS_STEPS}; {sum(pair.ours is None for pair in found)} never reach "
+        "it and count as 0",
         at_least=True,
         text=lambda value: f"{value:.1f}",
     )
