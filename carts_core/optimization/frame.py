@@ -160,7 +160,7 @@ class FrameOptimizer:
             self.best, self._epoch = iterate, epoch
         self._offsets = self._restarted(epoch[1], solver)
         self.stop_reason = solver.finished
-        if self.stop_reason is not None and self.settings.propose_ignore and self._round == 0:
+        if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
         return iterate
 
