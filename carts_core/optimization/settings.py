@@ -57,7 +57,7 @@ class OptimizerSettings:
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
     propose_ignore: bool = False
     """`surface`: solve a frame again, from its start and in as many steps, without areas at the arms that contradicted
-    the first solution. Only where each frame is alone; for recordings with occluders, see docs/benchmark.md."""
+    the first solution. Only where each frame is alone. It does not always help: see docs/benchmark.md."""
     parts_weight: float = 0.1
     """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05
