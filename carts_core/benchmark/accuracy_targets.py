@@ -10,6 +10,8 @@ from .tables import DOMAIN_LABELS
 from .target import Target, counted, make_target
 
 _RECOVERED = 0.95
+_CONDITIONS = ("low_brightness", "bleeding", "smoke", "background_change")
+"""Of real frames."""
 
 
 def accuracy_targets(data: Measurements) -> list[Target]:
@@ -103,11 +105,7 @@ def _real_dice(data: Measurements, what: str, method: str, least: float) -> Targ
 
 def _real_robustness(data: Measurements) -> Target:
     clean = _real(data, "regular")
-    altered = {
-        domain: value
-        for domain in ("low_brightness", "bleeding", "smoke", "background_change")
-        if (value := _real(data, domain)) is not None
-    }
+    altered = {domain: value for domain in _CONDITIONS if (value := _real(data, domain)) is not None}
     worst = min(altered, key=lambda domain: altered[domain]) if altered else None
     return make_target(
         "real frames under low light, blood, smoke, other background: Dice lost against clean",
@@ -115,8 +113,9 @@ def _real_robustness(data: Measurements) -> Target:
         None if clean is None or worst is None else clean - altered[worst],
         _worst_of(altered, worst),
         at_least=False,
-        text=lambda value: f"{value:.3f}",
+        text=lambda value: f"{round(value, 3) + 0.0:.3f}",
         reference="paper: within 0.026",
+        complete=len(altered) == len(_CONDITIONS),
     )
 
 

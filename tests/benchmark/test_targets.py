@@ -65,7 +65,14 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
     near = make_measurement((0.87, 0.958), source="real", domain="smoke")
     far = make_measurement((0.87, 0.9), source="real", domain="bleeding")
     assert _target("real frames, each alone", clean).met is True
-    assert _target("real frames under", clean, near).met is True
+    assert _target("real frames under", clean, near).met is None
+    others = [
+        make_measurement((0.87, 0.965), source="real", domain=domain)
+        for domain in ("low_brightness", "bleeding", "background_change")
+    ]
+    assert _target("real frames under", clean, near, *others).met is True
+    same = _target("real frames under", clean, *others)
+    assert same.reached == "0.000"
     lost = _target("real frames under", clean, near, far)
     assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
 
