@@ -2,18 +2,18 @@
 
 from .measurement import Measurement as Measurement
 from .measurement import Score as Score
-from .plan import FULL as FULL
-from .plan import QUICK as QUICK
-from .plan import Run as Run
-from .plan import Scope as Scope
 from .plan import plan as plan
 from .report import Facts as Facts
 from .report import write_report as write_report
 from .runner import Benchmark as Benchmark
+from .scope import FULL as FULL
+from .scope import QUICK as QUICK
+from .scope import Run as Run
+from .scope import Scope as Scope
 from .sources import TEST_SEED as TEST_SEED
 from .sources import Source as Source
 from .sources import real_source as real_source
 from .sources import synthetic_source as synthetic_source
 from .store import ResultsFile as ResultsFile
-from .targets import Target as Target
+from .target import Target as Target
 from .targets import targets as targets

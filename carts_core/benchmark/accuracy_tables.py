@@ -5,7 +5,7 @@ from collections.abc import Callable
 from . import paper
 from .frame import TOLERANCE
 from .measurement import Score
-from .plan import SYNTHETIC
+from .scope import SYNTHETIC
 from .statistics import Measurements, Spread, scores
 from .tables import DOMAIN_LABELS, NOTHING, SHORT_LABELS, Cell, Table, paper_note, spread_text
 

@@ -43,11 +43,14 @@ class Counterfactual:
     """
 
     def __init__(self, sequence: Sequence, camera: str, backdrop: UInt8[np.ndarray, "h w 3"], seed: int) -> None:
-        self.scene = sequence.scene.with_cameras([camera])
+        self.scene, self.timestamps = sequence.scene, sequence.timestamps
         self.measured_joints = sequence.measured_joints
         self._sequence, self._camera, self._backdrop = sequence, camera, backdrop
         self._config = SynthesisConfig(seed=seed)
-        self._surface = RealSurface(self.scene, [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))])
+        self._surface = RealSurface(
+            sequence.scene.with_cameras([camera]),
+            [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))],
+        )
         strengths: DomainConfig = self._config.domain
         self._bleeding = Bleeding(_relief(seed), strengths, self._config.rng("bleeding"))
         self._smoke = Smoke(strengths, self._config.rng("smoke"))
@@ -57,10 +60,15 @@ class Counterfactual:
         self._lamp = np.pi * DISTANCE**2 * brightness / _REFLECTANCE
         self._backgrounds: dict[str, np.ndarray] = {}
 
+    def __len__(self) -> int:
+        return len(self._sequence)
+
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """A frame of the sequence with its image in a domain."""
+        """A frame of the sequence with its image in a domain; only the regular one has other cameras, too."""
         domain = domain or DOMAINS[0]
-        frame = self._sequence.frame(index, cameras=cameras or [self._camera])
+        if domain == DOMAINS[0]:
+            return dataclasses.replace(self._sequence.frame(index, cameras=cameras or [self._camera]), domain=domain)
+        frame = self._sequence.frame(index, cameras=[self._camera])
         assert frame.masks is not None
         image, mask = frame.images[self._camera], frame.masks[self._camera]
         altered = self._altered(domain, image, mask, frame.measured, self._time(index), index)
@@ -69,6 +77,8 @@ class Counterfactual:
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """The background under the domain's condition, averaged over some moments."""
         domain = domain or DOMAINS[0]
+        if domain == DOMAINS[0]:
+            return self._sequence.background(camera)
         if domain not in self._backgrounds:
             nothing = np.zeros(self._clean.shape[:2], bool)
             moments = [
@@ -97,8 +107,6 @@ class Counterfactual:
             return expose(change(self._surface.of(mask, measured)), _QUIET, rng)
 
         match domain:
-            case "regular":
-                return image
             case "low_brightness":
                 return expose(linear(image) * self._config.domain.low_brightness, _NOISY, rng)
             case "bleeding":

@@ -14,7 +14,7 @@ from ..export import write_bytes
 from . import paper
 from .accuracy_tables import ROWS
 from .measurement import Measurement, Score
-from .plan import SYNTHETIC
+from .scope import SYNTHETIC
 from .statistics import Measurements, Spread, scores
 from .tables import DOMAIN_LABELS, SHORT_LABELS
 

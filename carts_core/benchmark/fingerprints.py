@@ -8,7 +8,7 @@ from pathlib import Path
 from ..features.extractor import FeatureExtractor
 from .frame import TOLERANCE
 from .methods import METHODS
-from .plan import Run, Scope
+from .scope import Run, Scope
 
 _MEASURED = (
     "*.py",
@@ -18,6 +18,8 @@ _MEASURED = (
     "optimization/**/*.py",
     "rendering/**/*.py",
     "benchmark/frame.py",
+    "benchmark/occlusion.py",
+    "benchmark/together.py",
 )
 _NOT_CODE = {"bench.py", "cli.py"}
 
@@ -43,7 +45,8 @@ def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source:
         extractor: the network and its device.
         source: fingerprint of the images and kinematics.
     """
-    make = METHODS[run.method].settings
-    settings = asdict(make(scope.paper_iterations)) if make else {}
-    parts = (settings, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
+    method = METHODS[run.method]
+    settings = asdict(method.settings(scope.steps(run))) if method.settings else {}
+    company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
+    parts = (settings, company, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

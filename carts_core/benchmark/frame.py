@@ -7,18 +7,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from ..data import Frame
 from ..evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ..features.extractor import FeatureExtractor
-from ..optimization import FrameOptimizer, Iterate, OptimizerSettings
+from ..keypoints import keypoints
+from ..optimization import FrameOptimizer, OptimizerSettings
+from ..optimization.observability import Uncertainty
 from ..perturbation import perturb
 from ..rendering import Renderer
-from ..scene import Scene
+from ..scene import Arm, Scene, SceneState
 from .machine import machine
 from .measurement import Measurement, Score
-from .plan import Run
+from .scope import Run
 
 TOLERANCE = 2.0
 """Of the normalized surface distance [px]."""
@@ -28,43 +30,77 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Truth:
-    """What the estimates of one frame are compared with."""
+    """What the estimates of one frame are compared with, in one camera.
 
+    Attributes:
+        camera: its name.
+        mask: the instruments' visible pixels.
+        joint_positions: arm -> true joint positions [rad, m]; empty where they are not known.
+        measured_joints: arm -> joints that count.
+        hidden: pixels that show an occluder; nothing is compared there.
+    """
+
+    camera: str
     mask: Bool[np.ndarray, "h w"]
     joint_positions: Mapping[str, np.ndarray]
-    """Arm -> true joint positions [rad, m]; empty where they are not known."""
     measured_joints: Mapping[str, tuple[str, ...]]
-    """Arm -> joints that count."""
+    hidden: Bool[np.ndarray, "h w"] | None = None
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
         """The score of a mask without kinematics."""
-        nsd = normalized_surface_distance(mask, self.mask, TOLERANCE)
-        return Score(None, dice(mask, self.mask), nsd, None, None, seconds)
+        return Score(None, *self._overlap(mask), None, None, None, seconds)
 
-    def score(self, iterate: Iterate, renderer: Renderer, seconds: float) -> Score:
-        """The score of an iterate."""
-        mask = renderer.segment(iterate.state.to("cpu"))[0] >= 0
-        estimate, visible = iterate.joint_positions(), visible_joints(iterate, self.measured_joints)
+    def score(
+        self,
+        state: SceneState,
+        known: Uncertainty | None,
+        loss: float | None,
+        renderer: Renderer,
+        seconds: float,
+        *,
+        depth: bool = True,
+    ) -> Score:
+        """The score of an estimate.
+
+        Args:
+            state: the estimate.
+            known: what the images determine, where the optimizer says it.
+            loss: the optimizer's.
+            renderer: of the camera, at its size.
+            seconds: until the estimate was known [s].
+            depth: whether to look for the tips, too, which takes longer than all the rest.
+        """
+        state, scene = state.to("cpu"), renderer.scene
+        names = [arm.name for arm in scene.arms]
+        estimate = dict(zip(names, (v.double().numpy() for v in state.joint_positions), strict=True))
+        visible = visible_joints(known, self.measured_joints)
         return Score(
-            loss=iterate.loss,
-            dice=dice(mask, self.mask),
-            nsd=normalized_surface_distance(mask, self.mask, TOLERANCE),
-            joint_mae_deg=joint_mae_deg(renderer.scene, estimate, self.joint_positions, self.measured_joints),
+            loss,
+            *self._overlap(renderer.segment(state)[0] >= 0),
+            joint_mae_deg=joint_mae_deg(scene, estimate, self.joint_positions, self.measured_joints),
             visible_joint_mae_deg=None
             if visible is None
-            else joint_mae_deg(renderer.scene, estimate, self.joint_positions, visible),
+            else joint_mae_deg(scene, estimate, self.joint_positions, visible),
+            tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
+            if depth
+            else None,
             seconds=seconds,
         )
 
+    def _overlap(self, mask: np.ndarray) -> tuple[float, float]:
+        truth = self.mask
+        if self.hidden is not None:
+            mask, truth = mask & ~self.hidden, truth & ~self.hidden
+        return dice(mask, truth), normalized_surface_distance(mask, truth, TOLERANCE)
+
 
 def visible_joints(
-    iterate: Iterate, measured_joints: Mapping[str, tuple[str, ...]]
+    known: Uncertainty | None, measured_joints: Mapping[str, tuple[str, ...]]
 ) -> Mapping[str, tuple[str, ...]] | None:
     """Arm -> measured joints that the image determines; None for losses that do not say which.
 
     This is the one place that reads it: what is returned here appears as "visible joints" in the whole report.
     """
-    known = iterate.uncertainty
     if known is None:
         return None
     return {
@@ -75,6 +111,25 @@ def visible_joints(
         )
         for arm, joints in measured_joints.items()
     }
+
+
+def tip_depth_error_mm(
+    scene: Scene, estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
+) -> float | None:
+    """Mean absolute error [mm] of the jaw tips along the axis of the scene's camera; None without a truth."""
+    errors = []
+    for arm in scene.arms:
+        if arm.name in truth:
+            errors += (_tip_depths(scene, arm, estimate) - _tip_depths(scene, arm, truth)).tolist()
+    return float(1e3 * np.mean(np.abs(errors))) if errors else None
+
+
+def _tip_depths(scene: Scene, arm: Arm, joint_positions: Mapping[str, np.ndarray]) -> Float[np.ndarray, " tips"]:
+    links = arm.robot.forward_kinematics(torch.tensor(np.asarray(joint_positions[arm.name]), dtype=torch.float64))
+    T_camera_base = scene.cameras[0].T_camera_world @ arm.T_world_base
+    tips = [point for point in keypoints(arm) if point.name.endswith(" tip")]
+    points = (T_camera_base @ links[tip.link].numpy() @ np.append(tip.position, 1.0) for tip in tips)
+    return np.array([point[2] for point in points])
 
 
 def start_of(
@@ -96,22 +151,24 @@ def optimize(
     settings: OptimizerSettings,
     truth: Truth,
     renderer: Renderer,
+    ignore: dict[str, Bool[np.ndarray, "h w"]] | None = None,
 ) -> Measurement:
-    """Run the optimizer on one frame in one camera, and score every iterate.
+    """Run the optimizer on one frame, and score every iterate in one camera.
 
     Args:
         run: which.
-        scene: with the one camera.
-        frame: its image and kinematics.
+        scene: with the cameras that take part.
+        frame: its images and kinematics.
         background: camera name -> mean background.
         extractor: the feature network.
         settings: of the method.
         truth: what estimates are compared with.
-        renderer: draws the masks, at the camera's size.
+        renderer: draws the masks of the camera that is scored, at its size.
+        ignore: camera name -> pixels that show an occluder.
     """
     start = start_of(scene, frame, run.error_deg, truth.measured_joints)
     began = time.perf_counter()
-    optimizer = FrameOptimizer(scene, frame, background, extractor, start=start, settings=settings)
+    optimizer = FrameOptimizer(scene, frame, background, extractor, ignore=ignore, start=start, settings=settings)
     seconds = time.perf_counter() - began
     trace: list[Score] = []
     best: list[int] = []
@@ -122,10 +179,12 @@ def optimize(
         if iterate is None:
             break
         best.append(len(trace) if optimizer.best is iterate else best[-1])
-        trace.append(truth.score(iterate, renderer, seconds))
+        known, first = iterate.uncertainty, not trace
+        trace.append(truth.score(iterate.state, known, iterate.loss, renderer, seconds, depth=first))
     assert optimizer.best is not None and optimizer.stop_reason is not None
-    final = truth.score(optimizer.best, renderer, seconds)
-    return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine())
+    end = optimizer.best
+    final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
+    return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine(extractor.device))
 
 
 def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:
@@ -138,4 +197,4 @@ def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtra
     height, width = image.shape[:2]
     mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
     seconds = time.perf_counter() - began
-    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine())
+    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(extractor.device))

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from .plan import Run
+from .scope import Run
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,9 @@ class Score:
     """Over measured revolute joints; None without true joint positions."""
     visible_joint_mae_deg: float | None
     """The same over those that the image determines; None where the optimizer does not report which."""
+    tip_depth_mm: float | None
+    """Mean absolute error of the jaw tips along the camera's axis [mm]; None without true joint positions, and on the
+    way from start to end."""
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
 
@@ -40,11 +43,13 @@ class Measurement:
     """Why the optimization ended."""
     machine: str
     """What it ran on, for people."""
+    before: Score | None = None
+    """Of the start, where iterates are not followed."""
 
     @property
     def start(self) -> Score | None:
         """The score before anything is corrected; None where the method has no start."""
-        return self.trace[0] if self.trace else None
+        return self.trace[0] if self.trace else self.before
 
     @property
     def iterations(self) -> int:
@@ -80,6 +85,7 @@ class Measurement:
             "best": self.best,
             "stopped": self.stopped,
             "machine": self.machine,
+            "before": self.before and _rounded(asdict(self.before)),
         }
 
     @staticmethod
@@ -101,6 +107,7 @@ class Measurement:
             best=best,
             stopped=line["stopped"],
             machine=line["machine"],
+            before=line["before"] and Score(**line["before"]),
         )
 
 

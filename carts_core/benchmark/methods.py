@@ -1,4 +1,4 @@
-"""The compared methods: the rows of the paper's main table."""
+"""The compared methods: the rows of the paper's main table, and what the default solver does with more to go by."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,19 +8,43 @@ from ..optimization import OptimizerSettings
 
 @dataclass(frozen=True)
 class Method:
-    """One way from an image and measured kinematics to a mask."""
+    """One way from images and measured kinematics to a mask."""
 
     label: str
     """For people."""
     settings: Callable[[int], OptimizerSettings] | None
     """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
     and looks at no kinematics."""
+    told: bool = False
+    """It is given the occluders' pixels."""
+    every_camera: bool = False
+    """All cameras enter one objective."""
+    calibrated: bool = False
+    """Base frames are those of one calibration of the whole recording."""
+    together: bool = False
+    """Frames are corrected together, as a sequence."""
+
+
+def _ours(_: int) -> OptimizerSettings:
+    return OptimizerSettings()
+
+
+def _start(_: int) -> OptimizerSettings:
+    return OptimizerSettings(solver="none")
 
 
 METHODS = {
     "unet": Method("U-Net alone", None),
-    "start": Method("CaRTS without optimization", lambda _: OptimizerSettings(solver="none")),
+    "start": Method("CaRTS without optimization", _start),
     "l1": Method("CaRTS L1 (paper's setting)", lambda _: replace(OptimizerSettings.paper(50), loss="l1")),
     "paper": Method("CaRTS ACS (paper's setting)", OptimizerSettings.paper),
-    "ours": Method("CaRTS, ours", lambda _: OptimizerSettings()),
+    "ours": Method("CaRTS, ours", _ours),
+    "ours_told": Method("ours, occluder given", _ours, told=True),
+    "ours_proposed": Method("ours, ignore mask proposed", lambda _: OptimizerSettings(propose_ignore=True)),
+    "stereo": Method("ours, all cameras", _ours, every_camera=True),
+    "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
+    "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
+    "sequence": Method("ours, sequence mode", _ours, together=True),
 }
+MAIN = ("unet", "start", "l1", "paper", "ours")
+"""Methods of the main table: each frame alone, in one camera."""

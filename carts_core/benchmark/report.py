@@ -13,12 +13,14 @@ from . import paper
 from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
 from .frame import TOLERANCE
+from .further_tables import calibration_table, camera_table, occlusion_table, sequence_table
 from .measurement import Measurement
 from .page import PAGE
-from .speed_tables import speed_table, stage_table, worse_table
+from .speed_tables import pair_table, speed_table, stage_table, worse_table
 from .statistics import Measurements
 from .tables import Cell, Table
-from .targets import Target, targets
+from .target import Target
+from .targets import targets
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,11 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         ("Main table", main_tables(data)),
         ("Iterations", iteration_tables(data)),
         ("Error at the start", error_tables(data)),
-        ("Speed and safety", [speed_table(data), *filter(None, [worse_table(data)])]),
+        ("Occlusion", _known(occlusion_table(data))),
+        ("Several cameras", _known(camera_table(data))),
+        ("Calibration", _known(calibration_table(data))),
+        ("Sequence mode", _known(sequence_table(data))),
+        ("Speed and safety", _known(speed_table(data), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
     ]
     figures = write_figures(data, folder / "figures")
@@ -88,6 +94,10 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
     return path
 
 
+def _known(*tables: Table | None) -> list[Table]:
+    return [table for table in tables if table is not None]
+
+
 def _row(measurement: Measurement) -> dict[str, object]:
     """One run, flat."""
     start, final = measurement.start, measurement.final
@@ -102,6 +112,7 @@ def _row(measurement: Measurement) -> dict[str, object]:
         "joint_mae_deg_start": start and start.joint_mae_deg,
         "joint_mae_deg": final.joint_mae_deg,
         "visible_joint_mae_deg": final.visible_joint_mae_deg,
+        "tip_depth_mm": final.tip_depth_mm,
         "iterations": measurement.iterations,
         "seconds": final.seconds,
         "made_worse": measurement.made_worse,

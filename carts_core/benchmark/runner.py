@@ -1,19 +1,27 @@
 """Does the runs that are not known yet, one after the other."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..rendering import Renderer
+from ..scene import Scene
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
 from .measurement import Measurement
 from .methods import METHODS
-from .plan import Run, Scope
+from .occlusion import OCCLUSION, occlude
+from .scope import Run, Scope
 from .sources import Recording, Source
 from .store import ResultsFile
+from .together import calibrated_scene, correct_together
+
+_OCCLUDERS_SEED = 20
 
 
 class Benchmark:
@@ -63,14 +71,23 @@ class Benchmark:
         with Progress(*columns, console=console) as bar:
             bench = {name: _Bench(source, bar) for name, source in self.sources.items()}
             task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
-            for run, key in todo.items():
+            while todo:
+                run = next(iter(todo))
+                group = self._group(run)
                 error = "" if run.error_deg is None else f", {run.error_deg:g} deg off"
-                bar.update(task, description=f"{run.source}, {run.domain}, frame {run.frame}: {run.method}{error}")
-                measurement = bench[run.source].measure(run, self.scope, self.extractor)
-                facts = {"weights": self.extractor.sha256, "code": code_fingerprint()}
-                self.results.append(measurement, key, **facts)
-                bar.advance(task)
+                which = f"frame {run.frame}" if len(group) == 1 else f"{len(group)} frames"
+                bar.update(task, description=f"{run.source}, {run.domain}, {which}: {run.method}{error}")
+                for measurement in bench[run.source].measure(group, self.scope, self.extractor):
+                    facts = {"weights": self.extractor.sha256, "code": code_fingerprint()}
+                    self.results.append(measurement, self.runs[measurement.run], **facts)
+                    bar.advance(task, todo.pop(measurement.run, None) is not None)
             bar.update(task, description="measured")
+
+    def _group(self, run: Run) -> list[Run]:
+        """The runs that are measured at once with this one."""
+        if not METHODS[run.method].together:
+            return [run]
+        return [other for other in self.runs if replace(other, frame=run.frame) == run]
 
 
 class _Bench:
@@ -79,19 +96,53 @@ class _Bench:
     def __init__(self, source: Source, bar: Progress) -> None:
         self._source, self._bar = source, bar
         self._opened: tuple[Recording, Renderer] | None = None
+        self._calibrated: Scene | None = None
 
-    def measure(self, run: Run, scope: Scope, extractor: FeatureExtractor) -> Measurement:
+    def measure(self, runs: list[Run], scope: Scope, extractor: FeatureExtractor) -> list[Measurement]:
+        """Measure a run, or all runs of one method that corrects frames together."""
+        if not METHODS[runs[0].method].together:
+            return [self._measure_alone(runs[0], scope, extractor)]
         recording, renderer = self._open()
-        camera = self._source.camera
-        frame = recording.frame(run.frame, run.domain, [camera])
-        assert frame.masks is not None
-        truth = Truth(frame.masks[camera], frame.truth or {}, recording.measured_joints)
-        make_settings = METHODS[run.method].settings
-        if make_settings is None:
+        truths = {run.frame: self._truth(recording.frame(run.frame, cameras=[self._source.camera])) for run in runs}
+        return correct_together(runs, recording, extractor, truths, renderer)
+
+    def _measure_alone(self, run: Run, scope: Scope, extractor: FeatureExtractor) -> Measurement:
+        recording, renderer = self._open()
+        method, camera = METHODS[run.method], self._source.camera
+        cameras = self._source.cameras if method.every_camera else (camera,)
+        covered = run.domain == OCCLUSION
+        frame = recording.frame(run.frame, None if covered else run.domain, cameras)
+        truth = self._truth(frame)
+        if covered:
+            frame, truth = self._covered(frame, truth)
+        if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
-        background = {camera: recording.background(camera, run.domain)}
-        settings = make_settings(scope.paper_iterations)
-        return optimize(run, renderer.scene, frame, background, extractor, settings, truth, renderer)
+        # The default loss needs no background, and only one camera has one in every domain.
+        background = {} if len(cameras) > 1 or covered else {camera: recording.background(camera, run.domain)}
+        ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
+        known = self._calibration(scope, extractor) if method.calibrated else recording.scene
+        settings = method.settings(scope.steps(run))
+        scene = known.with_cameras(cameras)
+        return optimize(run, scene, frame, background, extractor, settings, truth, renderer, ignore)
+
+    def _truth(self, frame: Frame) -> Truth:
+        recording, _ = self._open()
+        assert frame.masks is not None
+        camera = self._source.camera
+        return Truth(camera, frame.masks[camera], frame.truth or {}, recording.measured_joints)
+
+    def _covered(self, frame: Frame, truth: Truth) -> tuple[Frame, Truth]:
+        rng = np.random.default_rng((_OCCLUDERS_SEED, frame.index))
+        found = occlude(frame.images[truth.camera], truth.mask, rng)
+        return replace(frame, images={truth.camera: found.image}), replace(truth, hidden=found.hidden)
+
+    def _calibration(self, scope: Scope, extractor: FeatureExtractor) -> Scene:
+        if self._calibrated is None:
+            recording, _ = self._open()
+            task = self._bar.add_task(f"calibrating with {scope.calibration_frames} frames", total=None)
+            self._calibrated = calibrated_scene(recording, self._source.camera, scope.calibration_frames, extractor)
+            self._bar.remove_task(task)
+        return self._calibrated
 
     def _open(self) -> tuple[Recording, Renderer]:
         if self._opened is None:

@@ -2,24 +2,25 @@
 
 import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from ..data import Frame, Sequence
 from ..data.background import spread
 from ..errors import SettingsError
 from ..mesh_cache import cache_dir
 from ..scene import Scene
-from ..synthesis.config import MotionConfig, RenderConfig, SynthesisConfig
+from ..synthesis.config import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
+from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from .backdrop import backdrop
 from .counterfactual import Counterfactual
 from .fingerprints import code_fingerprint
-from .plan import REAL, SYNTHETIC, Scope
+from .scope import REAL, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
@@ -32,6 +33,11 @@ class Recording(Protocol):
 
     scene: Scene
     measured_joints: dict[str, tuple[str, ...]]
+    timestamps: Float[np.ndarray, " frames"] | None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """One frame in a domain."""
@@ -51,11 +57,16 @@ class Source:
     description: str
     """For people: which frames these are."""
     camera: str
-    """The camera that takes part."""
+    """The camera that takes part, and in which is scored."""
     frames: list[int]
+    """Positions of the evaluated frames."""
     fingerprint: str
     """Of images and kinematics."""
     open: Callable[[Progress], Recording]
+    cameras: tuple[str, ...] = ()
+    """All cameras that see the regular domain."""
+    consecutive: list[int] = field(default_factory=list)
+    """Positions of frames that are corrected together."""
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
@@ -73,6 +84,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
     config = SynthesisConfig(
         seed=seed,
         name=f"fresh {seed}",
+        endoscope=EndoscopeConfig(stereo=True),
         motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
         render=RenderConfig(samples=scope.samples),
     )
@@ -90,7 +102,16 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
     counted = f"{len(evaluated)} of {frames} frames, {scope.samples} paths per pixel"
-    return Source(SYNTHETIC, f"{what}, {counted}", "left", evaluated, fingerprint, open_)
+    return Source(
+        SYNTHETIC,
+        f"{what}, {counted}",
+        "left",
+        evaluated,
+        fingerprint,
+        open_,
+        cameras=tuple(camera.name for camera in place_cameras(config.endoscope)),
+        consecutive=list(range(min(frames, scope.consecutive))),
+    )
 
 
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
@@ -108,9 +129,11 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
     code = code_fingerprint(("synthesis/*.py", *_ALTERING_CODE))
     fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
-    for index in frames:
-        frame = sequence.frame(index, cameras=[camera.name])
-        fingerprint.update(frame.images[camera.name].tobytes())
+    consecutive = masked[: scope.consecutive]
+    calibrating = spread(len(sequence), scope.calibration_frames)
+    for index in sorted({*frames, *consecutive, *calibrating}):
+        frame = sequence.frame(index)
+        fingerprint.update(b"".join(image.tobytes() for image in frame.images.values()))
         fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
 
     def open_(progress: Progress) -> Counterfactual:
@@ -118,4 +141,13 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
     description = f"{sequence.name}, camera {camera.name}, {len(frames)} of {len(masked)} frames with masks"
-    return Source(REAL, description, camera.name, frames, fingerprint.hexdigest()[:32], open_)
+    return Source(
+        REAL,
+        description,
+        camera.name,
+        frames,
+        fingerprint.hexdigest()[:32],
+        open_,
+        cameras=tuple(camera.name for camera in sequence.scene.cameras),
+        consecutive=consecutive,
+    )

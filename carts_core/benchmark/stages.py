@@ -62,4 +62,4 @@ def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
 
 
 def _of(extractor: FeatureExtractor) -> list[str]:
-    return [machine(), extractor.sha256, code_fingerprint()]
+    return [machine(extractor.device), extractor.sha256, code_fingerprint()]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..synthesis.config import DOMAINS
 from .measurement import Measurement, Score
 
 ANY = object()
@@ -40,12 +41,15 @@ class Measurements:
         method: str | None = None,
         error_deg: object = ANY,
     ) -> list[Measurement]:
-        """The measurements that match; what is not named matches everything, `error_deg=None` the measured start."""
+        """The measurements that match; what is not named matches everything, `error_deg=None` the measured start.
+
+        Pictures with occluders are none of the usual conditions: they match only where their domain is named.
+        """
         return [
             measurement
             for measurement in self.all
             if source in (None, measurement.run.source)
-            and domain in (None, measurement.run.domain)
+            and measurement.run.domain in ((domain,) if domain else DOMAINS)
             and method in (None, measurement.run.method)
             and (error_deg is ANY or measurement.run.error_deg == error_deg)
         ]

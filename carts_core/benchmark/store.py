@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import CartsError
 from .measurement import Measurement
-from .plan import Run
+from .scope import Run
 
 
 class ResultsFile:

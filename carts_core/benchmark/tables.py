@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from . import paper
+from .occlusion import OCCLUSION
 from .statistics import Spread
 
 DOMAIN_LABELS = {
@@ -12,6 +13,7 @@ DOMAIN_LABELS = {
     "smoke": "smoke",
     "background_change": "background change",
     "simulated_smoke": "simulated smoke",
+    OCCLUSION: "occlusion",
 }
 SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
 """Of the methods that are followed through iterations and errors."""
@@ -36,6 +38,11 @@ class Table:
     caption: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
+
+
+def begun(error_deg: float | None) -> str:
+    """Where a run started."""
+    return "as measured" if error_deg is None else f"{error_deg:g}°"
 
 
 def spread_text(spread: Spread | None, scale: float = 100.0, digits: int = 1) -> str:

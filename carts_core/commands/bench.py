@@ -37,7 +37,6 @@ class Bench:
 
         from ..benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
         from ..benchmark.fingerprints import code_fingerprint
-        from ..benchmark.methods import METHODS
         from ..benchmark.sources import real_source, synthetic_source
         from ..benchmark.stages import known_stages, measure_stages
         from ..features.extractor import FeatureExtractor
@@ -53,7 +52,7 @@ class Bench:
         sources = [synthetic_source(scope, seed)]
         if self.real is not None:
             sources.append(real_source(self.real, scope, seed))
-        runs = plan(scope, {source.name: source.frames for source in sources}, tuple(METHODS))
+        runs = plan(scope, sources)
         results = ResultsFile(folder / "measurements.jsonl")
         benchmark = Benchmark(scope, sources, extractor, results, runs)
         if results.unreadable:

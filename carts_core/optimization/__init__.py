@@ -9,6 +9,7 @@ from .calibration import UnknownChange as UnknownChange
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
+from .ignore import propose_ignore as propose_ignore
 from .sequence import FrameEstimate as FrameEstimate
 from .sequence import SequenceOptimizer as SequenceOptimizer
 from .sequence_settings import SequenceSettings as SequenceSettings
@@ -30,4 +31,5 @@ __all__ = [
     "SequenceOptimizer",
     "SequenceSettings",
     "UnknownChange",
+    "propose_ignore",
 ]

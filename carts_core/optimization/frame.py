@@ -15,6 +15,7 @@ from ..scene import Scene, SceneState
 from .evaluation import Evaluation, Objective, Solver
 from .feature_objective import FeatureObjective
 from .gauss_newton import GaussNewton
+from .ignore import propose_ignore
 from .observability import Uncertainty
 from .parameters import ParameterVector
 from .settings import FreeParameters, OptimizerSettings
@@ -30,7 +31,7 @@ class Iterate:
     """Number of steps before it; 0 is the start."""
     state: SceneState
     loss: float
-    """In the final stage, so comparable through all iterates."""
+    """In the final stage, so comparable through all iterates, up to a proposed ignore mask and from it on."""
     terms: dict[str, float]
     """Parts of the objective that was descended."""
     gradient_norms: dict[str, float]
@@ -108,22 +109,31 @@ class FrameOptimizer:
         self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         state = scene.state(frame.measured if start is None else start, extractor.device)
         self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
-        self._objective: Objective
+        self._scene, self._images, self._extractor, self._given = scene, frame.images, extractor, ignore or {}
+        self._first: Objective
         if self.settings.loss == "surface":
-            self._objective = SurfaceObjective(scene, frame.images, extractor, self._parameters, self.settings, ignore)
+            self._first = self._surface(self._given)
         else:
-            self._objective = FeatureObjective(
-                scene, frame.images, backgrounds, extractor, self._parameters, self.settings
-            )
+            self._first = FeatureObjective(scene, frame.images, backgrounds, extractor, self._parameters, self.settings)
         self.reset()
+
+    def _surface(self, ignore: Mapping[str, Bool[np.ndarray, "h w"]]) -> SurfaceObjective:
+        return SurfaceObjective(self._scene, self._images, self._extractor, self._parameters, self.settings, ignore)
 
     def reset(self) -> None:
         """Go back to the start; the history is emptied."""
-        self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
-        self._solver = make_solver(self.settings, self._parameters, self._objective.stages)
         self.history: list[Progress] = []
         self.best: Iterate | None = None
-        self._epoch = 0
+        self.proposed: dict[str, Bool[np.ndarray, "h w"]] = {}
+        """Camera name -> pixels that were left out on a proposal; see `OptimizerSettings.propose_ignore`."""
+        self._round = 0
+        self._epoch = 0, 0
+        self._begin(self._first)
+
+    def _begin(self, objective: Objective) -> None:
+        self._objective = objective
+        self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
+        self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._retried = False
         self.stop_reason: str | None = None
 
@@ -140,7 +150,7 @@ class FrameOptimizer:
             return None
         began = time.perf_counter()
         index, offsets, solver = len(self.history), self._offsets, self._solver
-        epoch = self._objective.epoch(solver.stage)
+        epoch = self._round, self._objective.epoch(solver.stage)
         moves = self.settings.solver != "none"
         evaluation = self._objective(offsets, solver.stage, gradient=moves)
         self._offsets = solver(offsets, evaluation)
@@ -148,9 +158,20 @@ class FrameOptimizer:
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._epoch = iterate, epoch
-        self._offsets = self._restarted(epoch, solver)
+        self._offsets = self._restarted(epoch[1], solver)
         self.stop_reason = solver.finished
+        if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
+            self._look_past_occluders()
         return iterate
+
+    def _look_past_occluders(self) -> None:
+        """Begin again without what contradicts the best iterate, if there is such."""
+        assert self.best is not None
+        self.proposed = propose_ignore(self._scene, self.best.silhouette, self.best.similarity)
+        if self.proposed:
+            self._round = 1
+            masks = {name: mask | self._given.get(name, False) for name, mask in self.proposed.items()}
+            self._begin(self._surface({**self._given, **masks}))
 
     def _restarted(self, epoch: int, solver: Solver) -> torch.Tensor:
         """The next offsets; better ones, once, where a first look that ended badly says that the start was bad."""

@@ -57,6 +57,9 @@ class OptimizerSettings:
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
+    propose_ignore: bool = False
+    """`surface`: solve a frame again, from its start and in as many steps, without areas at the arms that contradicted
+    the first solution. Only where each frame is alone. It does not always help: see docs/benchmark.md."""
     parts_weight: float = 0.1
     """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05
@@ -114,6 +117,8 @@ class OptimizerSettings:
         _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
         _require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
         _require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
+        proposes = not self.propose_ignore or self.loss == "surface"
+        _require(proposes, "propose_ignore", self.propose_ignore, f"False for the loss {self.loss}")
         fits = self.solver != "gauss_newton" or self.loss == "surface"
         _require(fits, "solver", self.solver, f"adam or gradient_descent for the loss {self.loss}")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")
@@ -142,14 +147,15 @@ class OptimizerSettings:
     def with_loss(self, loss: Loss) -> "OptimizerSettings":
         """These settings for another loss, with a solver that can descend it.
 
-        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`.
+        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`. Ignore masks
+        are proposed for `surface` only.
         """
         solver = self.solver
         if loss == "surface" and solver != "none":
             solver = "gauss_newton"
         elif solver == "gauss_newton":
             solver = "adam"
-        return replace(self, loss=loss, solver=solver)
+        return replace(self, loss=loss, solver=solver, propose_ignore=self.propose_ignore and loss == "surface")
 
     @staticmethod
     def acs(iterations: int = 60) -> "OptimizerSettings":

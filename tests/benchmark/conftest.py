@@ -21,6 +21,10 @@ TINY = Scope(
     errors_deg=(2.0,),
     paper_errors_deg=(2.0,),
     real_errors_deg=(),
+    hard_errors_deg=(2.0,),
+    consecutive=2,
+    consecutive_domains=("regular",),
+    calibration_frames=2,
 )
 
 
@@ -39,13 +43,22 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def tiny_benchmark(tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps: None) -> Callable[..., Benchmark]:
-    """Factory of the same benchmark over one frame of a tiny sequence in all domains, on the same results file."""
-    path = tiny_sequence(frames=1, domains=DOMAINS, width=160, height=128)
+    """Factory of the same benchmark over one frame of a tiny sequence in all domains, and two in sequence mode, on the
+    same results file."""
+    path = tiny_sequence(frames=2, domains=DOMAINS, cameras=("left", "right"), width=160, height=128)
 
-    def make(fingerprint: str = "tiny") -> Benchmark:
-        source = Source("synthetic", "tiny", "left", [0], fingerprint, lambda progress: Sequence.open(path))
-        runs = plan(TINY, {"synthetic": [0]}, tuple(methods.METHODS))
+    def make(fingerprint: str = "tiny", name: str = "synthetic") -> Benchmark:
+        source = Source(
+            name,
+            "tiny",
+            "left",
+            [0],
+            fingerprint,
+            lambda progress: Sequence.open(path),
+            cameras=("left", "right"),
+            consecutive=[0, 1],
+        )
         results = ResultsFile(tmp_path / "bench" / "measurements.jsonl")
-        return Benchmark(TINY, [source], FeatureExtractor.load(), results, runs)
+        return Benchmark(TINY, [source], FeatureExtractor.load(), results, plan(TINY, [source]))
 
     return make

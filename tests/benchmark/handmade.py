@@ -22,6 +22,7 @@ def make_measurement(
             nsd=value,
             joint_mae_deg=0.5,
             visible_joint_mae_deg=None,
+            tip_depth_mm=None,
             seconds=place,
         )
         for place, value in ((seconds * (step + 1), value) for step, value in enumerate(dice))

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from carts_core.benchmark import Benchmark, Facts, Measurement, runner, write_report
+from carts_core.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
 from carts_core.benchmark.runner import _Bench
 from carts_core.cli import BAD_INPUT, main
 
 QUIET = Console(quiet=True)
+RUNS = 42
+"""30 of the main table, 2 with an error at the start, 6 with occluders, 2 with both cameras, 2 in sequence mode."""
 
 
 @pytest.fixture
@@ -24,9 +26,10 @@ def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
     measured: list[Measurement] = []
     measure = _Bench.measure
 
-    def counting(self: _Bench, *arguments) -> Measurement:
-        measured.append(measure(self, *arguments))
-        return measured[-1]
+    def counting(self: _Bench, *arguments) -> list[Measurement]:
+        found = measure(self, *arguments)
+        measured.extend(found)
+        return found
 
     monkeypatch.setattr(runner._Bench, "measure", counting)
     return measured
@@ -38,7 +41,7 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     benchmark = tiny_benchmark()
     benchmark.run(QUIET)
     measurements = benchmark.measurements()
-    assert len(measurements) == len(benchmark.runs) == len(count_runs) == 32
+    assert len(measurements) == len(benchmark.runs) == len(count_runs) == RUNS
     by_method = {measurement.run.method: measurement for measurement in measurements}
     assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
     assert 1 <= by_method["ours"].iterations <= 2
@@ -48,9 +51,9 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
         if measurement.run.error_deg and measurement.start:
             assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
     tiny_benchmark().run(QUIET)
-    assert len(count_runs) == 32
-    facts = Facts("quick", 32, {"synthetic": "tiny"}, "w", "c", "0")
-    assert "32 of 32" in write_report(tmp_path / "bench", measurements, facts, {}).read_text()
+    assert len(count_runs) == RUNS
+    facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
+    assert f"{RUNS} of {RUNS}" in write_report(tmp_path / "bench", measurements, facts, {}).read_text()
 
 
 def test_a_stopped_benchmark_goes_on_where_it_was(
@@ -58,7 +61,7 @@ def test_a_stopped_benchmark_goes_on_where_it_was(
 ) -> None:
     measure = _Bench.measure
 
-    def stop_at_five(self: _Bench, *arguments) -> Measurement:
+    def stop_at_five(self: _Bench, *arguments) -> list[Measurement]:
         if len(count_runs) == 5:
             raise KeyboardInterrupt
         return measure(self, *arguments)
@@ -71,7 +74,7 @@ def test_a_stopped_benchmark_goes_on_where_it_was(
     monkeypatch.setattr(runner._Bench, "measure", measure)
     resumed = tiny_benchmark()
     resumed.run(QUIET)
-    assert len(count_runs) == 32 and resumed.measurements()[:5] == kept
+    assert len(count_runs) == RUNS and resumed.measurements()[:5] == kept
 
 
 def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[..., Benchmark]) -> None:
@@ -82,10 +85,49 @@ def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[...,
     assert tiny_benchmark("other images").measurements() == []
 
 
+def test_a_calibration_is_found_once_and_holds_for_every_frame(
+    tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    found = runner.calibrated_scene
+
+    def counting(recording, camera: str, frames: int, extractor):
+        calls.append(frames)
+        return found(recording, camera, frames, extractor)
+
+    monkeypatch.setattr(runner, "calibrated_scene", counting)
+    benchmark = tiny_benchmark(name="real")
+    runs = [Run("real", "regular", 0, method) for method in ("start", "calibrated", "calibrated_ours")]
+    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
+    benchmark.run(QUIET)
+    plain, calibrated, corrected = benchmark.measurements()
+    assert calls == [2]
+    assert calibrated.final.dice != plain.final.dice
+    assert corrected.start is not None and corrected.start.dice == calibrated.final.dice
+
+
+def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
+    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement]
+) -> None:
+    benchmark = tiny_benchmark()
+    runs = [Run("synthetic", "regular", frame, "sequence") for frame in (0, 1)]
+    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
+    benchmark.run(QUIET)
+    first = benchmark.measurements()
+    assert [entry.stopped for entry in first] == ["cold", "warm"] and all(entry.start for entry in first)
+    lines = benchmark.results.path.read_bytes().splitlines(keepends=True)
+    benchmark.results.path.write_bytes(lines[0])
+    results = ResultsFile(benchmark.results.path)
+    again = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, results, runs)
+    again.run(QUIET)
+    assert len(count_runs) == 4
+    assert [entry.final.dice for entry in again.measurements()] == [entry.final.dice for entry in first]
+
+
 def _one(benchmark: Benchmark) -> Measurement:
     run = next(iter(benchmark.runs))
     bench = _Bench(benchmark.sources[run.source], runner.Progress(console=QUIET))
-    return bench.measure(run, benchmark.scope, benchmark.extractor)
+    return bench.measure([run], benchmark.scope, benchmark.extractor)[0]
 
 
 def test_measurements_of_other_settings_weights_or_code_are_not_used(

@@ -102,7 +102,7 @@ def test_a_recording_opens_as_a_source_with_its_masked_frames(
     monkeypatch.setattr(sources, "backdrop", lambda width, height, seed: np.zeros((height, width, 3), np.uint8))
     path = tiny_sequence(frames=3, **SIZE)
     source = real_source(path, QUICK)
-    assert source.frames == [0, 1, 2] and source.camera == "left"
+    assert source.frames == [0, 2] and source.camera == "left" and source.consecutive == [0, 1, 2]
     recording = source.open(lambda what, done, total: None)
     assert recording.frame(2, "smoke", ["left"]).domain == "smoke"
     path.write_text(path.read_text().replace('name = "tiny"', 'name = "other"', 1))

@@ -3,10 +3,15 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
 from handmade import make_measurement
+from tiny import tiny_scene
 
 from carts_core.benchmark import Measurement, Run, Score
+from carts_core.benchmark.frame import tip_depth_error_mm
+from carts_core.robot import Robot
 
 
 def test_a_measurement_survives_its_json_line() -> None:
@@ -15,7 +20,7 @@ def test_a_measurement_survives_its_json_line() -> None:
 
 
 def test_a_measurement_without_iterates_survives_too_and_has_no_start() -> None:
-    score = Score(None, 0.9, 0.8, None, None, 0.1)
+    score = Score(None, 0.9, 0.8, None, None, None, 0.1)
     measurement = Measurement(Run("real", "smoke", 3, "unet"), score, (), (), "not iterative", "a machine")
     again = Measurement.from_json(json.loads(json.dumps(measurement.to_json())))
     assert again == measurement
@@ -47,3 +52,19 @@ def test_a_run_that_was_cut_says_nothing_of_more_steps_but_one_that_converged_do
 @pytest.mark.parametrize(("last", "worse"), [(0.48, True), (0.495, False), (0.6, False)])
 def test_a_frame_is_made_worse_when_dice_falls_by_more_than_a_hundredth(last: float, worse: bool) -> None:
     assert make_measurement((0.5, last)).made_worse is worse
+
+
+def test_the_depth_of_the_tips_is_compared_along_the_cameras_axis(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
+    truth = {"PSM1": tiny.truth[0]}
+    longer = {"PSM1": tiny.truth[0] + 0.002 * (np.array(shipped_psm.joint_types) == "prismatic")}
+    assert tip_depth_error_mm(tiny.scene, truth, truth) == 0.0
+    assert tip_depth_error_mm(tiny.scene, truth, {}) is None
+    viewing_direction = tiny.scene.cameras[0].T_camera_world[2, :3]
+    change = shipped_psm.forward_kinematics(torch.tensor(longer["PSM1"])) - shipped_psm.forward_kinematics(
+        torch.tensor(tiny.truth[0])
+    )
+    moved = change[shipped_psm.meshes[-1].link][:3, 3].numpy()
+    assert tip_depth_error_mm(tiny.scene, longer, truth) == pytest.approx(
+        1e3 * abs(moved @ viewing_direction), abs=1e-6
+    )

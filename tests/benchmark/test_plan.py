@@ -2,16 +2,27 @@
 
 import pytest
 
-from carts_core.benchmark import FULL, QUICK, Run, plan
+from carts_core.benchmark import FULL, QUICK, Run, Source, plan
+from carts_core.data import Sequence
 from carts_core.errors import SettingsError
 from carts_core.synthesis import DOMAINS
 
 METHODS = ("unet", "start", "l1", "paper", "ours")
 
 
+def _source(name: str, frames: list[int], cameras: tuple[str, ...] = ("left",)) -> Source:
+    def never(_: object) -> Sequence:
+        raise AssertionError("a plan opens nothing")
+
+    return Source(name, "", "left", frames, "", never, cameras, [0, 1])
+
+
+BOTH = [_source("synthetic", [0, 2]), _source("real", [5], ("left", "right"))]
+
+
 @pytest.mark.parametrize("scope", [QUICK, FULL])
 def test_no_run_is_planned_twice_and_the_main_table_is_complete(scope) -> None:
-    runs = plan(scope, {"synthetic": [0, 2], "real": [5]}, METHODS)
+    runs = plan(scope, BOTH)
     assert len(set(runs)) == len(runs)
     for source, frame in (("synthetic", 0), ("synthetic", 2), ("real", 5)):
         for domain in DOMAINS:
@@ -20,19 +31,30 @@ def test_no_run_is_planned_twice_and_the_main_table_is_complete(scope) -> None:
 
 
 def test_frame_comes_after_frame_so_that_a_stopped_benchmark_has_some_of_everything() -> None:
-    runs = plan(FULL, {"synthetic": [0, 2], "real": [5]}, METHODS)
-    first = [run for run in runs if (run.source, run.frame) != ("synthetic", 2)]
+    runs = plan(FULL, BOTH)
+    alone = [run for run in runs if run.method != "sequence"]
+    assert runs[: len(alone)] == alone
+    first = [run for run in alone if (run.source, run.frame) != ("synthetic", 2)]
     assert runs[: len(first)] == first
 
 
 def test_the_full_scope_has_every_error_in_every_domain() -> None:
-    runs = plan(FULL, {"synthetic": [0]}, METHODS)
+    runs = plan(FULL, BOTH)
     for degrees in range(7):
         for domain in DOMAINS:
             assert Run("synthetic", domain, 0, "ours", float(degrees)) in runs
 
 
+def test_several_cameras_and_calibration_are_planned_where_there_is_something_to_measure() -> None:
+    runs = plan(QUICK, BOTH)
+    assert {run.source for run in runs if run.method == "stereo"} == {"real"}
+    assert {run.source for run in runs if run.method.startswith("calibrated")} == {"real"}
+    for method in ("ours", "ours_told", "ours_proposed"):
+        assert Run("synthetic", "occlusion", 0, method, 2.0) in runs and Run("real", "occlusion", 5, method) in runs
+    assert [run.frame for run in runs if (run.source, run.method) == ("real", "sequence")] == [0, 1]
+
+
 @pytest.mark.parametrize("frames", [0, 25])
 def test_more_frames_than_there_are_is_an_error_that_says_how_many_may_be_asked_for(frames: int) -> None:
-    with pytest.raises(SettingsError, match=f"--frames is {frames}; .* Give 1 to 24"):
+    with pytest.raises(SettingsError, match=f"--frames is {frames}; .* Give 1 to {FULL.sequence_frames}"):
         FULL.with_frames(frames)

@@ -10,6 +10,8 @@ from handmade import make_measurement
 
 from carts_core.benchmark import Facts, Measurement, Run, Score, write_report
 from carts_core.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
+from carts_core.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
+from carts_core.benchmark.speed_tables import pair_table
 from carts_core.benchmark.statistics import Measurements
 from carts_core.synthesis import DOMAINS
 
@@ -21,7 +23,7 @@ def _measurements() -> list[Measurement]:
     for source in ("synthetic", "real"):
         for domain in DOMAINS:
             for frame, dice in enumerate((0.9, 0.94)):
-                unet = Score(None, 0.8, 0.7, None, None, 0.1)
+                unet = Score(None, 0.8, 0.7, None, None, None, 0.1)
                 run = Run(source, domain, frame, "unet")
                 found.append(Measurement(run, unet, (), (), "not iterative", "a machine"))
                 place = {"source": source, "domain": domain, "frame": frame}
@@ -119,3 +121,36 @@ def test_the_error_tables_have_a_column_per_error_and_no_row_without_numbers() -
     dice, mae = error_tables(Measurements(_measurements()))
     assert dice.columns[2:] == ("0°", "1°", "2°", "3°") and len(dice.rows) == 1
     assert mae.rows[0][2].text == "0.50"
+
+
+def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_frames() -> None:
+    data = Measurements(
+        [
+            *_measurements(),
+            *(make_measurement((0.7, 0.9), domain="occlusion", frame=frame) for frame in range(2)),
+            *(make_measurement((0.7, 0.96), domain="occlusion", method=m) for m in ("ours_told", "ours_proposed")),
+            make_measurement((0.8, 0.97), source="real", method="stereo"),
+            make_measurement((0.95,), source="real", method="calibrated"),
+            make_measurement((0.95, 0.98), source="real", method="calibrated_ours"),
+            *(make_measurement((0.9, 0.95), method="sequence", frame=frame, stopped="warm") for frame in range(5)),
+        ]
+    )
+    tables = [occlusion_table(data), camera_table(data), calibration_table(data), sequence_table(data)]
+    texts = [[[cell.text for cell in row] for row in table.rows] for table in tables if table]
+    occlusion, camera, calibration, sequence = texts
+    assert [row[1] for row in occlusion] == ["1"] * 4
+    assert [row[4] for row in occlusion] == ["70.0", "90.0", "96.0", "96.0"]
+    assert [row[4] for row in camera] == ["80.0", "90.0", "97.0"]
+    assert [row[4] for row in calibration] == ["80.0", "90.0", "95.0", "98.0"]
+    assert sequence[0][2] == "5" and sequence[0][-3:] == ["2", "92.0 ± 2.0", "95.0 ± 0.0"]
+    assert not any(table(Measurements(_measurements())) for table in (occlusion_table, camera_table, sequence_table))
+
+
+def test_the_pair_table_says_how_much_faster_the_same_dice_is_reached() -> None:
+    pairs = [
+        make_measurement((0.5, 0.6, 0.7, 0.8), method="paper", seconds=10.0),
+        make_measurement((0.5, 0.9), seconds=2.0),
+    ]
+    table = pair_table(Measurements(pairs))
+    assert table is not None
+    assert [cell.text for cell in table.rows[0]] == ["synthetic", "as measured", "1", "40.00", "4.00", "10.0", "0", "1"]

@@ -1,8 +1,10 @@
 """Verdicts are computed from measurements, both ways."""
 
+from dataclasses import replace
+
 from handmade import make_measurement
 
-from carts_core.benchmark import Target, targets
+from carts_core.benchmark import Measurement, Target, targets
 from carts_core.benchmark.statistics import Measurements
 from carts_core.synthesis import DOMAINS
 
@@ -63,7 +65,14 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
     near = make_measurement((0.87, 0.958), source="real", domain="smoke")
     far = make_measurement((0.87, 0.9), source="real", domain="bleeding")
     assert _target("real frames, each alone", clean).met is True
-    assert _target("real frames under", clean, near).met is True
+    assert _target("real frames under", clean, near).met is None
+    others = [
+        make_measurement((0.87, 0.965), source="real", domain=domain)
+        for domain in ("low_brightness", "bleeding", "background_change")
+    ]
+    assert _target("real frames under", clean, near, *others).met is True
+    same = _target("real frames under", clean, *others)
+    assert same.reached == "0.000"
     lost = _target("real frames under", clean, near, far)
     assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
 
@@ -71,3 +80,36 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
 def test_visible_joints_have_no_verdict_as_long_as_nobody_says_which_they_are() -> None:
     target = _target("synthetic, 1° off: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
     assert target.met is None and "all measured joints: 0.50°" in target.basis
+
+
+def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_and_nowhere_else() -> None:
+    covered = make_measurement((0.7, 0.6), domain="occlusion", error_deg=2.0)
+    assert _target("synthetic, 2° off: mean Dice", covered).met is None
+    assert _target("seconds per frame", covered).reached == "not measured"
+    assert _target("frames made worse", covered).reached == "100.0 %"
+    plain = [make_measurement((0.9, dice), domain="occlusion", frame=i) for i, dice in enumerate((0.95, 0.97))]
+    told = make_measurement((0.9, 0.99), domain="occlusion", method="ours_told")
+    reached = _target("30 % of the visible instrument", *plain, told)
+    assert reached.reached == "0.960" and reached.met is True and "occluder given 0.990" in reached.basis
+    real = make_measurement((0.9, 0.94), domain="occlusion", source="real")
+    assert _target("30 % of the visible instrument", *plain, real).met is False
+
+
+def test_stereo_and_calibration_have_their_own_lines_on_real_frames() -> None:
+    runs = [
+        make_measurement((0.87, dice), source="real", method=method)
+        for method, dice in (("stereo", 0.97), ("calibrated", 0.93))
+    ]
+    assert _target("real frames, both cameras", *runs).met is True
+    assert _target("real frames, one calibration", *runs).met is False
+    assert _target("real frames, each alone", *runs).met is None
+
+
+def test_sequence_mode_counts_warm_frames_on_cpu_and_gpu_apart() -> None:
+    def frame(seconds: float, stopped: str, machine: str) -> Measurement:
+        return replace(make_measurement((0.97,), method="sequence", seconds=seconds, stopped=stopped), machine=machine)
+
+    cold, warm, card = frame(3.0, "cold", "a CPU"), frame(0.25, "warm", "a CPU"), frame(0.02, "warm", "cuda: a card")
+    assert _target("sequence mode, seconds", cold, warm, card).reached == "0.25 s"
+    assert _target("sequence mode, frames per second", cold, warm).reached == "not measured"
+    assert _target("sequence mode, frames per second", cold, warm, card).reached == "50.0"

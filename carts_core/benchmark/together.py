@@ -1,0 +1,65 @@
+"""What takes many frames at once: one calibration of a recording, and frames that are corrected as a sequence."""
+
+from collections.abc import Iterable, Mapping
+
+from ..data.background import spread
+from ..features.extractor import FeatureExtractor
+from ..optimization import CalibrationOptimizer, SequenceOptimizer
+from ..rendering import Renderer
+from ..scene import Scene
+from .frame import Truth
+from .machine import machine
+from .measurement import Measurement
+from .scope import Run
+from .sources import Recording
+
+
+def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:
+    """The scene with base frames from so many frames of the recording, evenly spread, as one camera sees them.
+
+    Neither masks nor true joint positions are looked at.
+    """
+    chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
+    optimizer = CalibrationOptimizer(recording.scene, chosen, extractor, cameras=[camera])
+    for _ in optimizer:
+        pass
+    return optimizer.result().scene
+
+
+def correct_together(
+    runs: Iterable[Run],
+    recording: Recording,
+    extractor: FeatureExtractor,
+    truths: Mapping[int, Truth],
+    renderer: Renderer,
+) -> list[Measurement]:
+    """Correct frames as a sequence, from the measured joint positions on, and score them when all are done.
+
+    Seconds are those spent on a frame over all visits, reading its image included.
+
+    Args:
+        runs: one per frame, of one domain.
+        recording: where the frames are from.
+        extractor: the networks.
+        truths: position of the frame -> what its estimate is compared with.
+        renderer: of the camera that takes part, at its size.
+    """
+    by_frame = {run.frame: run for run in runs}
+    (domain,) = {run.domain for run in by_frame.values()}
+    scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
+    stamps = recording.timestamps
+    optimizer = SequenceOptimizer(
+        scene,
+        lambda index: recording.frame(index, domain, cameras),
+        {index: None if stamps is None else float(stamps[index]) for index in by_frame},
+        extractor,
+    )
+    for _ in optimizer:
+        pass
+    found = []
+    for index, estimate in sorted(optimizer.estimates.items()):
+        truth, state = truths[index], scene.state(recording.frame(index, domain, cameras).measured)
+        before = truth.score(state, None, None, renderer, 0.0)
+        after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
+        found.append(Measurement(by_frame[index], after, (), (), estimate.start, machine(extractor.device), before))
+    return found

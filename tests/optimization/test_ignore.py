@@ -1,0 +1,98 @@
+"""Proposed ignore masks: what is taken for an occluder, and what becomes of a frame that is solved again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.errors import SettingsError
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import FrameOptimizer, OptimizerSettings, propose_ignore
+from carts_core.scene import Scene
+
+WIDTH, HEIGHT = 320, 240
+
+
+@pytest.fixture
+def scene(tiny_sequence: Callable[..., Path]) -> Scene:
+    return Sequence.open(tiny_sequence(frames=1, width=2 * WIDTH, height=2 * HEIGHT)).scene
+
+
+def _arm() -> tuple[np.ndarray, np.ndarray]:
+    silhouette, similarity = np.zeros((1, HEIGHT, WIDTH)), np.ones((1, HEIGHT, WIDTH))
+    silhouette[0, 100:140, :200] = 1.0
+    return silhouette, similarity
+
+
+def test_a_gap_in_the_arm_and_what_sticks_out_of_it_are_proposed_at_the_cameras_size(scene: Scene) -> None:
+    silhouette, similarity = _arm()
+    similarity[0, 105:135, 40:70] = 0.0
+    similarity[0, 70:100, 120:150] = 0.0
+    mask = propose_ignore(scene, silhouette, similarity)["left"]
+    assert mask.shape == (2 * HEIGHT, 2 * WIDTH) and mask.dtype == bool
+    assert mask[240, 110] and mask[170, 270]
+    assert not mask[240, 20] and mask.mean() < 0.05
+
+
+def test_a_thin_rim_is_an_arm_that_is_off_and_no_occluder(scene: Scene) -> None:
+    silhouette, similarity = _arm()
+    similarity[0, 97:101, :200] = 0.0
+    assert propose_ignore(scene, silhouette, similarity) == {}
+
+
+def test_what_does_not_touch_the_arm_is_somebody_elses(scene: Scene) -> None:
+    silhouette, similarity = _arm()
+    similarity[0, 180:220, 250:300] = 0.0
+    assert propose_ignore(scene, silhouette, similarity) == {}
+
+
+def test_where_most_of_the_arm_contradicts_the_estimate_is_wrong_and_nothing_is_proposed(scene: Scene) -> None:
+    silhouette, similarity = _arm()
+    similarity[0, 95:145, :150] = 0.0
+    assert propose_ignore(scene, silhouette, similarity) == {}
+
+
+def test_a_frame_is_solved_again_without_what_contradicts_and_reset_forgets_it(
+    sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, extractor = Sequence.open(sample_sequence_path), FeatureExtractor.load()
+    frame = sequence.frame(0, cameras=["left"])
+    height, width = frame.images["left"].shape[:2]
+    left_half = np.arange(width) < width // 2
+    proposal = {"left": np.broadcast_to(left_half, (height, width))}
+    settings = OptimizerSettings(propose_ignore=True)
+    given = {"left": np.zeros((height, width), bool)}
+
+    def optimizer(chosen: OptimizerSettings, ignore: dict[str, np.ndarray]) -> FrameOptimizer:
+        return FrameOptimizer(sequence.scene, frame, {}, extractor, ignore=ignore, settings=chosen, cameras=["left"])
+
+    monkeypatch.setattr("carts_core.optimization.frame.propose_ignore", lambda *_: proposal)
+    proposing = optimizer(settings, given)
+    steps = len(list(proposing))
+    assert proposing.best is not None and np.array_equal(proposing.proposed["left"], proposal["left"])
+    told = optimizer(replace(settings, propose_ignore=False), proposal)
+    list(told)
+    assert told.best is not None and len(told.history) < steps
+    assert proposing.best.loss == told.best.loss
+    proposing.reset()
+    assert proposing.proposed == {} and len(list(proposing)) == steps
+
+
+def test_without_a_proposal_a_frame_is_solved_once(sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("carts_core.optimization.frame.propose_ignore", lambda *_: {})
+    sequence, extractor = Sequence.open(sample_sequence_path), FeatureExtractor.load()
+    frame = sequence.frame(0, cameras=["left"])
+    runs = [
+        list(FrameOptimizer(sequence.scene, frame, {}, extractor, settings=settings, cameras=["left"]))
+        for settings in (OptimizerSettings(), OptimizerSettings(propose_ignore=True))
+    ]
+    assert [iterate.loss for iterate in runs[0]] == [iterate.loss for iterate in runs[1]]
+
+
+def test_a_loss_that_knows_no_ignore_masks_cannot_propose_them() -> None:
+    with pytest.raises(SettingsError, match="propose_ignore is True; allowed is False for the loss acs"):
+        replace(OptimizerSettings.acs(), propose_ignore=True)
+    assert OptimizerSettings(propose_ignore=True).with_loss("acs").propose_ignore is False
