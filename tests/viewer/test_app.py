@@ -24,10 +24,10 @@ from carts_core.resources import sample_sequence
 from carts_viewer import editing
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp, serve
-from carts_viewer.bench import RawTab
 from carts_viewer.layers import Layer, mask
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.picture import Painter
+from carts_viewer.raw_tab import RawTab
 from carts_viewer.stage import FRAME, OVERLAY
 from carts_viewer.storage import open_storage
 
