@@ -32,7 +32,7 @@ def gated(respond: Callable[[Request], Response | None], refuse: Callable[[objec
     class Connection(ServerConnection):
         """Swallows the messages that are refused."""
 
-        async def recv(self, decode: bool | None = None) -> Data:
+        async def recv(self, decode: bool | None = None) -> Data:  # pyright: ignore[reportIncompatibleMethodOverride]
             """The next message that is not refused."""
             while True:
                 data = await super().recv(decode)
