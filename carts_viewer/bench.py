@@ -1,4 +1,4 @@
-"""Measures the viewer: how long a moved slider takes to become an overlay, and whether memory stays flat.
+"""Measures the viewer: from a moved slider to its overlay, from a key to the next frame, and whether memory stays flat.
 
     python -m carts_viewer.bench [SEQUENCE]
 
@@ -21,6 +21,7 @@ from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.raw_tab import RawTab
+from carts_viewer.stage import OVERLAY
 from carts_viewer.state import Phase
 
 _MOVES_PER_SECOND = 20
@@ -30,13 +31,13 @@ _ITERATIONS = 500
 
 @dataclass(frozen=True)
 class Latency:
-    """Times from a moved slider to its overlay [ms]."""
+    """Times from what somebody does to the picture that shows it [ms]."""
 
     median: float
     p95: float
     worst: float
     stale: bool
-    """Whether the last overlay of a drag was not the one of the last value."""
+    """Whether the last overlay was not the one of the last value or frame."""
 
 
 def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True) -> Latency:
@@ -73,6 +74,43 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
             app.mailbox.put(ask.BackToMeasured())
             app.wait_until_shown()
             shown.clear()
+    return _latency(times, stale)
+
+
+def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: float = 0.15) -> Latency:
+    """Press the keys for the next and the previous frame, and wait for frame and overlay, which are sent together.
+
+    The frames have been read before. The times end with the arrival at the tab, so they contain the server's sending.
+
+    Args:
+        app: The viewer.
+        moves: How many keys are pressed.
+        frames: How many frames to go forth before going back.
+        pause: Between two keys [s].
+    """
+    forth, back = (app.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
+    count = min(frames, len(app.sequence)) - 1
+    lap = [forth] * count + [back] * count
+    app.mailbox.put(ask.ShowFrame(0))
+    times: list[float] = []
+    with RawTab(app.url, app.page.drawn_id) as tab:
+        app.wait_until_shown()
+        for number in range(len(lap) + moves):
+            seen, pressed = len(tab.overlays), time.perf_counter()
+            tab.press(lap[number % len(lap)])
+            while len(tab.overlays) == seen:
+                if time.perf_counter() - pressed > 10.0:
+                    raise RuntimeError(f"no picture came within 10 s: {app.state.error}")
+                time.sleep(0.0005)
+            times.append(tab.overlays[-1][0] - pressed)
+            app.wait_until_shown()
+            time.sleep(pause)
+        stale = tab.overlays[-1][1] != app.stage.sent(OVERLAY)
+    # The first lap has read the frames.
+    return _latency(times[len(lap) :], stale)
+
+
+def _latency(times: list[float], stale: bool) -> Latency:
     ms = 1e3 * np.array(times)
     return Latency(float(np.median(ms)), float(np.percentile(ms, 95)), float(ms.max()), stale)
 
@@ -119,6 +157,11 @@ def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> li
     return samples
 
 
+def _figures(latency: Latency) -> str:
+    times = ", ".join(f"{key} {value:.0f} ms" for key, value in dataclasses.asdict(latency).items() if key != "stale")
+    return f"{times}; stale at the end: {latency.stale}"
+
+
 def main() -> None:
     """Print the figures."""
     leave_a_core_free()
@@ -137,11 +180,8 @@ def main() -> None:
         camera = app.scene.camera(app.state.camera)
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")
         for draws, name in ((True, "tab that draws at once"), (False, "tab that never answers")):
-            latency = slider_latency(app, draws=draws)
-            figures = ", ".join(
-                f"{key} {value:.0f} ms" for key, value in dataclasses.asdict(latency).items() if key != "stale"
-            )
-            print(f"slider to overlay, {name}: {figures}; stale at the end of a drag: {latency.stale}")
+            print(f"slider to overlay, {name}: {_figures(slider_latency(app, draws=draws))}")
+        print(f"key to next frame with overlay, read before: {_figures(frame_latency(app))}")
         for iterations, megabytes in memory_while_optimizing(app, arguments.iterations):
             print(f"memory after {iterations} iterations: {megabytes:.0f} MB")
 

@@ -64,7 +64,8 @@ def refusal(data: object, value_of: Callable[[str], Any]) -> str | None:
         return "it is text"
     try:
         message = _DECODER.decode(data)
-    except msgspec.DecodeError as error:
+    # The latter two are what it raises for text that is no UTF-8 and for depth without end.
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         return str(error)
     if isinstance(message, GuiUpdateMessage):
         return _value_refusal(message.updates.value, value_of(message.uuid))

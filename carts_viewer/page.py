@@ -158,6 +158,11 @@ class Page:
         handles = self.server.gui._gui_input_handle_from_uuid.values()
         return next(handle for handle in handles if getattr(handle, "label", None) == label)
 
+    def command_id(self, label: str) -> str:
+        """The id by which a tab triggers the command with this label (for tests and scripts)."""
+        commands = self.server.gui._command_handle_from_uuid
+        return next(element for element, command in commands.items() if command.label == label)
+
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
         return handle._impl.uuid

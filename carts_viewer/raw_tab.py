@@ -36,6 +36,7 @@ class RawTab:
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._connection: ClientConnection | None = None
         self._drawings = 0
+        self._joined = threading.Event()
         self.overlays: deque[tuple[float, bytes]] = deque(maxlen=keep)
         """Time of arrival [s, perf_counter] and PNG of every overlay."""
         self.values: dict[str, Any] = {}
@@ -47,6 +48,9 @@ class RawTab:
         self._thread.start()
         try:
             asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(20)
+            # Before that, it would take an old value for the present one.
+            if not self._joined.wait(20):
+                raise TimeoutError("The server did not bring the tab up to date within 20 s.")
         except BaseException:
             self._end()
             raise
@@ -123,6 +127,8 @@ class RawTab:
 
     async def _note(self, message: dict[str, Any], arrived: float) -> None:
         updates, props = message.get("updates", {}), message.get("props", {})
+        if message["type"] == "ReplayDoneMessage":
+            self._joined.set()
         if message["type"] == "GuiUpdateMessage" and "value" in updates:
             self.values[message["uuid"]] = updates["value"]
         if "uuid" in message:

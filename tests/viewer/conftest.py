@@ -1,6 +1,7 @@
 """A running viewer of a tiny sequence, a tab without a browser, and a real browser."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -9,12 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 from playwright.sync_api import Browser, sync_playwright
+from viewer_canvas import Canvas, mark_frames
 from viewer_desk import Desk
+from viewer_tab import Tab
 
 from carts_core.data import Sequence
 from carts_core.features.network import Architecture, FeatureNetwork
 from carts_core.features.weights import save_weights
 from carts_core.project import Project
+from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.running import OptimizerFactory
 
@@ -68,3 +72,36 @@ def browser() -> Iterator[Browser]:
         chromium = playwright.chromium.launch(executable_path=executable, args=FLAGS)
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
+    """Opens a tab of a viewer, in a window of any size, when the first picture is there."""
+    with ExitStack() as stack:
+
+        def make(app: ViewerApp, window: tuple[int, int] = (1280, 800)) -> Tab:
+            context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
+            stack.callback(context.close)
+            page = context.new_page()
+            page.goto(app.url)
+            tab = Tab(app, page, Canvas(app, page))
+            tab.wait_until_ready()
+            return tab
+
+        yield make
+
+
+@pytest.fixture
+def open_marked(open_viewer: Callable[..., ViewerApp]) -> Callable[..., ViewerApp]:
+    """Opens a viewer whose frames carry discs, through an uneven lens off the centre, with a solid mask on top."""
+
+    def uneven(text: str) -> str:
+        return re.sub(r"K = .*", "K = [[390.0, 0.0, 130.0], [0.0, 372.0, 128.0], [0.0, 0.0, 1.0]]", text)
+
+    def make() -> ViewerApp:
+        app = open_viewer(width=320, height=240, edit=uneven, masks=False, prepare=mark_frames)
+        app.mailbox.put(ask.SetOpacity(1.0))
+        app.wait_until_shown()
+        return app
+
+    return make

@@ -2,83 +2,22 @@
 
 import io
 import math
-import re
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
-from viewer_canvas import Canvas, eventually, mark_frames
+from playwright.sync_api import Browser, expect
+from viewer_canvas import eventually
+from viewer_tab import Tab
 
-from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture import Painter
 from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser
-
-WINDOW = (1280, 800)
-
-
-@dataclass
-class Tab:
-    """One tab of the viewer."""
-
-    app: ViewerApp
-    page: Page
-    canvas: Canvas
-
-    def button(self, name: str) -> None:
-        # Controls of one panel share a sender that keeps the newest message of 50 ms, so a hasty click could be lost.
-        self.page.wait_for_timeout(80)
-        self.page.get_by_role("button", name=name, exact=True).click()
-
-    def type_value(self, handle: object, value: float) -> None:
-        """Type into the number field beside a slider, as a person does."""
-        field = self.page.locator(f"[id='{self.app.page.element_id(handle)}'] + * input")
-        field.click()
-        field.press("Control+a")
-        field.press_sequentially(f"{value:g}", delay=60)
-        field.press("Tab")
-
-
-@pytest.fixture
-def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
-    """Opens a tab of a viewer, in a window of any size, when the first picture is there."""
-    with ExitStack() as stack:
-
-        def make(app: ViewerApp, window: tuple[int, int] = WINDOW) -> Tab:
-            context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
-            stack.callback(context.close)
-            page = context.new_page()
-            page.goto(app.url)
-            page.wait_for_function("window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
-            # viser warns that this browser has no graphics card, on top of our tool bar.
-            page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
-            return Tab(app, page, Canvas(app, page))
-
-        yield make
-
-
-@pytest.fixture
-def open_marked(open_viewer: Callable[..., ViewerApp]) -> Callable[..., ViewerApp]:
-    """Opens a viewer whose frames carry discs, through an uneven lens off the centre, with a solid mask on top."""
-
-    def uneven(text: str) -> str:
-        return re.sub(r"K = .*", "K = [[390.0, 0.0, 130.0], [0.0, 372.0, 128.0], [0.0, 0.0, 1.0]]", text)
-
-    def make() -> ViewerApp:
-        app = open_viewer(width=320, height=240, edit=uneven, masks=False, prepare=mark_frames)
-        app.mailbox.put(ask.SetOpacity(1.0))
-        app.wait_until_shown()
-        return app
-
-    return make
 
 
 @pytest.mark.parametrize("window", [(1280, 800), (1000, 950), (1700, 620)])

@@ -1,0 +1,37 @@
+"""One tab of the viewer in a real browser."""
+
+from dataclasses import dataclass
+
+from playwright.sync_api import Page
+from viewer_canvas import Canvas
+
+from carts_viewer.app import ViewerApp
+
+
+@dataclass
+class Tab:
+    """One tab of the viewer."""
+
+    app: ViewerApp
+    page: Page
+    canvas: Canvas
+
+    def button(self, name: str) -> None:
+        # Controls of one panel share a sender that keeps the newest message of 50 ms, so a hasty click could be lost.
+        self.page.wait_for_timeout(80)
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def type_value(self, handle: object, value: float) -> None:
+        """Type into the number field beside a slider, as a person does."""
+        field = self.page.locator(f"[id='{self.app.page.element_id(handle)}'] + * input")
+        field.click()
+        field.press("Control+a")
+        field.press_sequentially(f"{value:g}", delay=60)
+        field.press("Tab")
+
+    def wait_until_ready(self) -> None:
+        """Wait for the first picture, and take away viser's warning that this browser has no graphics card."""
+        self.page.wait_for_function(
+            "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000
+        )
+        self.page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
