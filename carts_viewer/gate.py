@@ -41,7 +41,7 @@ def gated(respond: Callable[[Request], Response | None], refuse: Callable[[objec
                     return data
                 if not getattr(self, "warned", False):
                     self.warned = True
-                    _log.warning("A tab sent a message that the viewer does not take: %s", reason)
+                    _log.warning("A tab sent a message that the viewer does not take: %.200r", reason)
 
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def guarded(connection: Any, request: Request) -> Any:

@@ -71,7 +71,7 @@ class Guard:
             headers: Of the request.
         """
         hosts = headers.get_all("Host")
-        if len(hosts) != 1 or not self._is_ours(_hostname(f"//{hosts[0]}")):
+        if len(hosts) != 1 or not self._is_ours(_hostname(hosts[0])):
             return f"The viewer answers by its own address only, and was asked for {', '.join(hosts)!r}."
         for origin in headers.get_all("Origin"):
             if origin != f"http://{hosts[0]}":
@@ -153,10 +153,11 @@ def _bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _hostname(url: str) -> str | None:
+def _hostname(host: str) -> str | None:
+    """Of what a `Host` header says; None for what is more, or less, than a name and a port."""
     try:
-        parts = urlsplit(url)
+        parts = urlsplit(f"//{host}")
         _ = parts.port  # Raises when it is none.
-        return parts.hostname
     except ValueError:
         return None
+    return parts.hostname if parts.netloc == host and parts.username is None else None

@@ -46,7 +46,11 @@ def test_this_computers_own_names_are_answered(local: Guard, host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:8080", "127.0.0.1.evil.example", "", "192.168.0.7:8080", "[", "localhost:x"]
+    "host",
+    [
+        *("evil.example", "evil.example:8080", "127.0.0.1.evil.example", "", "192.168.0.7:8080"),
+        *("[", "localhost:x", "localhost/x", "localhost?x", "a; b@localhost", "localhost:1 localhost", "@localhost"),
+    ],
 )
 def test_a_foreign_host_name_is_refused_so_that_dns_rebinding_does_not_work(local: Guard, host: str) -> None:
     assert "was asked for" in (_refusal(local, host) or "")

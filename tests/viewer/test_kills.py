@@ -143,7 +143,7 @@ class Tally:
 
 def _survive(kills: int, sequence_path: Path, weights: Path, exports: Path) -> Tally:
     processes = multiprocessing.get_context("forkserver")
-    # Every life is forked from a process that has imported everything and done nothing. It does not know pytest's paths.
+    # Every life is forked from a process that has imported everything and done nothing.
     processes.set_forkserver_preload(["carts_viewer.app", "carts_core.export"])
     sequence = Sequence.open(sequence_path)
     project_path = sequence_path.with_suffix(".carts")
