@@ -107,7 +107,8 @@ class RawTab:
 
     async def _close(self) -> None:
         assert self._connection is not None
-        await self._connection.close()
+        if self.connected:
+            await self._connection.close()
         await asyncio.gather(self._reader, return_exceptions=True)
 
     def _end(self) -> None:
