@@ -36,9 +36,7 @@ def _agree(tabs: list[Tab]) -> None:
             expect(field).to_have_value(f"{value:g}", timeout=20_000)
         expect(tab.page.get_by_text(f"({state.index + 1} of {len(app.sequence)})")).to_be_visible(timeout=20_000)
         tab.page.get_by_text("Review", exact=True).first.click()
-        expect(tab.page.locator(f"[id='{app.page.element_id(app.page.find('Note'))}']")).to_have_value(
-            state.review.note
-        )
+        expect(tab.page.locator(".mantine-TextInput-input:visible")).to_have_value(state.review.note)
         history = tab.page.locator(f"[id='{app.page.element_id(app.page.find('Go to'))}']")
         expect(history).to_have_value(app.page.find("Go to").value)
         assert tab.canvas.eventually_registered() <= 1.5
