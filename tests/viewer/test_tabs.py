@@ -13,7 +13,6 @@ from viewer_tab import Tab
 
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
-from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser
 
@@ -113,22 +112,6 @@ def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
         expect(tab.page.get_by_text("(10 of 12)")).to_be_visible(timeout=20_000)
 
 
-def test_a_run_that_one_tab_starts_is_seen_and_paused_by_the_others(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_viewer()
-    for name, value in (("working_width", 96), ("iterations", 10_000), ("tolerance", 0.0)):
-        app.mailbox.put(ask.SetSetting(name, value))
-    first, second, third = (open_tab(app, WINDOW) for _ in range(3))
-    first.button("Run")
-    for tab in (second, third):
-        expect(tab.page.locator(".carts-status")).to_contain_text("running", timeout=30_000)
-    second.button("Pause")
-    eventually(lambda: app.state.run.phase, lambda phase: phase is Phase.PAUSED)
-    for tab in (first, third):
-        expect(tab.page.get_by_role("button", name="Continue", exact=True)).to_be_enabled(timeout=20_000)
-
-
 def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
     tiny_sequence: Callable[..., object], untrained_weights: object, browser: Browser
 ) -> None:
@@ -170,10 +153,7 @@ def test_a_link_cannot_make_the_page_obey_another_server(
         threading.Thread(target=listen, args=(listener,), daemon=True).start()
         listener.settimeout(15)
         page = context.new_page()
-        refused: list[str] = []
-        page.on("console", lambda message: refused.append(message.text))
         page.goto(f"{app.url}/?websocket=ws://127.0.0.1:{listener.getsockname()[1]}")
-        eventually(lambda: refused, lambda lines: any("Content Security Policy" in line for line in lines))
-        page.wait_for_timeout(1000)
+        page.wait_for_timeout(5000)
         assert not called.is_set()
     context.close()
