@@ -15,7 +15,7 @@ from carts_core.optimization import FreeParameters, OptimizerSettings
 from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
-from carts_viewer.guard import check_loopback
+from carts_viewer.guard import check_address
 from carts_viewer.layers import Layer
 from carts_viewer.layout import Layout
 from carts_viewer.mailbox import Mailbox
@@ -110,7 +110,7 @@ class ViewerApp:
         Args:
             path: The sequence file.
             project: The project file, begun if it is not there; None for the default place.
-            host: A loopback address or `localhost`.
+            host: The address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: Where to render and optimize, say `cpu` or `cuda`.
             weights: Weights files; a network that none is given of is the shipped one.
@@ -119,7 +119,7 @@ class ViewerApp:
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
         """
-        check_loopback(host)
+        check_address(host, port)
         report(f"Opening {path}")
         sequence = Sequence.open(path, progress=report)
         storage = open_storage(sequence, project)
@@ -243,7 +243,7 @@ def serve(
     Args:
         sequence_path: The sequence file.
         project: The project file, begun if it is not there; None for the default place.
-        host: A loopback address or `localhost`.
+        host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
         weights: Weights files; a network that none is given of is the shipped one.

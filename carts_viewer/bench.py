@@ -1,4 +1,4 @@
-"""Measures the viewer: how long a moved slider takes to become an overlay, and whether memory stays flat.
+"""Measures the viewer: from a moved slider to its overlay, from a key to the next frame, and whether memory stays flat.
 
     python -m carts_viewer.bench [SEQUENCE]
 
@@ -6,28 +6,21 @@ The sliders are moved over a real websocket, as a browser moves them (at most 20
 """
 
 import argparse
-import asyncio
 import dataclasses
 import tempfile
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
-import viser
-import zstandard
-from viser import _messages as messages
-from websockets.asyncio.client import ClientConnection, connect
-from websockets.typing import Subprotocol
 
 from carts_core.data.bench import resident_megabytes
 from carts_core.resources import sample_sequence
 from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
+from carts_viewer.raw_tab import RawTab
 from carts_viewer.stage import OVERLAY
 from carts_viewer.state import Phase
 
@@ -36,91 +29,15 @@ _SETTLE = 0.5
 _ITERATIONS = 500
 
 
-class RawTab:
-    """A tab without a browser: speaks viser's protocol, sets widgets to anything, and notes arriving overlays."""
-
-    def __init__(self, url: str, drawn: str | None = None) -> None:
-        """
-        Args:
-            url: The page's address.
-            drawn: Id of the field in which a tab says that it has drawn an overlay; None for a tab that never says so.
-        """
-        self._url = url.replace("http://", "ws://")
-        self._drawn = drawn
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._connection: ClientConnection | None = None
-        self.overlays: list[tuple[float, bytes]] = []
-        """Time of arrival [s, perf_counter] and PNG of every overlay."""
-        self.values: dict[str, Any] = {}
-        """Newest value of every widget that the server has set, by id."""
-
-    def __enter__(self) -> "RawTab":
-        self._thread.start()
-        asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(20)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result(20)
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(10)
-
-    def set(self, element: str, value: Any) -> None:
-        """Set a widget's value, whatever the page would allow."""
-        self._send(messages.GuiUpdateMessage(element, {"value": value}))
-
-    def _send(self, message: messages.Message) -> None:
-        asyncio.run_coroutine_threadsafe(self._push(message), self._loop).result(20)
-
-    async def _push(self, message: messages.Message) -> None:
-        assert self._connection is not None
-        await self._connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-
-    async def _open(self) -> None:
-        protocol = Subprotocol(f"viser-v{viser.__version__}")
-        self._connection = await connect(self._url, subprotocols=[protocol], max_size=None, compression=None)
-        # viser counts a tab as connected once it has said where its camera is.
-        await self._push(
-            messages.ViewerCameraMessage(
-                (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.1), (0.0, -1.0, 0.0)
-            )
-        )
-        self._reader = asyncio.create_task(self._read(self._connection))
-
-    async def _close(self) -> None:
-        assert self._connection is not None
-        await self._connection.close()
-        await asyncio.gather(self._reader, return_exceptions=True)
-
-    async def _read(self, connection: ClientConnection) -> None:
-        zstd = zstandard.ZstdDecompressor()
-        async for data in connection:
-            assert isinstance(data, bytes)
-            arrived = time.perf_counter()
-            size, packed = (int.from_bytes(data[start : start + 8], "little") for start in (0, 8))
-            inner = msgspec.msgpack.decode(zstd.decompress(data[16 : 16 + packed], max_output_size=size))
-            for message in inner["messages"]:
-                await self._note(message, arrived)
-
-    async def _note(self, message: dict[str, Any], arrived: float) -> None:
-        updates = message.get("updates", {})
-        if message["type"] == "GuiUpdateMessage" and "value" in updates:
-            self.values[message["uuid"]] = updates["value"]
-        if message.get("name") == OVERLAY and "_data" in (updates or message.get("props", {})):
-            self.overlays.append((arrived, (updates or message["props"])["_data"]))
-            if self._drawn is not None:
-                await self._push(messages.GuiUpdateMessage(self._drawn, {"value": f"{id(self)} {len(self.overlays)}"}))
-
-
 @dataclass(frozen=True)
 class Latency:
-    """Times from a moved slider to its overlay [ms]."""
+    """Times from what somebody does to the picture that shows it [ms]."""
 
     median: float
     p95: float
     worst: float
     stale: bool
-    """Whether the last overlay of a drag was not the one of the last value."""
+    """Whether the last overlay was not the one of the last value or frame."""
 
 
 def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True) -> Latency:
@@ -157,6 +74,43 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
             app.mailbox.put(ask.BackToMeasured())
             app.wait_until_shown()
             shown.clear()
+    return _latency(times, stale)
+
+
+def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: float = 0.15) -> Latency:
+    """Press the keys for the next and the previous frame, and wait for frame and overlay, which are sent together.
+
+    The frames have been read before. The times end with the arrival at the tab, so they contain the server's sending.
+
+    Args:
+        app: The viewer.
+        moves: How many keys are pressed.
+        frames: How many frames to go forth before going back.
+        pause: Between two keys [s].
+    """
+    forth, back = (app.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
+    count = min(frames, len(app.sequence)) - 1
+    lap = [forth] * count + [back] * count
+    app.mailbox.put(ask.ShowFrame(0))
+    times: list[float] = []
+    with RawTab(app.url, app.page.drawn_id) as tab:
+        app.wait_until_shown()
+        for number in range(len(lap) + moves):
+            seen, pressed = len(tab.overlays), time.perf_counter()
+            tab.press(lap[number % len(lap)])
+            while len(tab.overlays) == seen:
+                if time.perf_counter() - pressed > 10.0:
+                    raise RuntimeError(f"no picture came within 10 s: {app.state.error}")
+                time.sleep(0.0005)
+            times.append(tab.overlays[-1][0] - pressed)
+            app.wait_until_shown()
+            time.sleep(pause)
+        stale = tab.overlays[-1][1] != app.stage.sent(OVERLAY)
+    # The first lap has read the frames.
+    return _latency(times[len(lap) :], stale)
+
+
+def _latency(times: list[float], stale: bool) -> Latency:
     ms = 1e3 * np.array(times)
     return Latency(float(np.median(ms)), float(np.percentile(ms, 95)), float(ms.max()), stale)
 
@@ -203,6 +157,11 @@ def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> li
     return samples
 
 
+def _figures(latency: Latency) -> str:
+    times = ", ".join(f"{key} {value:.0f} ms" for key, value in dataclasses.asdict(latency).items() if key != "stale")
+    return f"{times}; stale at the end: {latency.stale}"
+
+
 def main() -> None:
     """Print the figures."""
     leave_a_core_free()
@@ -221,11 +180,8 @@ def main() -> None:
         camera = app.scene.camera(app.state.camera)
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")
         for draws, name in ((True, "tab that draws at once"), (False, "tab that never answers")):
-            latency = slider_latency(app, draws=draws)
-            figures = ", ".join(
-                f"{key} {value:.0f} ms" for key, value in dataclasses.asdict(latency).items() if key != "stale"
-            )
-            print(f"slider to overlay, {name}: {figures}; stale at the end of a drag: {latency.stale}")
+            print(f"slider to overlay, {name}: {_figures(slider_latency(app, draws=draws))}")
+        print(f"key to next frame with overlay, read before: {_figures(frame_latency(app))}")
         for iterations, megabytes in memory_while_optimizing(app, arguments.iterations):
             print(f"memory after {iterations} iterations: {megabytes:.0f} MB")
 

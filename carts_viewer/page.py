@@ -1,6 +1,6 @@
 """Everything the viewer needs from viser that viser does not offer publicly, in one place.
 
-- The server is guarded against other sites and other host names, and serves `static/` and our script and style.
+- The server is guarded (`guard.py`, `incoming.py`), and serves `static/` and our script and style.
 - Messages to one client's page (`tell`), and the page's word that it has drawn an overlay (`on_drawn`).
 - Buttons side by side, which viser's panels do not know.
 
@@ -15,48 +15,52 @@ import io
 import json
 import math
 import mimetypes
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import viser
-import websockets.asyncio.server
 from viser._messages import RunJavascriptMessage
-from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from carts_core.errors import CartsError
 from carts_core.resources import static_dir
-from carts_viewer.guard import check_loopback, refusal
+from carts_viewer import incoming
+from carts_viewer.gate import gated, response
+from carts_viewer.guard import Guard, check_address
 
 OWN_KEYS = ("[", "]", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
 
 _TITLE = "<title>Viser</title>"
-_SERVER_CONSTRUCTION = threading.Lock()
+# The token has done its work when the page is there; nobody should copy it out of the address bar by mistake.
+_FORGET_TOKEN = (
+    "const address = new URL(location.href); address.searchParams.delete('token');"
+    "history.replaceState(null, '', address);"
+)
 
 
 class Page:
-    """A viser server that answers this computer's own page only, plus the script that runs in that page."""
+    """A viser server that answers its own page only, plus the script that runs in that page."""
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, title: str = "CaRTS") -> None:
         """Start serving.
 
         Args:
-            host: A loopback address or `localhost`.
+            host: The address to listen on; one that other computers can reach makes the url carry a token.
             port: The port to listen on; 0 picks a free one, a busy one moves up to the next free one.
             title: The browser tab's title.
 
         Raises:
-            SettingsError: `host` is reachable from other computers.
+            SettingsError: `host` is no address of this computer.
         """
-        check_loopback(host)
+        check_address(host, port)
+        self._guard = Guard(host)
         self._title = title
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
-        with _guarded_server(self._respond), contextlib.redirect_stdout(io.StringIO()):
+        with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.url = self._guard.url(self.server.get_port())
         # The page writes into this invisible field when it has drawn a new overlay.
         self._drawn = self.server.gui.add_text("drawn", "", visible=False)
         # And into this one when somebody lets go of a slider or leaves a field.
@@ -168,29 +172,48 @@ class Page:
         handles = self.server.gui._gui_input_handle_from_uuid.values()
         return next(handle for handle in handles if getattr(handle, "label", None) == label)
 
+    def command_id(self, label: str) -> str:
+        """The id by which a tab triggers the command with this label (for tests and scripts)."""
+        commands = self.server.gui._command_handle_from_uuid
+        return next(element for element, command in commands.items() if command.label == label)
+
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
         return handle._impl.uuid
 
     def _respond(self, request: Request) -> Response | None:
         """Our own answer to a request, or None to let viser answer it."""
-        reason = refusal(request.headers.get_all("Host"), request.headers.get_all("Origin"))
+        reason = self._guard.refusal(request.path, request.headers)
         if reason is not None:
-            return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
+            return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
         path = request.path.partition("?")[0]
         if path.startswith("/static/"):
             return self._static(path.removeprefix("/static/"))
         if path in ("/", "/index.html") and request.headers.get("Upgrade") != "websocket":
-            return _response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index())
+            # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
+            own = f"connect-src 'self' ws://{request.headers['Host']} data: blob:"
+            cookie = self._guard.cookie(request.path, request.headers)
+            more = {"Content_Security_Policy": own} | ({} if cookie is None else {"Set_Cookie": cookie})
+            return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(), **more)
         return None
+
+    def _refuse(self, data: object) -> str | None:
+        """Why a tab's message must not reach viser; None when it may."""
+        return incoming.refusal(data, self._value_of)
+
+    def _value_of(self, element: str) -> Any:
+        # A tab may be there before the server's constructor has returned.
+        handles = self.server.gui._gui_input_handle_from_uuid if hasattr(self, "server") else {}
+        handle = handles.get(element)
+        return None if handle is None else handle._impl.value
 
     def _static(self, name: str) -> Response:
         # Only names that a listing of the folder gave are looked up, so no path can leave it.
         file = self._files.get(name)
         if file is None:
-            return _response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")
+            return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")
         kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
-        return _response(http.HTTPStatus.OK, kind, file.read_bytes())
+        return response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
         configuration = json.dumps(
@@ -211,7 +234,7 @@ class Page:
                 f"<title>{html.escape(self._title)}</title>"
                 '<link rel="icon" href="/static/icon.svg" />'
                 '<link rel="stylesheet" href="/static/page.css" />'
-                f"<script>window.cartsConfiguration = {configuration};</script>"
+                f"<script>{_FORGET_TOKEN} window.cartsConfiguration = {configuration};</script>"
                 '<script src="/static/page.js" defer></script>'
                 '<script src="/static/paint.js" defer></script>',
                 1,
@@ -252,35 +275,3 @@ def _index_of_viser() -> str:
             f"{index} is not the page of viser 1.1. Install the pinned version: pip install 'viser~=1.1.1'"
         )
     return text
-
-
-def _response(status: http.HTTPStatus, kind: str, body: bytes) -> Response:
-    headers = Headers()
-    headers["Content-Type"] = kind
-    headers["Content-Length"] = str(len(body))
-    headers["Cache-Control"] = "no-cache"
-    headers["X-Content-Type-Options"] = "nosniff"
-    headers["X-Frame-Options"] = "DENY"
-    return Response(status.value, status.phrase, headers, body)
-
-
-@contextlib.contextmanager
-def _guarded_server(respond: Callable[[Request], Response | None]) -> Iterator[None]:
-    """While active, a websocket server that is started asks `respond` before it answers anything."""
-    original = websockets.asyncio.server.serve
-
-    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def guarded(connection: Any, request: Request) -> Any:
-            answer = respond(request)
-            if answer is not None or process_request is None:
-                return answer
-            return process_request(connection, request)
-
-        return original(*arguments, process_request=guarded, **options)
-
-    with _SERVER_CONSTRUCTION:
-        websockets.asyncio.server.serve = serve  # type: ignore[assignment]
-        try:
-            yield
-        finally:
-            websockets.asyncio.server.serve = original

@@ -19,7 +19,7 @@ class View:
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
-    """Address to listen on; only this machine by default."""
+    """Address to listen on; only this machine by default. Others need the token in the address that is printed."""
     port: int = 8080
     """Port to listen on; the next free one if it is taken."""
     open_browser: bool = False

@@ -7,7 +7,8 @@ import pytest
 
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
-from carts_viewer.bench import memory_while_optimizing, slider_latency
+from carts_viewer.bench import frame_latency, memory_while_optimizing, slider_latency
+from carts_viewer.soak import Soaking
 
 
 @pytest.mark.slow
@@ -19,6 +20,25 @@ def test_no_drag_ends_with_a_stale_overlay_and_every_move_becomes_visible(
         latency = slider_latency(app, drags=2, seconds=2.0, draws=draws)
         assert not latency.stale
         assert 0 < latency.median <= latency.p95 <= latency.worst and isfinite(latency.worst)
+
+
+def test_every_key_brings_its_frame_with_its_overlay(open_viewer: Callable[..., ViewerApp]) -> None:
+    latency = frame_latency(open_viewer(frames=3), moves=6, frames=3, pause=0.0)
+    assert not latency.stale and 0 < latency.median <= latency.p95 <= latency.worst
+
+
+def test_a_short_soak_sees_what_it_is_there_for(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = open_viewer()
+    seen = Soaking(app, run=0.5).soak(0.01)
+    assert seen.rounds == seen.reloads == 1 and seen.frames == 40 and seen.iterations > 0
+    assert not seen.stale and not seen.exceptions and seen.growth == seen.spread == 0.0
+    # A server that no longer sends overlays, and one whose worker fails, are noticed.
+    monkeypatch.setattr(app.stage, "show_overlay", lambda *_: None)
+    assert Soaking(app, run=0.5).soak(0.01).stale
+    monkeypatch.setattr(app.stage, "show_frame", lambda *_: 1 / 0)
+    assert any("unexpected error" in line for line in Soaking(app, run=0.5).soak(0.01).exceptions)
 
 
 @pytest.mark.slow

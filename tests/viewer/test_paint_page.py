@@ -15,9 +15,9 @@ from viewer_tab import Tab
 from carts_core.project import Key
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
-from carts_viewer.bench import RawTab
 from carts_viewer.layers import IGNORED_COLOR
 from carts_viewer.picture import Painter
+from carts_viewer.raw_tab import RawTab
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.strokes import Tool
 

@@ -1,0 +1,143 @@
+"""A tab without a browser, to measure and to attack the viewer with."""
+
+import asyncio
+import threading
+import time
+from collections import deque
+from typing import Any
+
+import msgspec
+import viser
+import zstandard
+from viser import _messages as messages
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from carts_viewer.stage import OVERLAY
+
+
+class RawTab:
+    """Speaks viser's protocol, sets widgets to anything, and notes what arrives. Used as a context."""
+
+    def __init__(
+        self, url: str, drawn: str | None = None, *, keep: int | None = None, origin: str | None = None
+    ) -> None:
+        """
+        Args:
+            url: The page's address.
+            drawn: Id of the field in which a tab says that it has drawn an overlay; None for a tab that never says so.
+            keep: How many overlays to remember; None for all.
+            origin: The header of this name; None for none, as programs do.
+        """
+        self._url = url.replace("http://", "ws://")
+        self._drawn = drawn
+        self._origin = None if origin is None else Origin(origin)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._connection: ClientConnection | None = None
+        self._drawings = 0
+        self._joined = threading.Event()
+        self.overlays: deque[tuple[float, bytes]] = deque(maxlen=keep)
+        """Time of arrival [s, perf_counter] and PNG of every overlay."""
+        self.values: dict[str, Any] = {}
+        """Newest value of every widget that the server has set since this tab came, by id."""
+        self.widgets: dict[str, dict[str, Any]] = {}
+        """Newest known properties of every widget, by id."""
+
+    def __enter__(self) -> "RawTab":
+        self._thread.start()
+        try:
+            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(20)
+            # Before that, it would take an old value for the present one.
+            if not self._joined.wait(20):
+                raise TimeoutError("The server did not bring the tab up to date within 20 s.")
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result(20)
+        self._end()
+
+    def set(self, element: str, value: Any) -> None:
+        """Set a widget's value, whatever the page would allow.
+
+        Raises:
+            ConnectionClosed: the server is gone, or has had enough.
+        """
+        self.send(messages.GuiUpdateMessage(element, {"value": value}).as_serializable_dict())
+
+    def press(self, command: str) -> None:
+        """Trigger the command of a key; errors as `set`."""
+        self.send(messages.CommandTriggerMessage(command).as_serializable_dict())
+
+    def send(self, message: dict[str, Any] | bytes | str) -> None:
+        """Send a message, or any bytes or text; errors as `set`."""
+        data = msgspec.msgpack.encode(message) if isinstance(message, dict) else message
+        asyncio.run_coroutine_threadsafe(self._push(data), self._loop).result(20)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the server still talks to this tab."""
+        return not self._reader.done()
+
+    def close_code(self, timeout: float = 20.0) -> int | None:
+        """Wait until the server ends the connection, and give its code; None when it does not in that time [s]."""
+        end = time.monotonic() + timeout
+        while self.connected and time.monotonic() < end:
+            time.sleep(0.02)
+        return None if self._connection is None or self.connected else self._connection.close_code
+
+    async def _push(self, data: bytes | str) -> None:
+        assert self._connection is not None
+        await self._connection.send(data)
+
+    async def _open(self) -> None:
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        self._connection = await connect(
+            self._url, subprotocols=[protocol], max_size=None, compression=None, origin=self._origin
+        )
+        # viser counts a tab as connected once it has said where its camera is.
+        camera = messages.ViewerCameraMessage(
+            (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.1), (0.0, -1.0, 0.0)
+        )
+        await self._push(msgspec.msgpack.encode(camera.as_serializable_dict()))
+        self._reader = asyncio.create_task(self._read(self._connection))
+
+    async def _close(self) -> None:
+        assert self._connection is not None
+        if self.connected:
+            await self._connection.close()
+        await asyncio.gather(self._reader, return_exceptions=True)
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(10)
+        self._loop.close()
+
+    async def _read(self, connection: ClientConnection) -> None:
+        zstd = zstandard.ZstdDecompressor()
+        async for data in connection:
+            assert isinstance(data, bytes)
+            arrived = time.perf_counter()
+            size, packed = (int.from_bytes(data[start : start + 8], "little") for start in (0, 8))
+            inner = msgspec.msgpack.decode(zstd.decompress(data[16 : 16 + packed], max_output_size=size))
+            for message in inner["messages"]:
+                await self._note(message, arrived)
+
+    async def _note(self, message: dict[str, Any], arrived: float) -> None:
+        updates, props = message.get("updates", {}), message.get("props", {})
+        if message["type"] == "ReplayDoneMessage":
+            self._joined.set()
+        if message["type"] == "GuiUpdateMessage" and "value" in updates:
+            self.values[message["uuid"]] = updates["value"]
+        if "uuid" in message:
+            known = {name: message[name] for name in ("value",) if name in message}
+            self.widgets.setdefault(message["uuid"], {}).update({**known, **props, **updates})
+        if message.get("name") == OVERLAY and "_data" in (updates or props):
+            self.overlays.append((arrived, (updates or props)["_data"]))
+            self._drawings += 1
+            if self._drawn is not None:
+                data = messages.GuiUpdateMessage(self._drawn, {"value": f"{id(self)} {self._drawings}"})
+                await self._push(msgspec.msgpack.encode(data.as_serializable_dict()))

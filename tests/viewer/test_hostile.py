@@ -1,0 +1,268 @@
+"""A hostile tab at the real server: it is refused, the server stays up, and another tab notices nothing."""
+
+import gc
+import http.client
+import logging
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from carts_viewer import intents as ask
+from carts_viewer.app import ViewerApp
+from carts_viewer.page import Page
+from carts_viewer.raw_tab import RawTab
+from carts_viewer.stage import OVERLAY
+
+EVERYWHERE = ".".join("0000")
+
+
+def _get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(url.removeprefix("http://").partition("/")[0], timeout=20)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse()
+
+
+def _wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end, "it did not come true in 20 s"
+        time.sleep(0.02)
+
+
+class Victims:
+    """A viewer, a tab that somebody works in, and what may not change."""
+
+    def __init__(self, app: ViewerApp, tab: RawTab) -> None:
+        self.app = app
+        self.tab = tab
+        self.slider = app.joints.slider("PSM1", 0)
+        self._before = app.state
+        self._value = -5.0
+
+    def unharmed(self) -> None:
+        """Fail unless the other tab still works and nothing has changed."""
+        assert self.app.state.error is None and self.app.state.index == self._before.index
+        self._value += 0.5
+        value = self._value
+        self.tab.set(self.app.page.element_id(self.slider), value)
+        _wait_for(lambda: abs(self.slider.value - value) < 1e-9)
+        self.app.wait_until_shown()
+        _wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.stage.sent(OVERLAY))
+        assert _get(self.app.url).status == 200
+        # Whoever comes now gets all that the server has kept for newcomers.
+        with RawTab(self.app.url) as late:
+            _wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.stage.sent(OVERLAY))
+
+
+@pytest.fixture
+def victims(open_viewer: Callable[..., ViewerApp], caplog: pytest.LogCaptureFixture) -> Iterator[Victims]:
+    """They must be unharmed in the end, and nothing may have gone wrong in the server."""
+    app = open_viewer()
+    with caplog.at_level(logging.ERROR), RawTab(app.url) as tab:
+        victims = Victims(app, tab)
+        yield victims
+        victims.unharmed()
+        gc.collect()  # asyncio tells of an exception that nobody has looked at when its task is thrown away
+        assert [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+
+def _taken(rogue: RawTab, app: ViewerApp) -> None:
+    """Wait until everything that the rogue has sent was read, which the server does in order."""
+    text = f"rogue {time.perf_counter()}"
+    note = app.page.find("Note")
+    rogue.set(app.page.element_id(note), text)
+    _wait_for(lambda: note.value == text)
+    app.wait_until_shown()
+
+
+@pytest.mark.parametrize("label", ["Frame", "Frames/s", "Opacity %", "By [°, mm]", "Seed"])
+def test_numbers_that_are_none_or_beyond_all_range_change_nothing(victims: Victims, label: str) -> None:
+    # A number of more than 64 bits, once the toolkit has it, cannot be sent to any tab: all of them are disconnected.
+    widget = victims.app.page.find(label)
+    before = widget.value
+    with RawTab(victims.app.url) as rogue:
+        for value in (float("nan"), float("inf"), -float("inf"), 1e300, -1e300, "nan", "9" * 4000, None, [1], True):
+            rogue.set(victims.app.page.element_id(widget), value)
+        _taken(rogue, victims.app)
+    assert widget.value == before
+
+
+def test_a_number_beyond_its_widgets_range_is_clamped(victims: Victims) -> None:
+    app = victims.app
+    with RawTab(app.url) as rogue:
+        for label, value in (("Opacity %", 1e9), ("Frames/s", -1e9), ("Frame", -(2**40))):
+            rogue.set(app.page.element_id(app.page.find(label)), value)
+        _taken(rogue, app)
+    assert (app.state.opacity, app.state.fps, app.state.index) == (1.0, 0.5, 0)
+
+
+def test_unknown_controls_and_everything_but_values_are_refused(victims: Victims) -> None:
+    app = victims.app
+    known = app.page.element_id(app.page.find("Note"))
+    with RawTab(app.url) as rogue:
+        rogue.set("no such widget", 1.0)
+        rogue.press("no such command")
+        for name in ("removed", "sync_cb", "update_cb", "disabled", "is_button", "uuid", "__class__", "props"):
+            rogue.send({"type": "GuiUpdateMessage", "uuid": known, "updates": {name: None}})
+        _taken(rogue, app)
+
+
+def test_uploads_tunnels_and_other_messages_of_the_toolkit_are_refused(
+    victims: Victims, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = victims.app
+    asked: list[str] = []
+    monkeypatch.setattr(app.page.server, "request_share_url", lambda *_: asked.append("tunnel"))
+    source = app.page.element_id(app.page.find("Note"))
+    part = {"source_component_uuid": source, "transfer_uuid": "x", "part_index": 0, "content": b"x" * 1000}
+    upload = {
+        "source_component_uuid": source,
+        "transfer_uuid": "x",
+        "filename": "../../x",
+        "mime_type": "a/b",
+        "part_count": 2**40,
+        "size_bytes": 2**60,
+    }
+    with RawTab(app.url) as rogue:
+        rogue.send({"type": "ShareUrlRequest"})
+        rogue.send({"type": "FileTransferStartUpload", **upload})
+        rogue.send({"type": "FileTransferPart", **part})
+        rogue.send({"type": "RunJavascriptMessage", "source": "alert(1)"})
+        rogue.send({"type": "SceneNodeClickMessage", "name": "/frame"})
+        _taken(rogue, app)
+    assert not asked and not app.page.server.gui._current_file_upload_states
+
+
+def test_garbage_is_refused_and_what_comes_after_it_is_not(victims: Victims) -> None:
+    with RawTab(victims.app.url) as rogue:
+        for data in (b"", b"\xc1", "text", b"\x91" * 100_000, b"\x82\xa1a" + b"\x91" * 100_000, b"\x00" * 1_000_000):
+            rogue.send(data)
+        rogue.send({"type": 5})
+        rogue.send({"type": "ViewerCameraMessage", "fov": "wide"})
+        _taken(rogue, victims.app)
+
+
+@pytest.mark.parametrize("size", [2 << 20, 50_000_000])
+def test_a_message_that_is_too_large_ends_the_connection_it_came_by_and_no_other(victims: Victims, size: int) -> None:
+    app = victims.app
+    huge: dict[str, Any] = {
+        "type": "GuiUpdateMessage",
+        "uuid": app.page.element_id(app.page.find("Note")),
+        "updates": {"value": "x" * size},
+    }
+    with RawTab(app.url) as rogue:
+        try:
+            rogue.send(huge)
+        except ConnectionClosed:
+            pass
+        assert rogue.close_code() == 1009
+    assert app.page.find("Note").value == ""
+
+
+def test_a_text_that_is_too_long_is_cut_off(victims: Victims) -> None:
+    app = victims.app
+    with RawTab(app.url) as rogue:
+        rogue.set(app.page.element_id(app.page.find("Note")), "x" * 900_000)
+        _wait_for(lambda: bool(app.state.review.note))
+        app.mailbox.put(ask.Released())
+        app.wait_until_shown()
+    assert 0 < len(app.state.review.note) < 20_000
+    assert len(app.page.find("Note").value) == len(app.state.review.note)
+
+
+def test_another_sites_page_gets_no_connection(victims: Victims) -> None:
+    for origin in ("http://evil.example", "null", victims.app.url.replace("127.0.0.1", "localhost")):
+        with pytest.raises(InvalidStatus) as refused, RawTab(victims.app.url, origin=origin):
+            pass
+        assert refused.value.response.status_code == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/%2e%2e/pyproject.toml",
+        "/static/..\\pyproject.toml",
+        "/..%2f..%2f__init__.py",
+        "/%2e%2e/%2e%2e/__init__.py",
+        "/..\\..\\__init__.py",
+        "/assets/../../../__init__.py",
+        "//etc/passwd",
+        "/static/page.js/../../../pyproject.toml",
+        "/static/page.js%00.txt",
+    ],
+)
+def test_no_path_leads_out_of_what_is_served(victims: Victims, path: str) -> None:
+    assert _get(victims.app.url, path).status == 404
+
+
+def test_the_page_may_connect_to_its_own_server_only(victims: Victims) -> None:
+    # viser's client would connect to any server that `?websocket=` names, and run what that one sends.
+    address = victims.app.url.removeprefix("http://")
+    policy = _get(victims.app.url).headers["Content-Security-Policy"]
+    assert policy == f"connect-src 'self' ws://{address} data: blob:"
+
+
+@pytest.fixture
+def shared_page() -> Iterator[Page]:
+    """A page that every computer can reach."""
+    page = Page(host=EVERYWHERE, port=0)
+    yield page
+    page.close()
+
+
+def _connect(page: Page, path: str = "/", **headers: str) -> int:
+    """The status of an attempt to open a websocket; 101 when it was opened."""
+    url = f"ws://127.0.0.1:{page.server.get_port()}{path}"
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    try:
+        with connect(url, subprotocols=[protocol], additional_headers=headers):
+            return 101
+    except InvalidStatus as refused:
+        return refused.response.status_code
+
+
+def test_where_others_can_reach_it_pages_files_and_websockets_need_the_token(shared_page: Page) -> None:
+    url = f"http://127.0.0.1:{shared_page.server.get_port()}"
+    token = shared_page.url.partition("?")[2]
+    for query in ("", "?token=", f"?{token}x", f"?{token[:-1]}", "?token=%00"):
+        assert _get(url, "/" + query).status == _connect(shared_page, "/" + query) == 403
+        assert _get(url, "/static/page.js" + query).status == 403
+    answer = _get(url, "/?" + token)
+    assert answer.status == 200 and "delete('token')" in answer.read().decode()
+    cookie = answer.headers["Set-Cookie"].partition(";")[0]
+    for path in ("/", "/static/page.js", "/index.html"):
+        assert _get(url, path, Cookie=cookie).status == 200
+    assert _connect(shared_page, Cookie=cookie) == _connect(shared_page, "/?" + token) == 101
+    assert _connect(shared_page, Cookie=cookie + "x") == 403
+    assert _connect(shared_page, Cookie=cookie, Origin="http://evil.example") == 403
+    assert _connect(shared_page, Cookie=cookie, Host="evil.example") == 403
+
+
+def test_the_token_of_one_server_opens_no_other(shared_page: Page) -> None:
+    other = Page(host=EVERYWHERE, port=0)
+    try:
+        path = "/?" + other.url.partition("?")[2]
+        assert _connect(other, path) == 101 and _connect(shared_page, path) == 403
+    finally:
+        other.close()
+
+
+def test_a_program_that_has_the_address_gets_in_with_it(shared_page: Page) -> None:
+    with RawTab(f"http://127.0.0.1:{shared_page.server.get_port()}/?{shared_page.url.partition('?')[2]}") as tab:
+        assert tab.connected
+
+
+def test_a_huge_cookie_or_query_is_refused_and_the_server_stays_up(shared_page: Page) -> None:
+    url = f"http://127.0.0.1:{shared_page.server.get_port()}"
+    for send in (lambda: _get(url, Cookie="a=" + "x" * 200_000), lambda: _get(url, "/?token=" + "x" * 200_000)):
+        try:
+            assert send().status >= 400
+        except (OSError, http.client.HTTPException):
+            pass  # Hung up on, which is as good.
+    assert _get(url, "/?" + shared_page.url.partition("?")[2]).status == 200
