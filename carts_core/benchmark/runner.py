@@ -117,11 +117,10 @@ class _Bench:
             frame, truth = self._covered(frame, truth)
         if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
-        # The default loss needs no background, and only one camera has one in every domain.
-        background = {} if len(cameras) > 1 or covered else {camera: recording.background(camera, run.domain)}
+        settings = method.settings(scope.steps(run))
+        background = {camera: recording.background(camera, run.domain)} if settings.needs_background else {}
         ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
-        settings = method.settings(scope.steps(run))
         scene = known.with_cameras(cameras)
         return optimize(run, scene, frame, background, extractor, settings, truth, renderer, ignore)
 
