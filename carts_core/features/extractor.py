@@ -7,19 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import SettingsError, WeightsError
+from ..errors import WeightsError
 from ..resources import shipped_weights
-from ..surface import flipped, mirrored
 from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
 from .weights import Weights, read_weights
-
-MIRRORS = {
-    1: ((False, False),),
-    2: ((False, False), (True, False)),
-    4: ((False, False), (True, False), (False, True), (True, True)),
-}
-"""Number of views -> along which axes each mirrors the image."""
 
 
 class FeatureExtractor:
@@ -90,24 +82,10 @@ class FeatureExtractor:
 
     @torch.no_grad()
     def surface(
-        self, images: Float[Tensor, "batch 3 h w"], believed: Float[Tensor, "batch 6 h w"], views: int = 1
+        self, images: Float[Tensor, "batch 3 h w"], believed: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
         """Surface maps of what images show, given those of where the arms are believed to be.
 
-        Args:
-            images, believed: as for `SurfaceNetwork.forward`.
-            views: 1 looks at the images alone, 2 also at their mirror images, 4 also at both upside down. The mean of
-                several views errs less than one.
-
-        Raises:
-            SettingsError: another number of channels or views, or another size.
+        Arguments and errors as `SurfaceNetwork.forward`.
         """
-        if views not in MIRRORS:
-            raise SettingsError(f"{views} views are asked for; allowed are {', '.join(map(str, MIRRORS))}.")
-        mirrors = MIRRORS[views]
-        seen = self._surface(
-            torch.cat([flipped(images, *mirror) for mirror in mirrors]).contiguous(memory_format=torch.channels_last),
-            torch.cat([mirrored(believed, *mirror) for mirror in mirrors]),
-        ).map()
-        parts = zip(seen.chunk(views), mirrors, strict=True)
-        return torch.stack([mirrored(part, *mirror) for part, mirror in parts]).mean(0)
+        return self._surface(images.contiguous(memory_format=torch.channels_last), believed).map()

@@ -45,8 +45,6 @@ class OptimizerSettings:
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
-    views: int = 2
-    """`surface`: 1 shows the network the image, 2 also its mirror image, 4 also both upside down; the mean counts."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
     candidates: int = 64
@@ -109,7 +107,6 @@ class OptimizerSettings:
         _require(1 <= self.looks <= 10, "looks", self.looks, "1 to 10")
         blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
-        _require(self.views in (1, 2, 4), "views", self.views, "1, 2 or 4")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
         _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")

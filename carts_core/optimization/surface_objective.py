@@ -139,7 +139,7 @@ class SurfaceObjective:
         """Have the network say what the image shows, knowing the present estimate."""
         believed = self._whole.surface(self.parameters.state(offsets)).maps
         window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
-        observed = self._extractor.surface(window.of(self._images), window.of(believed), self.settings.views)
+        observed = self._extractor.surface(window.of(self._images), window.of(believed))
         silhouette = (believed[:, COVERAGE].sum(1) > 0).to(believed)
         near = attention(silhouette, _ATTENTION[min(look, 1)]) if silhouette.any() else torch.ones_like(silhouette)
         weight = window.of(self._weight * near[:, None])

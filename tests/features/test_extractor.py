@@ -4,7 +4,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from carts_core.errors import SettingsError, WeightsError
+from carts_core.errors import WeightsError
 from carts_core.features import FeatureExtractor
 from carts_core.features.network import Architecture, FeatureNetwork
 from carts_core.features.surface_network import SurfaceNetwork
@@ -127,29 +127,6 @@ def test_a_surface_network_takes_the_place_of_the_shipped_one(tmp_path: Path, sm
         extractor.surface(images, believed), network(images, believed).map(), atol=1e-5, rtol=1e-4
     )
     assert extractor.sha256 != FeatureExtractor.load().sha256
-
-
-def test_more_views_see_mirrored_images_the_mirrored_way(tmp_path: Path, small_architecture: Architecture):
-    torch.manual_seed(3)
-    network = SurfaceNetwork(small_architecture).eval()
-    save_weights(network, tmp_path / "surface.safetensors", {}, (320, 240))
-    extractor = FeatureExtractor.load(tmp_path / "surface.safetensors")
-    images, believed = torch.rand(1, 3, 32, 48), torch.rand(1, 6, 32, 48)
-    one, two, four = (extractor.surface(images, believed, views) for views in (1, 2, 4))
-    assert not torch.allclose(one, two, atol=1e-3)
-    turned = torch.tensor([1, 1, 1, -1, 1, 1]).view(6, 1, 1)
-    other = extractor.surface(images.flip(3), believed.flip(3) * turned).flip(3) * turned
-    torch.testing.assert_close(two, (one + other) / 2, atol=1e-5, rtol=1e-4)
-    # Seen from four sides it does not matter any more which of them is the image's own.
-    upside_down = turned.roll(1, 0)
-    again = extractor.surface(images.flip(2), believed.flip(2) * upside_down, 4).flip(2) * upside_down
-    torch.testing.assert_close(again, four, atol=1e-5, rtol=1e-4)
-
-
-@pytest.mark.parametrize("views", [0, 3])
-def test_views_that_do_not_exist_are_refused(views: int):
-    with pytest.raises(SettingsError, match=rf"{views} views .*1, 2, 4"):
-        FeatureExtractor.load().surface(torch.rand(1, 3, 32, 48), torch.rand(1, 6, 32, 48), views)
 
 
 def test_two_files_of_one_kind_are_refused_by_name(small_weights: Path):

@@ -20,8 +20,8 @@ class PerfectSight:
         fine = Renderer(sequence.scene, width=640, height=480).surface(truth).maps
         self.maps = functional.avg_pool2d(fine, 2)
 
-    def surface(self, images: torch.Tensor, believed: torch.Tensor, views: int = 1) -> torch.Tensor:
-        """The truth, in every view, cut to the window that `believed` lies in."""
+    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+        """The truth, cut to the window that `believed` lies in."""
         state = Window(0, 0, self.maps.shape[3], self.maps.shape[2])
         left, top = self.where
         window = Window(left, top, images.shape[3], images.shape[2])

@@ -39,7 +39,7 @@ class PerfectSight:
         ]
         self.window = Window(0, 0, *SIZE)
 
-    def surface(self, images: torch.Tensor, believed: torch.Tensor, views: int = 1) -> torch.Tensor:
+    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
         """The truth of the frame whose images these are."""
         return self.window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
 
