@@ -97,7 +97,9 @@ class Annotator:
     @handle.register
     def _(self, intent: ask.AcceptAndNext) -> None:
         self._review(ReviewState.ACCEPTED)
-        self.handle(ask.ShowUnreviewed())
+        # Whoever accepts the last frame is done, which is no error.
+        if next_unreviewed(self._controller.state.project, self._controller.state.index) is not None:
+            self.handle(ask.ShowUnreviewed())
 
     @handle.register
     def _(self, intent: ask.ShowUnreviewed) -> None:
