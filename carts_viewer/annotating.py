@@ -137,7 +137,8 @@ class Annotator:
         state = self._controller.state
         index = state.index + (1 if intent.step > 0 else -1)
         if not 0 <= index < len(self._session.sequence):
-            raise CartsError(f"Frame {state.frame.frame_id} is at the end; there is no frame to copy from.")
+            side = "after" if intent.step > 0 else "before"
+            raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
         source = self._session.sequence.frame(index, cameras=[])
         scene = self._session.copied(state.frame, source)
         self._controller.edit(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)
