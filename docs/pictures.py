@@ -14,19 +14,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from carts_core.keypoints import project_keypoints
 from carts_core.resources import sample_sequence
 from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
-from carts_viewer.layers import Layer
 from carts_viewer.marks import labelled_keypoints
 from carts_viewer.state import Phase
 from carts_viewer.strokes import Stroke, Target
 
 IMAGES = Path(__file__).parent / "images"
+WINDOW: ViewportSize = {"width": 1280, "height": 800}
 QUALITY = 82
 PATIENCE = 600.0
 """How long anything may take [s]."""
@@ -62,10 +62,15 @@ class Photographer:
     def tab(self, name: str) -> None:
         self.page.get_by_text(name, exact=True).first.click()
 
-    def picture(self, name: str, size: tuple[int, int] = (1280, 800)) -> None:
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list."""
+        self.page.locator(f"[id='{self.app.page.element_id(self.app.page.find(label))}']").click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+        self.page.wait_for_timeout(500)
+
+    def picture(self, name: str) -> None:
         """Write `images/NAME.jpg` of the whole page."""
-        self.page.set_viewport_size({"width": size[0], "height": size[1]})
-        self.page.mouse.move(size[0] / 2, size[1] - 1)
+        self.page.mouse.move(WINDOW["width"] / 2, WINDOW["height"] - 1)
         self.page.wait_for_timeout(2500)
         self.page.screenshot(path=IMAGES / f"{name}.jpg", type="jpeg", quality=QUALITY)
 
@@ -108,19 +113,16 @@ def take(work: Photographer) -> None:
     work.do(ask.Undo(), ask.Undo(), ask.ShowFrame(0), ask.AcceptAndNext(), ask.AcceptAndNext(), ask.ShowFrame(8))
     work.run()
     work.do(ask.HoldKeyframe(True), ask.ShowFrame(5), ask.Solve())
-    work.wait(lambda: app.state.solve is not None and app.state.solve.done >= 3)
-    work.picture("solve")
     work.wait(lambda: not app.state.solving)
+    work.picture("solve")
     work.do(ask.ShowFrame(2), *[ask.AcceptAndNext()] * 5, ask.SetNote("check the jaw of psm2"), ask.Released())
     work.picture("review")
     work.tab("Export")
-    work.do(ask.Export("coco", "Accepted"))
+    work.choose("Format", "COCO")
+    work.choose("Frames", "Accepted")
+    work.page.get_by_role("button", name="Export", exact=True).click()
     work.wait(lambda: app.state.export is not None and app.state.export.path is not None)
     work.picture("export")
-    work.tab("Optimize")
-    work.do(ask.ShowFrame(1), ask.ShowLayer(Layer.MASK), ask.Perturb(2.0, 0))
-    work.run()
-    work.picture("viewer", (1440, 860))
 
 
 def main() -> None:
@@ -129,12 +131,12 @@ def main() -> None:
     chromium = os.environ.get("CARTS_CHROMIUM") or shutil.which("chromium")
     IMAGES.mkdir(exist_ok=True)
     with (
-        tempfile.TemporaryDirectory() as folder,
+        tempfile.TemporaryDirectory(prefix="carts_") as folder,
         ViewerApp.open(sample_sequence(), project=Path(folder) / "sample.carts", port=0) as app,
         sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        take(Photographer(app, browser.new_page(viewport={"width": 1280, "height": 800})))
+        take(Photographer(app, browser.new_page(viewport=WINDOW)))
         browser.close()
     for path in sorted(IMAGES.glob("*.jpg")):
         print(f"{path.name}: {path.stat().st_size // 1024} KiB")
