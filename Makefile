@@ -10,7 +10,7 @@ BIN := .venv/bin
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help view test lint format bench wheel setup setup-dev clean
+.PHONY: help view test lint format bench pictures wheel setup setup-dev clean
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ bench: setup-dev ## Run the slow tests and print the measurements
 	$(BIN)/python -m carts_core.data.bench
 	$(BIN)/python -m carts_viewer.bench
 	$(BIN)/carts bench --quick
+
+pictures: setup-dev ## Take the pictures of the README and the tutorial again
+	chromium=$$($(BIN)/python .ci/chromium.py) && CARTS_CHROMIUM=$$chromium $(BIN)/python docs/pictures.py
 
 wheel: setup-dev ## Build the sdist and the wheel into dist/
 	$(BIN)/python -m hatchling build -t sdist -t wheel

@@ -97,7 +97,9 @@ class Annotator:
     @handle.register
     def _(self, intent: ask.AcceptAndNext) -> None:
         self._review(ReviewState.ACCEPTED)
-        self.handle(ask.ShowUnreviewed())
+        # Whoever accepts the last frame is done, which is no error.
+        if next_unreviewed(self._controller.state.project, self._controller.state.index) is not None:
+            self.handle(ask.ShowUnreviewed())
 
     @handle.register
     def _(self, intent: ask.ShowUnreviewed) -> None:
@@ -135,7 +137,8 @@ class Annotator:
         state = self._controller.state
         index = state.index + (1 if intent.step > 0 else -1)
         if not 0 <= index < len(self._session.sequence):
-            raise CartsError(f"Frame {state.frame.frame_id} is at the end; there is no frame to copy from.")
+            side = "after" if intent.step > 0 else "before"
+            raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
         source = self._session.sequence.frame(index, cameras=[])
         scene = self._session.copied(state.frame, source)
         self._controller.edit(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)

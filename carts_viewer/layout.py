@@ -52,7 +52,7 @@ class Layout:
         gui.main_panel.dock_left()
         gui.main_panel.set_width(_WIDTH)
         panels: list[Panel] = [
-            SavedPanel(page, storage),
+            SavedPanel(page, storage, emit),
             MessagePanel(page, emit),
             BrowsePanel(page, session, emit, waits),
             OverlayPanel(page, session, state, emit, waits),

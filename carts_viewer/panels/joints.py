@@ -41,11 +41,12 @@ class JointsPanel:
             with tabs.add_tab(arm.name, viser.Icon.GRAIN):
                 self._add_arm(page, arm.name, state, emit)
         window = gui.add_dropdown("Slider range", list(_WINDOWS), initial_value="± 20")
+        perturb = gui.add_button("Perturb all joints", color="gray")
         self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
         page.columns([self._degrees, self._seed], narrow_labels=True)
-        perturb = gui.add_button("Perturb all joints", color="gray")
-        measured = gui.add_button("Back to measured", icon=viser.Icon.HISTORY, color="gray")
+        back = "All back to measured" if len(session.scene.arms) > 1 else "Back to measured"
+        measured = gui.add_button(back, icon=viser.Icon.HISTORY, color="gray")
         before = gui.add_button("Copy previous", color="gray", hint="Correct by as much as the previous frame is")
         after = gui.add_button("Copy next", color="gray", hint="Correct by as much as the next frame is")
         page.row(before, after)

@@ -20,7 +20,7 @@ class KeyframesPanel:
         gui = page.server.gui
         self._ids = session.sequence.frame_ids
         self._seen: tuple[ProjectState | None, int] = (None, -1)
-        self._any_kept, self._plan = False, ""
+        self._solvable, self._plan = False, ""
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
                 "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
@@ -45,7 +45,7 @@ class KeyframesPanel:
         self._all.disabled = self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)
-        self._between.disabled = state.solving or not self._any_kept
+        self._between.disabled = state.solving or not self._solvable
         lines = [] if state.solving else [self._plan]
         if state.solve is not None:
             self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
@@ -58,8 +58,8 @@ class KeyframesPanel:
             return
         self._seen = (state.project, state.index)
         kept, frames = set(state.project.kept_frames), between_kept(state.project, state.index)
-        self._any_kept = bool(kept)
         count = sum(frame not in kept for frame in frames)
+        self._solvable = bool(kept) and count > 0
         first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
         self._plan = (
             f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"

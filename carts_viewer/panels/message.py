@@ -14,6 +14,7 @@ class MessagePanel:
     def __init__(self, page: Page, emit: Emit) -> None:
         self._server = page.server
         self._shown: str | None = None
+        self._notes: list[viser.NotificationHandle] = []
         self._text = page.server.gui.add_html("", visible=False)
         self._dismiss = page.server.gui.add_button("Dismiss", icon=viser.Icon.X, color="red", visible=False)
         on_click(self._dismiss, lambda _: ask.DismissError(), emit)
@@ -23,8 +24,12 @@ class MessagePanel:
         if state.error == self._shown:
             return
         self._shown = state.error
+        while self._notes:
+            self._notes.pop().remove()
         self._text.visible = self._dismiss.visible = state.error is not None
         self._text.content = f'<p class="carts-error" role="alert">{escaped(state.error or "")}</p>'
         if state.error is not None:
-            for client in self._server.get_clients().values():
+            self._notes = [
                 client.add_notification("That did not work", state.error, color="red", auto_close_seconds=12.0)
+                for client in self._server.get_clients().values()
+            ]

@@ -1,4 +1,4 @@
-"""Where everything is saved, whether it is, and the history: undo, redo, and going to any step."""
+"""Where everything is saved, whether it is, undo and redo, and the history to go to any step."""
 
 import viser
 
@@ -13,16 +13,22 @@ _LISTED = 60
 
 
 class SavedPanel:
-    """One line that says whether everything is saved, and a banner where nothing is."""
+    """Whether everything is saved, a banner where nothing is, and undo and redo, always at hand."""
 
-    def __init__(self, page: Page, storage: Storage) -> None:
+    def __init__(self, page: Page, storage: Storage, emit: Emit) -> None:
+        gui = page.server.gui
         self._storage = storage
         if storage.notice is not None:
-            page.server.gui.add_html(f'<p class="carts-notice" role="status">{escaped(storage.notice)}</p>')
-        self._text = page.server.gui.add_html("")
+            gui.add_html(f'<p class="carts-notice" role="status">{escaped(storage.notice)}</p>')
+        self._text = gui.add_html("")
+        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
+        self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
+        page.row(self._undo, self._redo)
+        on_click(self._undo, lambda _: ask.Undo(), emit)
+        on_click(self._redo, lambda _: ask.Redo(), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the line up to date."""
+        """Bring the line and the buttons up to date."""
         path = self._storage.project.path
         if self._storage.notice is not None:
             text = "Not saved" if state.unsaved else escaped(path.name)
@@ -31,28 +37,23 @@ class SavedPanel:
         else:
             text = f"<b>Saved</b> in {escaped(path.name)}"
         self._text.content = f'<p class="carts-caption" title="{escaped(str(path))}">{text}</p>'
+        self._undo.disabled, self._redo.disabled = state.project.undoable is None, state.project.redoable is None
 
 
 class HistoryPanel:
-    """Undo, redo and the list of steps."""
+    """The list of steps."""
 
     def __init__(self, page: Page, emit: Emit) -> None:
         gui = page.server.gui
         self._positions: dict[str, int] = {}
         with gui.add_folder("History"):
-            self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
-            self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
-            page.row(self._undo, self._redo)
             self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")
-            self._next = gui.add_html("")
-        on_click(self._undo, lambda _: ask.Undo(), emit)
-        on_click(self._redo, lambda _: ask.Redo(), emit)
+            page.columns([self._steps], 1, narrow_labels=True)
         on_input(self._steps, lambda label: ask.GoToStep(self._positions[label]), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the list up to date."""
         project = state.project
-        self._undo.disabled, self._redo.disabled = project.undoable is None, project.redoable is None
         first = max(project.position - _LISTED // 2, 0)
         positions = {"Start": 0} | {
             f"{step.number}. {step.name}{' (undone)' if step.number > project.position else ''}": step.number

@@ -36,9 +36,9 @@ class ReviewPanel:
             clear = gui.add_button("Clear", color="gray")
             page.row(work, reject, clear, weights=(4, 3, 3))
             self._note = gui.add_text("Note", "")
-            worse = gui.add_button("Worse", icon=viser.Icon.CHEVRON_LEFT, color="gray")
-            better = gui.add_button("Next worst", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
-            page.row(worse, better)
+            previous = gui.add_button("Previous worst", icon=viser.Icon.CHEVRON_LEFT, color="gray")
+            following = gui.add_button("Next worst", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            page.row(previous, following, weights=(5, 4))
             unreviewed = gui.add_button("Next unreviewed", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
             self._counts = gui.add_html("")
         on_click(accept, lambda _: ask.AcceptAndNext(), emit)
@@ -49,8 +49,8 @@ class ReviewPanel:
             (clear, ReviewState.UNTOUCHED),
         ):
             on_click(button, lambda _, state=state: ask.SetReview(state), emit)
-        on_click(worse, lambda _: ask.ShowWorse(-1), emit)
-        on_click(better, lambda _: ask.ShowWorse(1), emit)
+        on_click(previous, lambda _: ask.ShowWorse(-1), emit)
+        on_click(following, lambda _: ask.ShowWorse(1), emit)
         on_click(unreviewed, lambda _: ask.ShowUnreviewed(1), emit)
         on_input(self._note, ask.SetNote, emit)
 

@@ -16,6 +16,7 @@ _LEAST = 3.0
 """Height of a frame that is known to fit, so that it can be seen."""
 SOURCE_COLORS = {Source.HAND: "#facc15", Source.OPTIMIZER: "#60a5fa", Source.PROPAGATED: "#e879f9"}
 """Of the line below the bars: who made a frame's joint positions."""
+_EXPLAINED = "All frames: the higher a bar, the worse the fit. Click to go there."
 _LEGEND = {"by hand": Source.HAND, "optimized": Source.OPTIMIZER, "solved together": Source.PROPAGATED}
 
 
@@ -42,7 +43,8 @@ class TimelinePanel:
         here = _rectangle("carts-here", state.index / frames, 1 / frames)
         self._chart.content = (
             f'<svg class="carts-timeline" role="img" aria-label="Timeline of all frames" data-frames="{frames}" '
-            f'viewBox="0 0 100 {_HEIGHT + _STRIP}" preserveAspectRatio="none">{_solving(state)}{here}{self._bars}</svg>'
+            f'viewBox="0 0 100 {_HEIGHT + _STRIP}" preserveAspectRatio="none">'
+            f"<title>{_EXPLAINED}</title>{_solving(state)}{here}{self._bars}</svg>"
         )
 
 

@@ -31,11 +31,11 @@ class ValuesPanel:
                 cells = [
                     f"{measured:.2f}",
                     f"{now:.2f}",
-                    f"{now - measured:+.2f}",
+                    _signed(now - measured),
                     _deviation(limits, known.get(arm.name), joint),
                 ]
                 if arm.name in truth:
-                    cells.append(f"{now - to_shown(limits, float(truth[arm.name][joint])):+.2f}")
+                    cells.append(_signed(now - to_shown(limits, float(truth[arm.name][joint]))))
                 unit = "°" if limits.revolute else "mm"
                 name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
                 rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
@@ -44,6 +44,11 @@ class ValuesPanel:
             f'<table class="carts-values">{body}</table>'
             '<p class="carts-caption">± is the standard deviation of what the optimizer found.</p>'
         )
+
+
+def _signed(difference: float) -> str:
+    """With its sign, unless it is nothing to speak of."""
+    return f"{difference:+.2f}" if abs(difference) >= 0.005 else "0.00"
 
 
 def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:

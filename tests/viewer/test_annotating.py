@@ -98,8 +98,9 @@ def test_accept_and_next_goes_on_until_all_frames_are_reviewed(desk: Desk) -> No
     assert desk.state.index == 2
     desk.do(ask.SetReview(ReviewState.REJECTED), ask.ShowUnreviewed())
     assert desk.state.index == 0
+    assert desk.do(ask.AcceptAndNext()).index == 0
     with pytest.raises(CartsError, match="Every frame has been reviewed"):
-        desk.do(ask.AcceptAndNext())
+        desk.do(ask.ShowUnreviewed())
     states = [desk.state.project.review(index).state for index in range(3)]
     assert states == [ReviewState.ACCEPTED, ReviewState.ACCEPTED, ReviewState.REJECTED]
 

@@ -248,8 +248,11 @@ def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
     tab.type_value(app.page.find("Frame"), 12)
     message = tab.page.locator(".carts-error[role=alert]")
     expect(message).to_contain_text("012.png", timeout=20_000)
+    note = tab.page.get_by_text("That did not work")
+    expect(note).to_be_visible()
     tab.button("Dismiss")
     expect(message).to_be_hidden()
+    expect(note).to_be_hidden()
     tab.type_value(app.page.find("Frame"), 2)
     eventually(lambda: app.state.index, lambda index: index == 1)
 

@@ -35,6 +35,14 @@ class Tab:
         field.press_sequentially(f"{value:g}", delay=60)
         field.press("Tab")
 
+    def place(self, u: float, v: float) -> tuple[float, float]:
+        """Where a place of the image [px] is in the window, as the page's own script says."""
+        shown, camera = self.page.evaluate("carts.imageOnScreen()"), self.app.scene.camera(self.app.state.camera)
+        box = self.page.locator("canvas").first.bounding_box()
+        assert shown is not None and box is not None
+        x = box["x"] + shown["left"] + u / camera.width * shown["width"]
+        return x, box["y"] + shown["top"] + v / camera.height * shown["height"]
+
     def wait_until_ready(self) -> None:
         """Wait for the first picture, and take away viser's warning that this browser has no graphics card."""
         self.page.wait_for_function(
