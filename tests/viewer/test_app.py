@@ -64,6 +64,26 @@ def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_vie
         assert 1 <= len(tab.overlays) < 100
 
 
+def test_a_value_is_not_lost_to_a_panel_that_is_brought_up_to_date_at_that_moment(
+    open_viewer: Callable[..., ViewerApp],
+) -> None:
+    app = open_viewer()
+    slider = app.joints.slider("PSM1", 0)
+    before = slider.value
+    tell_other_tabs = slider._impl.sync_cb
+    assert tell_other_tabs is not None
+
+    def write_meanwhile(client_id: int, updates: dict[str, object]) -> None:
+        slider.value = before
+        tell_other_tabs(client_id, updates)
+
+    slider._impl.sync_cb = write_meanwhile
+    with RawTab(app.url) as tab:
+        tab.set(app.page.element_id(slider), before + 2.0)
+        _wait_for(lambda: abs(math.degrees(app.state.pose.scene.joint_positions[0][0]) - before - 2.0) < 0.01)
+        _wait_for(lambda: abs(slider.value - before - 2.0) < 0.01)
+
+
 @pytest.mark.parametrize("value", [float("nan"), 1e12, -1e12])
 def test_a_raw_client_cannot_move_a_joint_out_of_its_limits(
     open_viewer: Callable[..., ViewerApp], value: float

@@ -1,11 +1,13 @@
 """The app is killed at any moment: what the page has called saved is there afterwards, and nothing is half-written."""
 
+import html
+import json
 import multiprocessing
 import random
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -17,11 +19,17 @@ from viewer_victim import Widgets
 from websockets.exceptions import ConnectionClosed
 
 from carts_core.data import Sequence
-from carts_core.project import Project, ProjectState
+from carts_core.project import Key, Project, ProjectState, ReviewState
 from carts_viewer.raw_tab import RawTab
+from carts_viewer.strokes import Target
 
 T = TypeVar("T")
-FRAMES = 4
+FRAMES = 24
+WIDTH, HEIGHT = 96, 72
+CORNER = (2, 2)
+"""A pixel where no arm is ever rendered."""
+Holds = Callable[[ProjectState], bool]
+"""Whether a state of the project has an edit."""
 
 
 @dataclass(frozen=True)
@@ -31,29 +39,25 @@ class Acknowledged:
     number: int
     """Of its step in the history."""
     name: str
-    frame: int
-    value: float | str
-
-    def check(self, state: ProjectState) -> None:
-        """Fail unless this state, the one after the step, has the edit."""
-        if isinstance(self.value, float):
-            there = state.joints(self.frame)["PSM1"].joint_positions[0]
-            assert np.degrees(there) == pytest.approx(self.value, abs=1e-3), self
-        else:
-            review = state.review(self.frame)
-            assert self.value in (review.note, str(review.state)), self
+    holds: Holds
+    """For the state right after the step."""
 
 
 @dataclass
 class Client:
-    """Somebody who edits frames in a tab, notes what the page called saved, and starts runs and exports meanwhile."""
+    """Somebody who edits frames in a tab, notes what the page called done, and starts runs and exports meanwhile."""
 
     tab: RawTab
     ids: Widgets
     random: random.Random
-    unique: Callable[[], int]
+    unique: Iterator[int]
+    pixels: Iterator[tuple[int, int]]
+    """Each comes once, so that painting it is always a step."""
     seen: list[Acknowledged] = field(default_factory=list)
+    exported: set[Path] = field(default_factory=set)
+    """What the page said is exported."""
     runs: int = 0
+    strokes: int = 0
     exports: int = 0
     frame: int = 0
 
@@ -62,12 +66,14 @@ class Client:
         try:
             self._until(self._position)
             while True:
+                self._disturb()
                 self._edit()
         except ConnectionClosed:
             return
 
-    def _edit(self) -> None:
-        number, dice = self.unique(), self.random.random()
+    def _disturb(self) -> None:
+        """Go to another frame, start a run, or an export while there is none."""
+        dice = self.random.random()
         if dice < 0.3:
             self.frame = self.random.randrange(FRAMES)
             self.tab.set(self.ids.frame, self.frame + 1)
@@ -75,29 +81,73 @@ class Client:
             self.tab.set(self.ids.run, True)
             self.runs += 1
             time.sleep(0.1 * self.random.random())
-        elif dice < 0.45:
+        elif not self.tab.widgets.get(self.ids.export, {}).get("disabled"):
+            self.tab.set(self.ids.format, self.random.choice(viewer_victim.FORMATS))
             self.tab.set(self.ids.export, True)
             self.exports += 1
-        # Never twice the same, so that an old value cannot pass for a new one.
-        if self.random.random() < 0.5:
-            value = 5.0 - 0.002 * (number % 5000)
-            self._ask(self.ids.joint, value, "Move PSM1 yaw", value)
-        elif self.random.random() < 0.5:
-            self._ask(self.ids.note, f"note {number}", "Note", f"note {number}")
-        else:
-            # Accepting what is accepted is no step, so both are asked for.
-            self._ask(self.ids.accept, True, "Accept", "accepted", optional=True)
-            self._ask(self.ids.reject, True, "Reject", "rejected", optional=True)
 
-    def _ask(self, element: str, value: object, name: str, kept: float | str, *, optional: bool = False) -> None:
+    def _edit(self) -> None:
+        number, dice, frame = next(self.unique), self.random.random(), self.frame
+        if dice < 0.4:
+            # Never twice the same, so that an old value cannot pass for a new one.
+            value = 5.0 - 0.002 * (number % 5000)
+            self._ask(self.ids.joint, value, "Move PSM1 yaw", lambda state: _has_joint(state, frame, value))
+        elif dice < 0.6:
+            note = f"note {number}"
+            self._ask(self.ids.note, note, "Note", lambda state: state.review(frame).note == note)
+        elif dice < 0.7:
+            # Accepting what is accepted is no step, so both are asked for.
+            for element, name, wanted in (
+                (self.ids.accept, "Accept", ReviewState.ACCEPTED),
+                (self.ids.reject, "Reject", ReviewState.REJECTED),
+            ):
+                self._ask(
+                    element, True, name, lambda state, wanted=wanted: state.review(frame).state is wanted, optional=True
+                )
+        elif dice < 0.85:
+            pixel = next(self.pixels)
+            self._paint(Target.IGNORE, pixel, "Ignore pixels", lambda state: _ignores(state, frame, pixel))
+        else:
+            # Nor is adding what is there.
+            for erase, name in ((False, "Add to the mask"), (True, "Remove from the mask")):
+                added = lambda state, erase=erase: _adds(state, frame, CORNER) is not erase  # noqa: E731
+                self._paint(Target.MASK, CORNER, name, added, erase=erase, optional=True)
+
+    def _paint(
+        self,
+        target: Target,
+        pixel: tuple[int, int],
+        name: str,
+        holds: Holds,
+        *,
+        erase: bool = False,
+        optional: bool = False,
+    ) -> None:
+        """Paint a dot as our page does; the rest as in `_ask`."""
+        row, column = pixel
+        stroke = {
+            "number": next(self.unique),
+            "frame": self.frame,
+            "camera": "left",
+            "target": target,
+            "erase": erase,
+            "polygon": False,
+            "diameter": 1,
+            "points": [[column + 0.5, row + 0.5]],
+        }
+        text = f"client {next(self.unique)} {json.dumps(stroke)}"
+        self._ask(self.ids.painted, text, name, holds, optional=optional)
+        self.strokes += 1
+
+    def _ask(self, element: str, value: object, name: str, holds: Holds, *, optional: bool = False) -> None:
         """Edit the frame, let go, and wait until the page says that it is saved."""
         before, _ = self._position() or (0, "")
         expected = f"{name}, frame {self.frame + 1:03d}"
         self.tab.set(element, value)
-        self.tab.set(self.ids.released, f"client {self.unique()}")
+        self.tab.set(self.ids.released, f"client {next(self.unique)}")
         step = self._until(lambda: self._saved(before, expected), 0.5 if optional else 20.0)
         if step is not None:
-            self.seen.append(Acknowledged(step, expected, self.frame, kept))
+            self.seen.append(Acknowledged(step, expected, holds))
         else:
             assert optional, f"the page never called {expected} saved; it says {self._position()}, it was at {before}"
 
@@ -120,6 +170,8 @@ class Client:
         end = time.monotonic() + timeout
         while time.monotonic() < end:
             found = read()
+            result = self.tab.widgets.get(self.ids.result, {}).get("content", "")
+            self.exported |= {Path(html.unescape(path)) for path in re.findall("<code>(.*)</code>", result)}
             if found is not None:
                 return found
             if not self.tab.connected:
@@ -128,89 +180,133 @@ class Client:
         return None
 
 
+def _has_joint(state: ProjectState, frame: int, degrees: float) -> bool:
+    return abs(np.degrees(state.joints(frame)["PSM1"].joint_positions[0]) - degrees) < 1e-3
+
+
+def _ignores(state: ProjectState, frame: int, pixel: tuple[int, int]) -> bool:
+    region = state.get(Key.ignore_region(frame, "left"))
+    return region is not None and bool(region.region()[pixel])
+
+
+def _adds(state: ProjectState, frame: int, pixel: tuple[int, int]) -> bool:
+    correction = state.get(Key.mask_correction(frame, "left"))
+    return correction is not None and bool(correction.added()[pixel])
+
+
 @dataclass
 class Tally:
     """What all lives of the app together saw."""
 
     kills: int = 0
     acknowledged: int = 0
+    steps: int = 0
     runs: int = 0
-    page_exports: int = 0
+    strokes: int = 0
+    exports: int = 0
+    acknowledged_exports: int = 0
     whole_exports: int = 0
     interrupted_exports: int = 0
-    steps: int = 0
 
 
-def _survive(kills: int, sequence_path: Path, weights: Path, exports: Path) -> Tally:
-    processes = multiprocessing.get_context("forkserver")
-    # Every life is forked from a process that has imported everything and done nothing.
-    processes.set_forkserver_preload(["carts_viewer.app", "carts_core.export"])
-    sequence = Sequence.open(sequence_path)
-    project_path = sequence_path.with_suffix(".carts")
-    exports.mkdir()
-    before = {path.name for path in sequence_path.parent.iterdir()}
-    tally, names, serial = Tally(), [], iter(range(1, 10**9))
-    for seed in range(kills):
-        ours, theirs = processes.Pipe(duplex=False)
-        victim = processes.Process(target=viewer_victim.serve, args=(sequence_path, weights, exports, theirs))
+class Lives:
+    """One project through many lives of the app, each of which ends with a kill."""
+
+    def __init__(self, sequence_path: Path, weights: Path) -> None:
+        self._sequence_path, self._weights = sequence_path, weights
+        self._sequence = Sequence.open(sequence_path)
+        self._project_path = sequence_path.with_suffix(".carts")
+        self._exports = sequence_path.with_name(f"{sequence_path.stem}_exports")
+        self._beside = {path.name for path in sequence_path.parent.iterdir()} | {self._exports.name}
+        self._names: list[str] = []
+        """Of all steps."""
+        self._known: set[tuple[str, int]] = set()
+        """Exports, finished or not, that were there before this life."""
+        self._unique = iter(range(1, 10**9))
+        self._pixels = iter([(row, column) for row in range(HEIGHT) for column in range(WIDTH)])
+        self._processes = multiprocessing.get_context("forkserver")
+        # Every life is forked from a process that has imported everything and done nothing.
+        self._processes.set_forkserver_preload(["carts_viewer.app"])
+        self.tally = Tally()
+
+    def live(self, seed: int) -> None:
+        """Work in a new process until it is killed, and look what is left."""
+        ours, theirs = self._processes.Pipe(duplex=False)
+        victim = self._processes.Process(target=viewer_victim.serve, args=(self._sequence_path, self._weights, theirs))
         victim.start()
         theirs.close()
         assert ours.poll(120), "the app did not start"
         ids: Widgets = ours.recv()
         dice = random.Random(seed)
         with RawTab(ids.url, keep=1) as tab:
-            client = Client(tab, ids, dice, lambda: next(serial))
+            client = Client(tab, ids, dice, self._unique, self._pixels)
             killer = threading.Timer(0.05 + 2.5 * dice.random(), victim.kill)
             killer.start()
             client.work()
             killer.join()
         victim.join()
         assert victim.exitcode == -9, f"the app ended by itself, with code {victim.exitcode}"
-        names = _check_project(sequence, project_path, client.seen, names)
-        tally.kills += 1
-        tally.acknowledged += len(client.seen)
-        tally.runs += client.runs
-        tally.page_exports += client.exports
-        for path in exports.iterdir():
+        self._check_project(client)
+        self._check_exports()
+        self.tally.kills += 1
+        self.tally.acknowledged += len(client.seen)
+        self.tally.steps = len(self._names)
+        self.tally.runs += client.runs
+        self.tally.strokes += client.strokes
+        self.tally.exports += client.exports
+        self.tally.acknowledged_exports += len(client.exported)
+
+    def _check_project(self, client: Client) -> None:
+        """Open the project as the next server would, and check what this life's client was told."""
+        with Project.open(self._sequence, self._project_path) as project:
+            assert project.writable
+            steps = [step.name for step in project.state.steps]
+            assert steps[: len(self._names)] == self._names, "steps of earlier lives have changed"
+            assert project.state.position == len(steps)
+            logged = {Path(export.path) for export in project.state.exports}
+            assert client.exported <= logged and all(path.exists() for path in logged)
+            for edit in client.seen:
+                assert steps[edit.number - 1 : edit.number] == [edit.name], edit
+                project.go_to(edit.number)
+                assert edit.holds(project.state), edit
+            project.go_to(len(steps))
+        self._names = steps
+
+    def _check_exports(self) -> None:
+        """Whatever has a final name is whole, and nothing else has appeared beside the sequence."""
+        for path in self._exports.iterdir() if self._exports.exists() else ():
+            known = (path.name, path.stat().st_mtime_ns)
+            if known in self._known:
+                continue
+            self._known.add(known)
             if path.name.startswith("."):
-                tally.interrupted_exports += 1
+                self.tally.interrupted_exports += 1
             else:
                 viewer_victim.check_whole(path, FRAMES)
-                tally.whole_exports += 1
-        # Nothing but the project's own files has appeared beside the sequence.
-        new = {path.name for path in sequence_path.parent.iterdir()} - before
-        assert new <= {project_path.name + end for end in ("", "-wal", "-shm", ".lock")}, new
-    tally.steps = len(names)
-    return tally
+                self.tally.whole_exports += 1
+        project_files = {self._project_path.name + end for end in ("", "-wal", "-shm", ".lock")}
+        new = {path.name for path in self._sequence_path.parent.iterdir()} - self._beside
+        assert new <= project_files, new
 
 
-def _check_project(sequence: Sequence, path: Path, seen: list[Acknowledged], names: list[str]) -> list[str]:
-    """Open the project as the next server would, and check this life's edits; gives the names of all steps."""
-    with Project.open(sequence, path) as project:
-        assert project.writable
-        steps = [step.name for step in project.state.steps]
-        assert steps[: len(names)] == names, "steps of earlier lives have changed"
-        assert project.state.position == len(steps)
-        for edit in seen:
-            assert steps[edit.number - 1 : edit.number] == [edit.name], edit
-            project.go_to(edit.number)
-            edit.check(project.state)
-        project.go_to(len(steps))
-    return steps
+@pytest.fixture
+def lives(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Lives:
+    return Lives(tiny_sequence(frames=FRAMES, width=WIDTH, height=HEIGHT), untrained_weights)
 
 
-def test_nothing_that_the_page_called_saved_is_lost_when_the_app_is_killed(
-    tiny_sequence: Callable[..., Path], untrained_weights: Path, tmp_path: Path
-) -> None:
-    tally = _survive(6, tiny_sequence(frames=FRAMES), untrained_weights, tmp_path / "exports")
-    assert tally.kills == 6 and tally.acknowledged > 6 and tally.whole_exports > 0
+def test_nothing_that_the_page_called_saved_is_lost_when_the_app_is_killed(lives: Lives) -> None:
+    for seed in range(6):
+        lives.live(seed)
+    tally = lives.tally
+    assert tally.acknowledged > 6 and tally.strokes > 0 and tally.whole_exports > 0, tally
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_nothing_is_lost_in_200_kills(
-    tiny_sequence: Callable[..., Path], untrained_weights: Path, tmp_path: Path
-) -> None:
-    tally = _survive(200, tiny_sequence(frames=FRAMES), untrained_weights, tmp_path / "exports")
+def test_nothing_is_lost_in_200_kills(lives: Lives) -> None:
+    for seed in range(200):
+        lives.live(seed)
+    tally = lives.tally
     print(tally)
-    assert tally.kills == 200 and tally.acknowledged > 200 and tally.runs > 20 and tally.interrupted_exports > 20
+    assert tally.acknowledged > 200 and tally.strokes > 50 and tally.runs > 20, tally
+    assert tally.acknowledged_exports > 20 and tally.interrupted_exports > 20, tally
