@@ -22,7 +22,6 @@ from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.raw_tab import RawTab
 from carts_viewer.stage import OVERLAY
-from carts_viewer.state import Phase
 
 _MOVES_PER_SECOND = 20
 _SETTLE = 0.5
@@ -139,21 +138,21 @@ def _wait_for(moved: float, value: float, pictures: list[tuple[float, float]], a
 
 
 def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> list[tuple[int, float]]:
-    """Resident memory [MB] after every tenth of a long run, as (iterations, MB)."""
-    app.mailbox.put(ask.SetSetting("iterations", iterations))
-    app.mailbox.put(ask.SetSetting("tolerance", 0.0))
-    app.mailbox.put(ask.Run())
-    samples: list[tuple[int, float]] = []
-    while not samples or samples[-1][0] < iterations:
-        time.sleep(0.05)
-        done = len(app.state.run.curves.loss) - 1
-        if app.state.error is not None:
-            raise RuntimeError(app.state.error)
-        if done >= len(samples) * iterations // 10:
-            samples.append((done, resident_megabytes()))
-        if app.state.run.phase is Phase.IDLE and app.state.run.reason is not None:
-            samples.append((done, resident_megabytes()))
-            break
+    """Resident memory [MB] after every run of so many that they make that many iterations, as (iterations, MB).
+
+    Every run starts where the first one did.
+    """
+    done, samples = 0, list[tuple[int, float]]()
+    while done < iterations:
+        app.mailbox.put(ask.Run())
+        state = app.wait_until_shown(600.0)
+        steps = len(state.run.curves.loss) - 1
+        if state.error is not None or steps < 1:
+            raise RuntimeError(state.error or "The run made no step.")
+        done += steps
+        samples.append((done, resident_megabytes()))
+        app.mailbox.put(ask.Reset())
+        app.wait_until_shown()
     return samples
 
 

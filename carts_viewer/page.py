@@ -2,6 +2,7 @@
 
 - The server is guarded (`guard.py`, `incoming.py`), and serves `static/` and our script and style.
 - Messages to one client's page (`tell`), and the page's word that it has drawn an overlay (`on_drawn`).
+- Values as a tab has sent them (`on_sent`).
 - Buttons side by side, which viser's panels do not know.
 
 viser is pinned to one minor version, and the browser tests drive all of this end to end.
@@ -241,6 +242,22 @@ class Page:
             )
             .encode()
         )
+
+
+def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
+    """Call `callback(value)` on the event loop whenever a tab sends a new value for a widget.
+
+    By the time that viser's own `on_update` reads the widget, the worker may have written an older value into it, and
+    what the tab has sent would be lost.
+    """
+    impl = handle._impl
+    tell_other_tabs = impl.sync_cb
+
+    def sent(client_id: int, updates: dict[str, Any]) -> None:
+        tell_other_tabs(client_id, updates)
+        callback(updates["value"])
+
+    impl.sync_cb = sent
 
 
 def _on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:

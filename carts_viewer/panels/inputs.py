@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import viser
 
 from carts_viewer.intents import Intent, Refresh
+from carts_viewer.page import on_sent
 from carts_viewer.state import ViewState
 
 Emit = Callable[[Intent], None]
@@ -26,18 +27,12 @@ class Panel(Protocol):
 
 
 def on_input(handle: Any, intent: Callable[[Any], Intent], emit: Emit) -> None:
-    """When a person changes the widget, emit what `intent` makes of its value.
+    """When a person changes the widget, emit what `intent` makes of the new value.
 
-    Our own writes (they have no client), numbers that are not finite and choices that do not exist are not input.
-    The callback is a coroutine: viser runs those in order on its event loop, plain functions in no order on a pool.
+    Our own writes, numbers that are not finite and choices that do not exist are not input.
     """
-
-    @handle.on_update
-    async def _(event: viser.GuiEvent) -> None:
-        if event.client_id is None:
-            return
-        # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
-        emit(intent(handle.value) if valid(handle) else Refresh())
+    # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
+    on_sent(handle, lambda value: emit(intent(value) if valid(handle, value) else Refresh()))
 
 
 def on_click(handle: viser.GuiButtonHandle, intent: Callable[[int], Intent], emit: Emit) -> None:
@@ -50,9 +45,8 @@ def on_click(handle: viser.GuiButtonHandle, intent: Callable[[int], Intent], emi
             emit(intent(event.client_id))
 
 
-def valid(handle: Any) -> bool:
-    """Whether the widget's value is one that its own rules allow, as far as they are not numbers to be clamped."""
-    value = handle.value
+def valid(handle: Any, value: Any) -> bool:
+    """Whether a widget's own rules allow a value, as far as they are not numbers to be clamped."""
     if isinstance(value, float) and not math.isfinite(value):
         return False
     options = getattr(handle, "options", None) if isinstance(handle, viser.GuiDropdownHandle) else None

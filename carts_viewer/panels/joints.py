@@ -71,7 +71,7 @@ class JointsPanel:
 
     def perturb(self) -> ask.Perturb:
         """The perturbation that the fields describe."""
-        seed = int(self._seed.value) if valid(self._seed) else 0
+        seed = int(self._seed.value) if valid(self._seed, self._seed.value) else 0
         return ask.Perturb(float(self._degrees.value), max(0, seed))
 
     def slider(self, arm: str, joint: int) -> viser.GuiSliderHandle[float]:

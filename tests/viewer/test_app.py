@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,6 +63,25 @@ def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_vie
         fresh = Painter(app.sequence).arm_ids(state.pose.scene, "left")
         assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
         assert 1 <= len(tab.overlays) < 100
+
+
+def test_a_value_is_not_lost_to_a_panel_that_is_brought_up_to_date_at_that_moment(
+    open_viewer: Callable[..., ViewerApp],
+) -> None:
+    app = open_viewer()
+    slider = app.joints.slider("PSM1", 0)
+    before = slider.value
+    go_on: Any = slider._impl.sync_cb
+
+    def write_meanwhile(*arguments: Any) -> None:
+        slider.value = before
+        go_on(*arguments)
+
+    slider._impl.sync_cb = write_meanwhile
+    with RawTab(app.url) as tab:
+        tab.set(app.page.element_id(slider), before + 2.0)
+        _wait_for(lambda: abs(math.degrees(app.state.pose.scene.joint_positions[0][0]) - before - 2.0) < 0.01)
+        _wait_for(lambda: abs(slider.value - before - 2.0) < 0.01)
 
 
 @pytest.mark.parametrize("value", [float("nan"), 1e12, -1e12])

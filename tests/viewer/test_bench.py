@@ -44,10 +44,9 @@ def test_a_short_soak_sees_what_it_is_there_for(
 @pytest.mark.slow
 def test_memory_stays_flat_while_the_optimizer_runs(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    for name, value in (("working_width", 96), ("attention_radius", 4), ("wide_attention_radius", 8)):
-        app.mailbox.put(ask.SetSetting(name, value))
+    app.mailbox.put(ask.SetSetting("working_width", 96))
     samples = memory_while_optimizing(app, iterations=500)
-    assert samples[-1][0] == 500
-    # The first tenth allocates what the rest reuses.
+    assert samples[-1][0] >= 500 and len(samples) > 5
+    # The first runs allocate what the rest reuse.
     assert samples[-1][1] - samples[1][1] < 30
     assert samples[-1][1] < 1500

@@ -9,12 +9,14 @@ from viewer_desk import Desk
 
 from carts_core.data import Sequence
 from carts_core.errors import CartsError, ProjectError
+from carts_core.evaluation.metrics import dice
 from carts_core.optimization import OptimizerSettings
 from carts_core.project import (
     CorrectedIntrinsics,
     IgnoreRegion,
     Key,
     Keyframe,
+    MaskCorrection,
     Project,
     Provenance,
     ReviewState,
@@ -188,3 +190,17 @@ def test_a_run_waits_for_solving_and_a_new_calibration_ends_it(desk: Desk) -> No
     with pytest.raises(CartsError, match="calibration was changed"):
         desk.finish()
     assert not desk.state.solving and sources(desk) == [None] * FRAMES
+
+
+def test_dice_of_a_solved_frame_is_that_of_its_corrected_mask(desk: Desk) -> None:
+    project = desk.session.editor.project
+    everything, nothing = np.ones((120, 160), bool), np.zeros((120, 160), bool)
+    project.apply("Add to the mask", {Key.mask_correction(1, "left"): MaskCorrection.of(everything, nothing)})
+    desk.do(ask.Solve(whole=True))
+    desk.finish()
+    masks = desk.session.sequence.frame(1, "regular", ["left"]).masks
+    figures = [desk.saved.figures(frame) for frame in range(FRAMES)]
+    assert masks is not None and all(figure is not None for figure in figures)
+    found = [figure.dice for figure in figures if figure is not None]
+    assert found[1] == pytest.approx(dice(everything, masks["left"]))
+    assert min(value for value in (found[0], *found[2:]) if value is not None) > 0.8 > (found[1] or 0.0)

@@ -1,22 +1,22 @@
-"""The real app in a process of its own, exporting all the time, until it is killed."""
+"""The real app in a process of its own, until it is killed, and what a whole export looks like."""
 
-import itertools
+import json
+import threading
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import torch
+from viewer_run import run_without_end
 
-from carts_core.data import Sequence
-from carts_core.export import Dataset, FormatName, export, measured_frames
 from carts_core.export.publish import MARKER
-from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
+from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.project import SavedPanel
 
-FORMATS: tuple[FormatName, ...] = ("masks", "csv", "coco")
-LONG_RUN = {"working_width": 96, "attention_radius": 4, "wide_attention_radius": 8, "iterations": 10_000}
-"""A run that ends by itself would leave nothing to be killed in the middle of."""
+FORMATS = ("PNG masks", "COCO", "Kinematics, CSV")
+"""What is exported, as the page calls it."""
 
 
 class Widgets(NamedTuple):
@@ -24,46 +24,42 @@ class Widgets(NamedTuple):
 
     url: str
     released: str
+    painted: str
+    saved: str
+    result: str
+    """Of the export that was finished last."""
     frame: str
     joint: str
     note: str
     accept: str
     reject: str
     run: str
+    format: str
     export: str
-    saved: str
     steps: str
 
 
-def serve(sequence: Path, weights: Path, exports: Path, tell: Connection) -> None:
-    """Serve a sequence on a free port, tell where, and export it into a folder, over and over."""
+def serve(sequence: Path, weights: Path, tell: Connection) -> None:
+    """Serve a sequence on a free port, tell where, and do what the page asks for."""
     torch.set_num_threads(1)
     app = ViewerApp.open(sequence, port=0, weights=(weights,))
     assert app.project.writable, app.notice
-    for name, value in LONG_RUN.items():
-        app.mailbox.put(ask.SetSetting(name, value))
-    app.wait_until_shown(60)
+    # A run that ends by itself would leave nothing to be killed in the middle of.
+    run_without_end(app)
     (saved,) = (panel for panel in app.display._panels if isinstance(panel, SavedPanel))
+    (exports,) = (panel for panel in app.display._panels if isinstance(panel, ExportPanel))
+    labels = "Note", "Accept", "Reject", "Run", "Format", "Export", "Go to"
     found = [
         app.page._released,
+        app.page._painted,
+        saved._text,
+        exports._result,
         app.page.find("Frame"),
         app.joints.slider("PSM1", 0),
-        *map(app.page.find, ("Note", "Accept", "Reject", "Run", "Export all")),
-        saved._text,
-        app.page.find("Go to"),
+        *map(app.page.find, labels),
     ]
     tell.send(Widgets(app.url, *map(app.page.element_id, found)))
-    for number in itertools.count():
-        _export(app.sequence, exports, number)
-
-
-def _export(sequence: Sequence, folder: Path, number: int) -> None:
-    dataset = Dataset(
-        sequence, tuple(measured_frames(sequence, range(len(sequence)))), sequence.scene, sequence.domains[0]
-    )
-    name = FORMATS[number % len(FORMATS)]
-    # Few names, so that exports replace one another, too.
-    export(dataset, name, folder / f"{name}-{number % 2}", overwrite=True)
+    threading.Event().wait()
 
 
 def check_whole(path: Path, frames: int) -> None:
@@ -71,9 +67,16 @@ def check_whole(path: Path, frames: int) -> None:
     if path.suffix == ".csv":
         assert len(path.read_text().splitlines()) == frames + 1, path
         return
-    assert (path / MARKER).stat().st_size > 0, f"{path} is not finished"
-    # One image at least for each frame, and none cut off.
-    pictures = list(path.rglob("*.png"))
-    assert len(pictures) >= frames, path
-    for picture in pictures:
-        assert picture.read_bytes().endswith(b"IEND\xaeB`\x82"), picture
+    assert len(json.loads((path / MARKER).read_text())["views"]) == frames, f"{path} is not finished"
+    annotations = path / "annotations" / "instances_default.json"
+    if annotations.exists():
+        assert len(json.loads(annotations.read_text())["images"]) == frames, path
+        folders = ("images",)
+    else:
+        assert json.loads((path / "labels.json").read_text()).keys() == {"binary", "arms", "links"}, path
+        folders = ("images", "binary", "arms", "links")
+    for folder in folders:
+        pictures = list((path / folder).iterdir())
+        assert len(pictures) == frames, path / folder
+        for picture in pictures:
+            assert cv2.imread(str(picture), cv2.IMREAD_UNCHANGED) is not None, picture
