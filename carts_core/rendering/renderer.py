@@ -11,7 +11,7 @@ from torch import Tensor
 from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
-from .shading import phong, visible_points
+from .shading import nonzero, phong, visible_points
 from .surface import SurfaceRendering, Tangents, surface_maps
 from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch
@@ -123,7 +123,10 @@ class Renderer:
         """Label of the visible triangle per pixel, -1 for background."""
         Ts, intrinsics = self._views(state)
         face_ids, _ = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
-        labels = torch.where(face_ids >= 0, face_labels[face_ids.long()], -1)
+        seen = face_ids.flatten()
+        pixel = nonzero(seen >= 0)
+        labels = face_labels.new_full(seen.shape, -1)
+        labels[pixel] = face_labels[seen[pixel].long()]
         return labels.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
 
     @torch.no_grad()

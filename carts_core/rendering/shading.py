@@ -62,7 +62,7 @@ def visible_points(
     """The surface point and the normal that each visible pixel sees."""
     views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
-    pixel = _nonzero(face_ids.flatten() >= 0)
+    pixel = nonzero(face_ids.flatten() >= 0)
     face = face_ids.flatten()[pixel].long()
     view = pixel // (height * width)
     key = (view * links + geometry.face_links[face]).short()
@@ -91,7 +91,7 @@ def visible_points(
     return VisiblePoints(pixel, face, groups, point_link, unit(normal))
 
 
-def _nonzero(flags: Bool[Tensor, " n"]) -> Int[Tensor, " K"]:
+def nonzero(flags: Bool[Tensor, " n"]) -> Int[Tensor, " K"]:
     """Where flags are set; NumPy is several times faster on a CPU."""
     if flags.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(flags.numpy()))

@@ -13,13 +13,26 @@ NEAR = 1e-3
 """Depth of the near plane [m]; triangles that cross it are clipped, not dropped."""
 
 
+_WIDE = 8
+"""Width of a bounding box [px] from which on it pays to find where each of its rows enters and leaves the triangle."""
+
+
+@numba.njit(cache=True, nogil=True, fastmath=False)
+def _first_and_last(value, slope, first, last):
+    """Those of steps 0 to `last` at which `value + slope * step` may be positive; one too many on either side."""
+    if slope > 0.0:
+        first = max(first, int(min(-value / slope, last + 1.0)) - 1)
+    elif slope < 0.0:
+        last = min(last, int(max(-value / slope, -2.0)) + 1)
+    elif value < 0.0:
+        last = -1
+    return first, last
+
+
 @numba.njit(cache=True, nogil=True, fastmath=False)
 def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
-    """Z-buffer one projected triangle (corners a, b, c of the polygon u, v with 1/z)."""
+    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z)."""
     height, width = face_ids.shape
-    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
-    if area == 0.0:
-        return
     # Only pixel centres (x + 0.5, y + 0.5) inside the bounding box can be covered.
     first_x = max(int(np.ceil(max(min(u[a], u[b], u[c]) - 0.5, 0.0))), 0)
     last_x = min(int(np.floor(min(max(u[a], u[b], u[c]) - 0.5, width - 1.0))), width - 1)
@@ -27,8 +40,11 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
     last_y = min(int(np.floor(min(max(v[a], v[b], v[c]) - 0.5, height - 1.0))), height - 1)
     if first_x > last_x or first_y > last_y:
         return
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
+    if area == 0.0:
+        return
     scale = 1.0 / area
-    # Barycentric coordinates and 1/z are affine in the image, so they are walked by differences.
+    # Barycentric coordinates and 1/z are affine in the image.
     w_b_dx = (v[c] - v[a]) * scale
     w_b_dy = -(u[c] - u[a]) * scale
     w_c_dx = -(v[b] - v[a]) * scale
@@ -40,45 +56,59 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
         w_b = w_b_dx * x0 + w_b_dy * dy
         w_c = w_c_dx * x0 + w_c_dy * dy
         z = inverse_z[a] + w_b * (inverse_z[b] - inverse_z[a]) + w_c * (inverse_z[c] - inverse_z[a])
-        for x in range(first_x, last_x + 1):
-            if w_b >= 0.0 and w_c >= 0.0 and w_b + w_c <= 1.0 and z > inverse_depth[y, x]:
-                inverse_depth[y, x] = z
+        first, last = 0, last_x - first_x
+        if last >= _WIDE:
+            first, last = _first_and_last(w_b, w_b_dx, first, last)
+            first, last = _first_and_last(w_c, w_c_dx, first, last)
+            first, last = _first_and_last(1.0 - w_b - w_c, -w_b_dx - w_c_dx, first, last)
+        for step in range(first, last + 1):
+            w_b_here, w_c_here, z_here = w_b + step * w_b_dx, w_c + step * w_c_dx, z + step * z_dx
+            x = first_x + step
+            if w_b_here >= 0.0 and w_c_here >= 0.0 and w_b_here + w_c_here <= 1.0 and z_here > inverse_depth[y, x]:
+                inverse_depth[y, x] = z_here
                 face_ids[y, x] = face
-            w_b += w_b_dx
-            w_c += w_c_dx
-            z += z_dx
+
+
+@numba.njit(cache=True, nogil=True, fastmath=False)
+def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z):
+    """Cut a triangle off at the near plane (Sutherland-Hodgman); the number of corners that are left, 0, 3 or 4."""
+    count = 0
+    for k in range(3):
+        here, there = corners[k], corners[(k + 1) % 3]
+        p, q = vertices[here], vertices[there]
+        if inverse_z[here] > 0.0:
+            clipped_inverse_z[count] = inverse_z[here]
+            clipped_u[count] = fx * p[0] * inverse_z[here] + cx
+            clipped_v[count] = fy * p[1] * inverse_z[here] + cy
+            count += 1
+        if (inverse_z[here] > 0.0) != (inverse_z[there] > 0.0):
+            t = (NEAR - p[2]) / (q[2] - p[2])
+            clipped_inverse_z[count] = 1.0 / NEAR
+            clipped_u[count] = fx * (p[0] + t * (q[0] - p[0])) / NEAR + cx
+            clipped_v[count] = fy * (p[1] + t * (q[1] - p[1])) / NEAR + cy
+            count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True, fastmath=False)
 def _rasterize(vertices, faces, fx, fy, cx, cy, face_ids, inverse_depth):
-    u, v, inverse_z = np.empty(4), np.empty(4), np.empty(4)
+    count = vertices.shape[0]
+    u, v, inverse_z = np.zeros(count), np.zeros(count), np.zeros(count)
+    for index in range(count):
+        z = vertices[index, 2]
+        if z >= NEAR:  # what is nearer keeps an inverse depth of 0
+            inverse_z[index] = 1.0 / z
+            u[index] = fx * vertices[index, 0] * inverse_z[index] + cx
+            v[index] = fy * vertices[index, 1] * inverse_z[index] + cy
+    clipped_u, clipped_v, clipped_inverse_z = np.empty(4), np.empty(4), np.empty(4)
     for face in range(faces.shape[0]):
-        behind = 0
-        for k in range(3):
-            if vertices[faces[face, k], 2] < NEAR:
-                behind += 1
-        if behind == 3:
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        if inverse_z[a] > 0.0 and inverse_z[b] > 0.0 and inverse_z[c] > 0.0:
+            _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth)
             continue
-        corners = 0
-        for k in range(3):
-            p = vertices[faces[face, k]]
-            if p[2] >= NEAR:
-                inverse_z[corners] = 1.0 / p[2]
-                u[corners] = fx * p[0] * inverse_z[corners] + cx
-                v[corners] = fy * p[1] * inverse_z[corners] + cy
-                corners += 1
-            if behind > 0:
-                # An edge that crosses the near plane adds the crossing as a corner (Sutherland-Hodgman).
-                q = vertices[faces[face, (k + 1) % 3]]
-                if (p[2] >= NEAR) != (q[2] >= NEAR):
-                    t = (NEAR - p[2]) / (q[2] - p[2])
-                    inverse_z[corners] = 1.0 / NEAR
-                    u[corners] = fx * (p[0] + t * (q[0] - p[0])) / NEAR + cx
-                    v[corners] = fy * (p[1] + t * (q[1] - p[1])) / NEAR + cy
-                    corners += 1
-        _fill_triangle(face, u, v, inverse_z, 0, 1, 2, face_ids, inverse_depth)
-        if corners == 4:
-            _fill_triangle(face, u, v, inverse_z, 0, 2, 3, face_ids, inverse_depth)
+        corners = _clip(faces[face], inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z)
+        for last in range(2, corners):
+            _fill_triangle(face, clipped_u, clipped_v, clipped_inverse_z, 0, last - 1, last, face_ids, inverse_depth)
 
 
 def rasterize(
