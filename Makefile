@@ -21,7 +21,7 @@ view: setup ## Open the shipped sequence in the browser (or SEQUENCE=path/to/seq
 test: setup-dev ## Check the style and run the tests, browser included
 	$(BIN)/ruff check
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
-	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m "not slow and not gpu" $(ARGS)
+	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not gpu" $(ARGS)
 
 lint: setup-dev ## Check style, formatting and types
 	$(BIN)/ruff check

@@ -48,7 +48,7 @@ def test_every_kind_of_unknown_has_a_gradient(scene: Scene) -> None:
     offsets = torch.zeros(len(parameters), requires_grad=True)
     state = parameters.state(offsets)
     leaves = (state.joint_positions[0], state.T_world_base, state.T_camera_world, state.intrinsics)
-    (gradient,) = torch.autograd.grad(sum(leaf.cos().sum() + leaf.sum() for leaf in leaves), offsets)
+    (gradient,) = torch.autograd.grad(torch.stack([leaf.cos().sum() + leaf.sum() for leaf in leaves]).sum(), offsets)
     assert torch.isfinite(gradient).all()
     assert (gradient != 0).float().mean() > 0.8
 

@@ -48,8 +48,8 @@ def test_the_torch_kernel_agrees_with_the_compiled_one(seed: int, near: float) -
 def test_the_torch_kernel_gives_the_same_on_a_gpu() -> None:
     vertices, faces = random_triangles(0)
     ids, depth = visibility(vertices, faces, INTRINSICS, WIDTH, HEIGHT)
-    on_gpu = [torch.tensor(array).cuda() for array in (vertices, faces, np.array(INTRINSICS))]
-    other_ids, other_depth = visibility_torch(*on_gpu, WIDTH, HEIGHT)
+    points, triangles, intrinsics = (torch.tensor(array).cuda() for array in (vertices, faces, np.array(INTRINSICS)))
+    other_ids, other_depth = visibility_torch(points, triangles, intrinsics, WIDTH, HEIGHT)
     same_surface(ids, depth, other_ids.cpu(), other_depth.cpu())
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from viewer_canvas import decoded
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -47,7 +48,7 @@ def _wait_for(condition: Callable[[], bool]) -> None:
 
 
 def _picture(png: bytes) -> np.ndarray:
-    return cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
+    return cv2.cvtColor(decoded(png), cv2.COLOR_BGRA2RGBA)
 
 
 def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:

@@ -7,11 +7,10 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
-from viewer_canvas import eventually
+from viewer_canvas import decoded, eventually
 from viewer_tab import Tab
 
 from carts_viewer import intents as ask
@@ -165,7 +164,7 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
     tab.page.get_by_text("Export", exact=True).click()
     with tab.page.expect_download() as started:
         tab.button("Export mask")
-    mask = cv2.imread(str(started.value.path()), cv2.IMREAD_UNCHANGED)
+    mask = decoded(Path(started.value.path()).read_bytes())
     shown = Painter(app.sequence).arm_ids(app.state.pose.scene, "left") >= 0
     assert started.value.suggested_filename == "tiny_001_left.png"
     assert np.array_equal(mask > 0, shown)
@@ -177,7 +176,7 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
         tab.button("Download it")
     assert started.value.suggested_filename == "masks.zip"
     with zipfile.ZipFile(io.BytesIO(Path(started.value.path()).read_bytes())) as archive:
-        again = cv2.imdecode(np.frombuffer(archive.read("masks/binary/left_001.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+        again = decoded(archive.read("masks/binary/left_001.png"))
         views = json.loads(archive.read("masks/export.json"))["views"]
     assert np.array_equal(again, mask)
     assert [view["source"] for view in views] == ["edited", "measured", "measured"]
@@ -196,6 +195,7 @@ def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_ca
     expect(tab.page.get_by_text("1 of 40 frames")).to_be_visible()
     tab.button("Export")
     path = eventually(lambda: app.state.export and app.state.export.path, bool)
+    assert path is not None
     content = json.loads((path / "annotations" / "instances_default.json").read_text())
     assert path.parent == app.project.path.with_name("sequence_exports") and len(content["images"]) == 1
     tab.choose("Format", "Overlay video")

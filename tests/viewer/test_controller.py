@@ -1,8 +1,8 @@
 """What intents do to the state, with the real optimizer, without threads or a page."""
 
-import cv2
 import numpy as np
 import pytest
+from viewer_canvas import decoded
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError, SettingsError
@@ -185,7 +185,7 @@ def test_maps_are_there_without_a_run_when_they_are_looked_at(desk: Desk, layer:
 def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
     desk.do(ask.Perturb(4.0, 3), ask.ShowCamera("right"), ask.ExportMask(7))
     client, name, content = desk.delivered[0]
-    mask = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    mask = decoded(content)
     assert (client, name) == (7, "tiny_001_right.png")
     assert set(np.unique(mask)) == {0, 255}
     assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)

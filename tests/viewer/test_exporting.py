@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from viewer_canvas import decoded
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError, SettingsError
@@ -72,7 +73,7 @@ def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: D
         assert np.array_equal(read_mask(folder / f"{name}.png"), desk.painter.arm_ids(pose, camera) >= 0)
     desk.do(ask.Refresh(), ask.ShowCamera("left"), ask.ExportMask(7))
     _, name, content = desk.delivered[-1]
-    shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    shown = decoded(content)
     assert name == "tiny_001_left.png" and np.array_equal(shown > 0, expected)
 
 

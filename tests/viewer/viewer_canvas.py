@@ -26,8 +26,15 @@ def mark_frames(folder: Path) -> None:
         _mark(path)
 
 
+def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
+    """The picture in a file's content."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    assert image is not None
+    return image
+
+
 def _mark(path: Path) -> None:
-    height, width = cv2.imread(str(path)).shape[:2]
+    height, width = decoded(path.read_bytes()).shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     image = np.zeros((height, width, 3), np.uint8)
     for u, v in MARKERS:
@@ -47,8 +54,8 @@ class Canvas:
         """RGB [height, width, 3] of the canvas as a person sees it, the tool bar blanked."""
         box = self._page.locator("canvas").first.bounding_box()
         assert box is not None
-        png = self._page.screenshot(clip={key: box[key] for key in ("x", "y", "width", "height")})
-        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()
+        png = self._page.screenshot(clip={"x": box["x"], "y": box["y"], "width": box["width"], "height": box["height"]})
+        image = decoded(png, cv2.IMREAD_COLOR)[..., ::-1].copy()
         image[: self._bar_height()] = 0
         return image
 
