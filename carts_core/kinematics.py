@@ -1,5 +1,6 @@
 """Forward kinematics of a URDF tree, differentiable and batched (pytorch-kinematics)."""
 
+import copy
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -83,7 +84,7 @@ class Kinematics:
     def _Ts_root(self, joint_positions: Float[Tensor, "n dofs"]) -> Float[Tensor, "links n 4 4"]:
         device = joint_positions.device
         if device not in self._chains:
-            self._chains[device] = self._chains[torch.device("cpu")].clone().to(device=device)
+            self._chains[device] = copy.deepcopy(self._chains[torch.device("cpu")]).to(device=device)
         expand, offset = self._expand.to(device), self._offset.to(device)
         return self._chains[device].forward_kinematics_tensor(joint_positions @ expand.T + offset)
 

@@ -41,7 +41,7 @@ def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[
         RobotError: a mesh file is missing or cannot be read.
     """
     color, opacity = _urdf_color(visual, materials)
-    if opacity < _OPAQUE:
+    if opacity < _OPAQUE or visual.geometry is None:
         return []
     parts: list[tuple[trimesh.Trimesh, np.ndarray]] = []
     for mesh in _geometry(visual.geometry, folder):

@@ -123,7 +123,9 @@ def _load_meshes(
         urdf.parent / visual.geometry.mesh.filename
         for link in model.robot.links
         for visual in link.visuals
-        if visual.geometry.mesh is not None and (urdf.parent / visual.geometry.mesh.filename).is_file()
+        if visual.geometry is not None
+        and visual.geometry.mesh is not None
+        and (urdf.parent / visual.geometry.mesh.filename).is_file()
     ]
     key = mesh_cache.fingerprint([urdf, *mesh_files], max_faces)
     if (cached := mesh_cache.read(key)) is not None:
