@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, file_name, mask_png
+from carts_core.export import FORMATS, Dataset, ExportFrame, export, file_name, mask_png
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
@@ -121,7 +121,7 @@ class Exporter:
         dataset = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
         self._intent = intent
-        self._job = Stepped(lambda monitor: _write(dataset, intent, target, monitor))
+        self._job = Stepped(lambda monitor: export(dataset, intent.format, target, monitor=monitor))
         self._controller.change(export=ExportState(FORMATS[intent.format].label, len(dataset.frames)), error=None)
 
     @handle.register
@@ -212,7 +212,3 @@ def free_path(project: Path, stem: str, intent: ask.Export) -> Path:
         number += 1
         path = folder / f"{stem}-{number}{suffix}"
     return path
-
-
-def _write(dataset: Dataset, intent: ask.Export, target: Path, monitor: Monitor) -> Path:
-    return export(dataset, intent.format, target, monitor=monitor)

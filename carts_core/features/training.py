@@ -184,7 +184,17 @@ def _first_network(config: TrainingConfig) -> UNet:
             f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
             "weights of that kind, or start from random weights."
         )
-    return network if network.architecture == config.architecture else grow(fresh, network)
+    if network.architecture == config.architecture:
+        return network
+    try:
+        if network.architecture.local_mean != config.architecture.local_mean:
+            raise SettingsError("local_mean differs.")
+        return grow(fresh, network)
+    except SettingsError as error:
+        raise SettingsError(
+            f"{config.start} holds a network of {network.architecture}, which does not grow into "
+            f"{config.architecture}: {error}"
+        ) from error
 
 
 def weights_file(config: TrainingConfig, output: Path) -> Path:

@@ -21,7 +21,8 @@ class TrainingConfig:
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots whose images are made."""
     start: Path | None = None
-    """Weights file to start from, for fine-tuning; random weights without it."""
+    """Weights file to start from, for fine-tuning; random weights without it. A network that is smaller
+    than the one that is asked for grows."""
     steps: int = 4000
     """Optimizer steps."""
     batch_size: int = 8

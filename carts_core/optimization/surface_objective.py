@@ -140,9 +140,9 @@ class SurfaceObjective:
         believed = self._whole.surface(self.parameters.state(offsets)).maps
         window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed))
-        silhouette = (believed[:, COVERAGE].sum(1) > 0).to(believed)
+        silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, _ATTENTION[min(look, 1)]) if silhouette.any() else torch.ones_like(silhouette)
-        weight = window.of(self._weight * near[:, None])
+        weight = window.of(self._weight) * near[:, None]
         self._look, self._window = look, window
         self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
         blurs = [blur for number, blur in self._plan if number == look]

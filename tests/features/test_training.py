@@ -144,8 +144,17 @@ def test_fine_tuning_grows_into_a_larger_architecture(tmp_path: Path, small_weig
 
 def test_fine_tuning_weights_that_do_not_fit_in_is_refused(tmp_path: Path, small_weights: Path):
     other = Architecture(widths=(4, 6), encoder_convolutions=(1, 1), decoder_convolutions=(1,))
-    with pytest.raises(SettingsError, match=r"as many convolutions or more"):
+    with pytest.raises(SettingsError, match=r"small\.safetensors holds a network of .*as many convolutions or more"):
         train(small_config(start=small_weights, architecture=other), tmp_path)
+
+
+def test_fine_tuning_with_images_standardised_otherwise_is_refused(tmp_path: Path, small_weights: Path):
+    trained = read_weights(small_weights).network.architecture
+    with pytest.raises(SettingsError, match=r"small\.safetensors .*local_mean differs"):
+        train(
+            small_config(start=small_weights, architecture=replace(trained, local_mean=not trained.local_mean)),
+            tmp_path,
+        )
 
 
 def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
