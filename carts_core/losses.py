@@ -2,6 +2,9 @@
 
 from typing import Literal
 
+import cv2
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
@@ -18,10 +21,15 @@ _EMPTY = 1e-6
 
 def attention(silhouette: Float[Tensor, "*batch h w"], radius: int) -> Float[Tensor, "*batch h w"]:
     """Att of the paper: the silhouette dilated by `radius` [px], without gradient."""
-    flat = silhouette.detach().reshape(-1, 1, *silhouette.shape[-2:])
+    flat = silhouette.detach().reshape(-1, *silhouette.shape[-2:])
     size = 2 * radius + 1
-    flat = functional.max_pool2d(flat, (size, 1), stride=1, padding=(radius, 0))
-    flat = functional.max_pool2d(flat, (1, size), stride=1, padding=(0, radius))
+    if flat.device.type == "cpu":
+        # As fast for a large radius as for a small one.
+        square = np.ones((size, size), np.uint8)
+        flat = torch.from_numpy(np.stack([cv2.dilate(image, square) for image in flat.contiguous().numpy()]))
+    else:
+        flat = functional.max_pool2d(flat, (size, 1), stride=1, padding=(radius, 0))
+        flat = functional.max_pool2d(flat, (1, size), stride=1, padding=(0, radius))
     return flat.view(silhouette.shape)
 
 

@@ -51,3 +51,11 @@ def test_smooth_l1_is_zero_for_equal_predictions_only() -> None:
     prediction = torch.rand(1, 4, 4)
     assert float(smooth_l1(prediction, prediction)) == 0.0
     assert float(smooth_l1(prediction, 1 - prediction)) > 0.0
+
+
+def test_attention_of_any_radius_is_the_dilation_by_a_square() -> None:
+    silhouettes = (torch.rand(2, 37, 53, generator=torch.Generator().manual_seed(0)) > 0.995).float()
+    for radius in (1, 10, 40):
+        size = 2 * radius + 1
+        expected = torch.nn.functional.max_pool2d(silhouettes, size, stride=1, padding=radius)
+        assert torch.equal(attention(silhouettes, radius), expected)

@@ -1,6 +1,7 @@
 """The triangles of a whole scene in one place, each still in the frame of its link."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -8,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..parts import link_parts
+from ..robot import Robot
 from ..scene import Scene, SceneState
 
 
@@ -35,13 +37,18 @@ class SceneGeometry:
 
     @staticmethod
     def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
-        """Gather the link meshes of a scene."""
+        """Gather the link meshes of a scene; once, for all renderers of the same robots."""
+        return SceneGeometry._of(tuple(arm.robot for arm in scene.arms), torch.device(device))
+
+    @staticmethod
+    @lru_cache(maxsize=4)
+    def _of(robots: tuple[Robot, ...], device: torch.device) -> "SceneGeometry":
         vertices, normals, faces, face_links, arms, face_parts, colors, counts = [], [], [], [], [], [], [], []
         first_link, first_vertex = 0, 0
-        for arm_index, arm in enumerate(scene.arms):
-            counts += [0] * len(arm.robot.link_names)
-            parts = link_parts(arm.robot)
-            for mesh in sorted(arm.robot.meshes, key=lambda mesh: mesh.link):
+        for arm_index, robot in enumerate(robots):
+            counts += [0] * len(robot.link_names)
+            parts = link_parts(robot)
+            for mesh in sorted(robot.meshes, key=lambda mesh: mesh.link):
                 link, count = first_link + mesh.link, len(mesh.faces)
                 vertices.append(mesh.vertices)
                 normals.append(mesh.normals)
@@ -52,7 +59,7 @@ class SceneGeometry:
                 face_parts.append(np.full(count, parts[mesh.link]))
                 colors.append(np.broadcast_to(mesh.color, (count, 3)))
                 first_vertex += len(mesh.vertices)
-            first_link += len(arm.robot.link_names)
+            first_link += len(robot.link_names)
         vertex, face = np.concatenate(vertices).astype(np.float64), np.concatenate(faces)
 
         def tensor(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
