@@ -1,6 +1,6 @@
 """What intents about files do: the shown mask as a download, and frames in any format into the project's folder."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import singledispatchmethod
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportFrame, export, file_name, mask_png
+from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, file_name, mask_png
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
@@ -118,11 +118,11 @@ class Exporter:
             raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
         self._controller.end_run("Stopped: frames are exported")
         self._controller.save()
-        dataset = self._dataset(intent)
+        make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
         self._intent = intent
-        self._job = Stepped(lambda monitor: export(dataset, intent.format, target, monitor=monitor))
-        self._controller.change(export=ExportState(FORMATS[intent.format].label, len(dataset.frames)), error=None)
+        self._job = Stepped(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
+        self._controller.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
 
     @handle.register
     def _(self, intent: ask.CancelExport) -> None:
@@ -137,7 +137,8 @@ class Exporter:
 
     # ---- The export ------------------------------------------------------------------------------------------------
 
-    def _dataset(self, intent: ask.Export) -> Dataset:
+    def _dataset(self, intent: ask.Export) -> tuple[Callable[[Monitor], Dataset], int]:
+        """What makes the dataset as the project is now, frame by frame, and how many frames it will have."""
         state, session = self._controller.state, self._session
         view = session.editor.view
         chosen = frames_in(view, FRAME_CHOICES[intent.frames])
@@ -146,11 +147,15 @@ class Exporter:
                 f"No frame is in this choice ({intent.frames.lower()}). Review frames, or choose others."
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
-        frames = export_frames(session, self._controller.painter, view, chosen, cameras)
         scene = scene_at(session.scene, state.pose.scene).with_cameras(cameras)
-        return Dataset(
-            session.sequence, tuple(frames), scene, state.domain, parts=intent.parts, images=bool(intent.images)
-        )
+        painter, sequence, images = self._controller.painter, session.sequence, bool(intent.images)
+
+        def make(monitor: Monitor) -> Dataset:
+            indices = Monitor(cancelled=monitor.cancelled).track(chosen)
+            frames = tuple(export_frame(session, painter, view, index, cameras) for index in indices)
+            return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
+
+        return make, len(chosen)
 
     def _log(self, intent: ask.Export, path: Path) -> None:
         project, export_state = self._session.editor.project, self._controller.state.export
@@ -180,28 +185,22 @@ class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
         return len(self._corrections)
 
 
-def export_frames(
-    session: Session, painter: Painter, project: ProjectState, indices: list[int], cameras: list[str]
-) -> list[ExportFrame]:
-    """Frames as a project has them: joint positions, their deviations and source, and masks that were painted on."""
-    frames = []
-    for index in indices:
-        frame = session.sequence.frame(index, cameras=[])
-        pose = session.pose(frame, project)
-        corrections = project.joints(index)
-        known = {name: value.standard_deviations for name, value in corrections.items()}
-        painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
-        frames.append(
-            ExportFrame(
-                frame.frame_id,
-                _SOURCES[pose.source],
-                session.joints(pose.scene),
-                {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
-                index=index,
-                masks=CorrectedMasks(painter, pose.scene, {name: p for name, p in painted.items() if p is not None}),
-            )
-        )
-    return frames
+def export_frame(
+    session: Session, painter: Painter, project: ProjectState, index: int, cameras: list[str]
+) -> ExportFrame:
+    """A frame as a project has it: joint positions, their deviations and source, and masks that were painted on."""
+    frame = session.sequence.frame(index, cameras=[])
+    pose = session.pose(frame, project)
+    known = {name: value.standard_deviations for name, value in project.joints(index).items()}
+    painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
+    return ExportFrame(
+        frame.frame_id,
+        _SOURCES[pose.source],
+        session.joints(pose.scene),
+        {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
+        index=index,
+        masks=CorrectedMasks(painter, pose.scene, {name: p for name, p in painted.items() if p is not None}),
+    )
 
 
 def free_path(project: Path, stem: str, intent: ask.Export) -> Path:

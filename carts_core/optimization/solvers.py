@@ -1,5 +1,7 @@
 """Solvers that only need a gradient, with the paper's schedule."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,7 +15,7 @@ _FINE_FROM = 0.5
 """Share of the iterations after which the objective's last stage begins."""
 
 
-class _Descent:
+class _Descent(ABC):
     """Steps of a planned size, coarse stages first, for a planned number of iterations."""
 
     def __init__(self, settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> None:
@@ -22,9 +24,9 @@ class _Descent:
         self.stage = 0
         self.finished: str | None = None
 
+    @abstractmethod
     def _direction(self, gradient: Float[Tensor, " n"], iteration: int) -> Float[Tensor, " n"]:
         """A step of about unit size."""
-        raise NotImplementedError
 
     def __call__(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Float[Tensor, " n"]:
         """One step down the gradient."""
