@@ -29,6 +29,7 @@ from carts_core.resources import static_dir
 from carts_viewer import incoming
 from carts_viewer.gate import gated, response
 from carts_viewer.guard import Guard, check_address
+from carts_viewer.outgoing import queue_safely
 
 OWN_KEYS = ("[", "]", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -59,6 +60,7 @@ class Page:
         self._guard = Guard(host)
         self._title = title
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
+        queue_safely()
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())

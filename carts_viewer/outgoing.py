@@ -1,0 +1,36 @@
+"""Messages to tabs, queued from any thread.
+
+The toolkit below us wakes the tasks that send messages twice: at once, from whichever thread queued one, and again on
+the event loop. An asyncio event is for one thread only: with several tabs the first call now and then fails in the
+middle ("deque mutated during iteration"), and what it was to show stays hidden. The second call does the work alone.
+"""
+
+import asyncio
+import dataclasses
+
+from viser.infra import _infra
+from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+
+class LoopEvent(asyncio.Event):
+    """An event that leaves other threads' calls to the one that follows on the event loop."""
+
+    def set(self) -> None:
+        """Wake all who wait, if this is the event loop's thread."""
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            return
+        super().set()
+
+
+@dataclasses.dataclass
+class MessageBuffer(AsyncMessageBuffer):
+    """The toolkit's queue with such an event."""
+
+    message_event: asyncio.Event = dataclasses.field(default_factory=LoopEvent)
+
+
+def queue_safely() -> None:
+    """Have every server that starts from now on, and every tab that joins it, use such queues."""
+    _infra.AsyncMessageBuffer = MessageBuffer  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
