@@ -12,12 +12,12 @@ from .observability import Uncertainty
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An objective at one point. Maps are at the working resolution, and nothing carries autograd."""
+    """An objective at one point. Maps are at the resolution of comparison, and nothing carries autograd."""
 
     value: float
     """What is descended, in the stage that was asked for: the loss there, and the prior."""
     loss: float
-    """The loss as of the last stage and without the prior, so comparable through all iterations."""
+    """The loss as of the last stage of the same epoch and without the prior, so comparable within it."""
     prior: float
     gradient: Float[Tensor, " n"]
     """Of `value`; zero if it was not asked for."""

@@ -31,7 +31,7 @@ class Iterate:
     """Number of steps before it; 0 is the start."""
     state: SceneState
     loss: float
-    """In the final stage, so comparable through all iterates, up to a proposed ignore mask and from it on."""
+    """In the last stage of the present look at the image, so comparable through all iterates of that look."""
     terms: dict[str, float]
     """Parts of the objective that was descended."""
     gradient_norms: dict[str, float]
@@ -42,9 +42,9 @@ class Iterate:
     joint_names: tuple[tuple[str, ...], ...]
     """Per arm."""
     silhouette: Float[np.ndarray, "cameras h w"]
-    """At the working resolution."""
+    """At the resolution at which it was compared, as are the other maps."""
     image: UInt8[np.ndarray, "cameras h w 3"]
-    """Rendered arms at the working resolution, RGB."""
+    """Rendered arms, RGB."""
     uncertainty: Uncertainty | None
     """What the images determine; None for losses that cannot say."""
     attention: Float[np.ndarray, "cameras h w"]

@@ -41,17 +41,19 @@ class OptimizerSettings:
     """Which loss; see `carts_core.losses.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
-    blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 0.8)
+    blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.6, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
+    zoom: float = 1.5
+    """`surface`: how many times larger than the working image the compared images are, up to the camera's image [1]."""
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
     candidates: int = 64
     """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
-    bad_loss: float = 0.09
+    bad_loss: float = 0.045
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
-    noise: float = 2.0
+    noise: float = 1.33
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
@@ -105,6 +107,7 @@ class OptimizerSettings:
         _require(0 <= self.candidates <= 10_000, "candidates", self.candidates, "0 to 10000")
         _require(0 <= self.bad_loss <= 10, "bad_loss", self.bad_loss, "0 to 10")
         _require(1 <= self.looks <= 10, "looks", self.looks, "1 to 10")
+        _require(1 <= self.zoom <= 4, "zoom", self.zoom, "1 to 4")
         blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")

@@ -6,7 +6,7 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -29,10 +29,10 @@ from .parameters import ParameterVector
 from .settings import OptimizerSettings
 from .window import Window
 
-_MARGIN = 40
+_MARGIN = 27
 """What is compared beyond the arms as they are believed to be [px of the working image]."""
 
-_ATTENTION = (40, 12)
+_ATTENTION = (27, 8)
 """Distance from the arms as they are believed to be, beyond which nothing counts [px of the working image]: of the
 first look and of those that know better. What is taken for an arm further off is none."""
 
@@ -43,7 +43,7 @@ _FINE = 2
 """Number of stages of the second look."""
 
 _COARSEST = 8
-"""Working pixels per side of a pixel in the coarsest stages."""
+"""Pixels of the look per side of a pixel in the coarsest stages."""
 
 _SMALLEST_BLUR = 1.2
 """A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
@@ -86,12 +86,13 @@ class SurfaceObjective:
         self._plan += [(second, blur) for blur in fine]
         self._plan += [(look, fine[-1]) for look in range(second + 1, settings.looks)]
         self.stages = len(self._plan)
-        self._size = working_size(scene, settings.working_width, extractor.stride)
+        width = round(settings.working_width * settings.zoom)
+        self._size = working_size(scene, width, extractor.stride)
+        self._zoom = self._size[0] / working_size(scene, settings.working_width, extractor.stride)[0]
         device = extractor.device
         self._images = stacked_images(scene, images, self._size, "image").to(device)
         self._weight = _weights(scene, ignore or {}, self._size).to(device)
-        width, height = self._size
-        self._whole = Renderer(scene, width=width, height=height, device=device)
+        self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._look = -1
 
@@ -138,23 +139,26 @@ class SurfaceObjective:
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
         believed = self._whole.surface(self.parameters.state(offsets)).maps
-        window = Window.around(believed[:, COVERAGE].sum(1), _MARGIN, self._extractor.stride, self._size)
+        margin, reach = round(_MARGIN * self._zoom), round(_ATTENTION[min(look, 1)] * self._zoom)
+        window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
-        near = attention(silhouette, _ATTENTION[min(look, 1)]) if silhouette.any() else torch.ones_like(silhouette)
+        near = attention(silhouette, reach) if silhouette.any() else torch.ones_like(silhouette)
         weight = window.of(self._weight) * near[:, None]
-        self._look, self._window = look, window
-        self._seen = observed[:, COVERAGE].sum(1) * weight[:, 0]
-        blurs = [blur for number, blur in self._plan if number == look]
-        if blurs[-1] != self.settings.blurs[-1]:
-            blurs.append(self.settings.blurs[-1])
-        self._stages = [_Stage(self.scene, self._size, window, observed, weight, blur, self.settings) for blur in blurs]
+        self._look = look
+        self._seen = float((observed[:, COVERAGE].sum(1) * weight[:, 0]).sum()) / self._zoom**2
+        self._stages = [
+            _Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
+            for number, blur in self._plan
+            if number == look
+        ]
 
     def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)
         neighbours = _neighbours(self.parameters, offsets) if gradient else None
         compared = stage.compare(state, neighbours)
-        final = compared if stage is self._stages[-1] else self._stages[-1].compare(state, None)
+        last = self._stages[-1]
+        final = compared if stage is last else last.compare(state, None)
         prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None:
@@ -164,9 +168,9 @@ class SurfaceObjective:
             if bool((self._prior.precision.diagonal() > 0).all()):
                 known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
-        area = 0.5 * float((coverage + self._seen).sum().clamp(min=1.0))
-        empty = coverage.new_zeros(len(coverage), self._size[1], self._size[0])
-        paste = self._window.paste
+        area = 0.5 * max(float(coverage.sum()) * last.area + self._seen, 1.0)
+        empty = coverage.new_zeros(len(coverage), last.size[1], last.size[0])
+        paste = last.window.paste
         return Evaluation(
             value=compared.cost / self.settings.noise**2 + prior,
             loss=2.0 * final.cost / area,
@@ -206,28 +210,26 @@ class _Stage:
         self,
         scene: Scene,
         size: tuple[int, int],
+        zoom: float,
         window: Window,
         observed: Float[Tensor, "cameras 6 h w"],
         weight: Float[Tensor, "cameras 1 h w"],
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
-        # The last stage is what losses and pictures are made of, so it is never reduced.
-        coarsest = 1 if blur == settings.blurs[-1] else _COARSEST
-        self._factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or (f <= coarsest and blur / f >= _SMALLEST_BLUR))
-        self._blur, self._robust = blur / self._factor, settings.robust
-        # A pixel of a coarse stage stands for many of the last one.
-        self._precision = self._factor**2 / settings.noise**2
-        left, top, columns, rows = (v // self._factor for v in (window.left, window.top, window.width, window.height))
+        blur *= zoom
+        factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._blur, self._robust = blur / factor, settings.robust
+        self.area = (factor / zoom) ** 2
+        """Of a pixel [px of the working image]."""
+        self._precision = self.area / settings.noise**2
+        self.size = size[0] // factor, size[1] // factor
+        self.window = window.reduced(factor)
         self.renderer = Renderer(
-            scene,
-            width=size[0] // self._factor,
-            height=size[1] // self._factor,
-            window=(left, top, columns, rows),
-            device=observed.device,
+            scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=observed.device
         )
-        self._weight = functional.avg_pool2d(weight, self._factor)
-        maps = functional.avg_pool2d(observed * weight, self._factor)
+        self._weight = functional.avg_pool2d(weight, factor)
+        maps = functional.avg_pool2d(observed * weight, factor)
         self._observed = _compared(smoothed(maps, self._blur))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
         self._channels[1 : COVERAGE.stop] = settings.parts_weight
@@ -242,7 +244,7 @@ class _Stage:
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         ratio = 1.0 / (1.0 + squared / self._robust**2)
         comparison = _Comparison(
-            0.5 * self._factor**2 * float((squared * ratio).sum()),
+            0.5 * self.area * float((squared * ratio).sum()),
             rendering,
             (1.0 - squared[:, 0]).clamp(min=-1.0),
             (ratio.square() * self._weight)[:, 0],

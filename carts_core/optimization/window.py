@@ -54,6 +54,10 @@ class Window:
         """This window as a part of one that holds it."""
         return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
 
+    def reduced(self, factor: int) -> "Window":
+        """This part of an image that is so many times smaller."""
+        return Window(self.left // factor, self.top // factor, self.width // factor, self.height // factor)
+
     def of(self, image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch {self.height} {self.width}"]:
         """This part of an image."""
         return image[..., self.top : self.top + self.height, self.left : self.left + self.width]

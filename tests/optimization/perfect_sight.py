@@ -17,18 +17,17 @@ class PerfectSight:
     stride = 16
 
     def __init__(self, sequence: Sequence, truth: SceneState) -> None:
-        fine = Renderer(sequence.scene, width=640, height=480).surface(truth).maps
-        self.maps = functional.avg_pool2d(fine, 2)
+        self.maps = Renderer(sequence.scene, width=640, height=480).surface(truth).maps
 
     def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
         """The truth, cut to the window that `believed` lies in."""
-        state = Window(0, 0, self.maps.shape[3], self.maps.shape[2])
+        width, height = self.size
         left, top = self.where
         window = Window(left, top, images.shape[3], images.shape[2])
-        assert state.holds(window)
-        return window.of(self.maps)
+        assert Window(0, 0, width, height).holds(window)
+        return window.of(functional.interpolate(self.maps, (height, width), mode="area")).clone()
 
-    where = (0, 0)
+    where, size = (0, 0), (320, 240)
 
     def follow_windows(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Know which window of the image is looked at."""
@@ -36,7 +35,7 @@ class PerfectSight:
 
         def remembered(*arguments) -> Window:
             window = around(*arguments)
-            self.where = (window.left, window.top)
+            self.where, self.size = (window.left, window.top), arguments[3]
             return window
 
         monkeypatch.setattr(Window, "around", staticmethod(remembered))

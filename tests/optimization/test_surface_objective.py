@@ -59,6 +59,22 @@ def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: 
         assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.35)
 
 
+def test_images_are_enlarged_up_to_the_cameras_and_weigh_the_same(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame, scene = sequence.frame(0), sequence.scene
+    parameters = ParameterVector(scene, scene.state(frame.measured), FreeParameters(), 0.15)
+    off = torch.zeros(len(parameters))
+    off[0] = 0.03
+    found = {}
+    for zoom in (1.0, 1.5, 2.0, 4.0):
+        settings = OptimizerSettings(working_width=160, zoom=zoom, blurs=(0.8,), looks=1)
+        found[zoom] = SurfaceObjective(scene, frame.images, sight, parameters, settings)(off, 0, gradient=True)
+    assert [evaluation.silhouette.shape[-1] for evaluation in found.values()] == [160, 240, 320, 320]
+    for zoom in (1.5, 2.0, 4.0):
+        assert found[zoom].value == pytest.approx(found[1.0].value, rel=0.15)
+        assert found[zoom].loss == pytest.approx(found[1.0].loss, rel=0.15)
+        assert float(found[zoom].gradient[0]) == pytest.approx(float(found[1.0].gradient[0]), rel=0.15)
+
+
 def test_what_is_not_in_the_image_stays_and_is_said_to_be_unknown(sequence: Sequence, sight: FeatureExtractor) -> None:
     frame = sequence.frame(0)
     truth = (frame.truth or {})["PSM1"]

@@ -9,8 +9,8 @@ from .geometry import Intrinsics, RobotGeometry
 
 DEPTH = (0.05, 0.25)
 """Distance of the wrist from the camera [m]."""
-FOCAL_LENGTH = (0.7, 1.3)
-"""Focal length in image widths [1]."""
+FOCAL_LENGTH = (0.7, 2.0)
+"""Focal length in image widths [1]: of whole endoscope images, and of enlarged ones, which are looked at last."""
 OUTSIDE = 0.12
 """How far outside the image a wrist may be, in image sizes [1]."""
 ELEVATION = (-20.0, 60.0)
@@ -28,7 +28,7 @@ class Placement:
 
 def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> Intrinsics:
     """fx, fy, cx, cy [px] of a camera that is `field` px wide and of which a part of `width` x `height` px is seen."""
-    focal = rng.uniform(*FOCAL_LENGTH) * field
+    focal = float(np.exp(rng.uniform(*np.log(FOCAL_LENGTH)))) * field
     cx, cy = rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height
     return focal, focal * rng.uniform(0.98, 1.02), cx, cy
 
