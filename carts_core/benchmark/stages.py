@@ -9,7 +9,10 @@ from ..bench import milliseconds, optimizer_figures, render_figures
 from ..data import Sequence
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
+from ..optimization import OptimizerSettings
+from ..optimization.inputs import working_size
 from ..resources import sample_sequence
+from ..scene import Scene
 from .fingerprints import code_fingerprint
 from .machine import machine
 
@@ -30,17 +33,17 @@ def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
     if known_stages(path, extractor):
         return
     sequence = Sequence.open(sample_sequence())
-    figures = {
-        **render_figures(sequence, _RUNS),
-        **network_figures(extractor),
-        **optimizer_figures(sequence, _RUNS),
-    }
+    # The optimizer first, as in `carts_core.bench`.
+    optimizer = optimizer_figures(sequence, _RUNS)
+    figures = {**render_figures(sequence, _RUNS), **network_figures(sequence.scene, extractor), **optimizer}
     write_bytes(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1).encode())
 
 
-def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
-    """Times of the networks on a whole working image [ms]."""
-    width, height = extractor.working_size
+def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:
+    """Times of the networks on whole images of the sizes that the optimizer compares by default [ms]."""
+    settings = OptimizerSettings()
+    width, height = working_size(scene, settings.working_width, extractor.stride)
+    wide, high = working_size(scene, round(settings.working_width * settings.zoom), extractor.stride)
     image = torch.rand(1, 3, height, width, device=extractor.device)
 
     def forward() -> None:
@@ -50,12 +53,11 @@ def network_figures(extractor: FeatureExtractor) -> dict[str, float]:
     def both() -> None:
         extractor.features(image.requires_grad_()).sum().backward()
 
-    believed = torch.rand(1, 6, height, width, device=extractor.device)
+    large = torch.rand(1, 3, high, wide, device=extractor.device)
+    believed = torch.rand(1, 6, high, wide, device=extractor.device)
 
     return {
-        f"surface network forward, {width}x{height}": milliseconds(
-            lambda: extractor.surface(image.detach(), believed), _RUNS
-        ),
+        f"surface network forward, {wide}x{high}": milliseconds(lambda: extractor.surface(large, believed), _RUNS),
         f"feature network forward, {width}x{height}": milliseconds(forward, _RUNS),
         f"feature network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
     }
