@@ -13,22 +13,28 @@ from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 
 class LoopEvent(asyncio.Event):
-    """An event that leaves other threads' calls to the one that follows on the event loop."""
+    """An event of one event loop; calls from elsewhere are left to the one that follows on the loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._own_loop = loop
 
     def set(self) -> None:
-        """Wake all who wait, if this is the event loop's thread."""
+        """Wake all who wait, if this runs on the event loop."""
         try:
-            asyncio.get_running_loop()
+            running = asyncio.get_running_loop()
         except RuntimeError:
             return
-        super().set()
+        if running is self._own_loop:
+            super().set()
 
 
 @dataclasses.dataclass
 class MessageBuffer(AsyncMessageBuffer):
     """The toolkit's queue with such an event."""
 
-    message_event: asyncio.Event = dataclasses.field(default_factory=LoopEvent)
+    def __post_init__(self) -> None:
+        self.message_event = LoopEvent(self.event_loop)
 
 
 def queue_safely() -> None:

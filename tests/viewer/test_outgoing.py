@@ -23,9 +23,16 @@ def event_loop_in_a_thread():
 
 
 def test_an_event_is_set_by_its_loop_only(event_loop_in_a_thread: asyncio.AbstractEventLoop) -> None:
-    event = LoopEvent()
+    event = LoopEvent(event_loop_in_a_thread)
     waiting = asyncio.run_coroutine_threadsafe(event.wait(), event_loop_in_a_thread)
     event.set()
+
+    async def set_on_another_loop() -> None:
+        event.set()
+
+    other = threading.Thread(target=lambda: asyncio.run(set_on_another_loop()))
+    other.start()
+    other.join()
     assert not event.is_set()
     event_loop_in_a_thread.call_soon_threadsafe(event.set)
     assert waiting.result(10) and event.is_set()
