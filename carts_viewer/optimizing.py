@@ -195,12 +195,13 @@ class Runner:
             return
         self._accept(run, iterate)
         self._controller.score()
-        curves = self._controller.state.run.curves
+        curves, best = self._controller.state.run.curves, run.best()
         self._set(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
                 (*curves.scores, self._controller.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
+                best.index if best else 0,
             )
         )
 

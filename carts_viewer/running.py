@@ -32,7 +32,7 @@ class Optimizer(Protocol):
 
     @property
     def best(self) -> Iterate | None:
-        """The iterate of the lowest loss so far."""
+        """The best iterate so far: of the present look at the image, the one of the lowest loss."""
 
     @property
     def stop_reason(self) -> str | None:
@@ -227,7 +227,7 @@ class ActiveRun:
         return self._optimizer.step()
 
     def best(self) -> Iterate | None:
-        """The iterate of the lowest loss so far."""
+        """The best iterate so far: of the present look at the image, the one of the lowest loss."""
         return self._optimizer.best
 
     def pose(self, iterate: Iterate) -> Pose:

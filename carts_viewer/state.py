@@ -60,6 +60,9 @@ class Curves:
     scores: tuple[Scores, ...] = ()
     seconds: tuple[float, ...] = ()
     """Duration of each iteration [s]."""
+    best: int = 0
+    """Index of the iterate that is kept so far. Losses of different looks at the image do not compare, so it need not
+    be the one of the lowest loss."""
 
 
 @dataclass(frozen=True, eq=False)

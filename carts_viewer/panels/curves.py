@@ -27,15 +27,13 @@ class CurvesPanel:
         if curves is self._shown:
             return
         self._shown = curves
-        # The best iterate is the one of the lowest loss, whatever the other curves say: that is what is kept.
-        best = int(np.argmin(curves.loss)) if curves.loss else 0
         values = (
             curves.loss,
             tuple(score.dice for score in curves.scores),
             tuple(score.joint_degrees for score in curves.scores),
         )
         for chart, series in zip(self._charts, values, strict=True):
-            chart.show(series, best)
+            chart.show(series, curves.best)
 
 
 _QUANTITIES = ((_LOSS, _TEAL), ("Dice", _BLUE), ("Joint error [°]", _ORANGE))
@@ -73,5 +71,5 @@ class _Chart:
         if kept is None:
             return text
         if self._name == _LOSS:
-            return f"{text} · lowest <b>{kept:.3g}</b> at iteration {best}"
+            return f"{text} · kept <b>{kept:.3g}</b> of iteration {best}"
         return f"{text} · kept <b>{kept:.3g}</b>"

@@ -83,6 +83,7 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     assert len(state.run.curves.loss) == 5 and len(state.run.curves.scores) == 5
     assert min(state.run.curves.loss) < state.run.curves.loss[0]
     assert state.maps is not None and state.maps.iterate.loss == min(state.run.curves.loss)
+    assert state.run.curves.loss[state.run.curves.best] == state.maps.iterate.loss
     assert state.pose.source is Source.OPTIMIZER
     assert desk.saved.joints(0)["PSM1"].joint_positions == tuple(state.pose.scene.joint_positions[0].tolist())
 
