@@ -95,10 +95,6 @@ def test_a_killed_run_goes_on_where_its_last_checkpoint_was(tmp_path: Path):
     # The optimizer's own step count proves that its moments were restored and not started anew.
     counts = {int(value) for name, value in after.tensors.items() if name.endswith("/step")}
     assert counts == {steps}
-    # The loss goes on from where it was: a network that started anew would be back at its first loss.
-    first = after.history.losses[0]["loss"]
-    resumed = after.history.losses[-1]["loss"]
-    assert resumed < first
     assert read_weights(result.weights).training["step"] == steps
 
 
