@@ -219,7 +219,8 @@ class Controller:
     def mark(self, name: str, review: Review, *, gesture: object = None) -> None:
         """Say something about the shown frame, which ends a run. Arguments and errors as `edit`."""
         self.end_run("Stopped: the frame was reviewed")
-        self.stage(name, {Key.review(self.state.index): review}, gesture=gesture)
+        # What says nothing is none, so that clearing what is clear is no step.
+        self.stage(name, {Key.review(self.state.index): None if review == Review() else review}, gesture=gesture)
 
     def save(self) -> None:
         """Save the gesture under way as one step, as far as there is one.

@@ -1,0 +1,253 @@
+"""Random actions on the app's controller and on a model in plain Python: both must always say the same."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from viewer_desk import Desk
+
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.project import Project, ReviewState, Source
+from carts_viewer import intents as ask
+from carts_viewer.running import OptimizerFactory
+
+FRAMES = 3
+ARM = "PSM1"
+_STEP = 5e-4
+"""Between two values that joints are dragged to [rad]: none comes twice."""
+
+
+@dataclass(frozen=True)
+class FrameModel:
+    """What a frame should be; joint positions of None are the measured ones."""
+
+    joints: tuple[float, ...] | None = None
+    copied: bool = False
+    review: ReviewState = ReviewState.UNTOUCHED
+    note: str = ""
+    marked: bool | None = None
+
+    @property
+    def keyframe(self) -> bool:
+        """Said so, or made by hand."""
+        by_hand = self.joints is not None and not self.copied
+        return by_hand if self.marked is None else self.marked
+
+
+@dataclass
+class AppModel:
+    """Frames after every step, and a gesture that is not finished."""
+
+    snapshots: list[tuple[FrameModel, ...]] = field(default_factory=lambda: [(FrameModel(),) * FRAMES])
+    position: int = 0
+    index: int = 0
+    drag: tuple[FrameModel, ...] | None = None
+
+    @property
+    def frames(self) -> tuple[FrameModel, ...]:
+        """As they are shown."""
+        return self.snapshots[self.position] if self.drag is None else self.drag
+
+    def release(self) -> None:
+        """The gesture under way is a step."""
+        frames, self.drag = self.frames, None
+        if frames != self.snapshots[self.position]:
+            self.snapshots[self.position + 1 :] = [frames]
+            self.position += 1
+
+    def changed(self, **changes) -> tuple[FrameModel, ...]:
+        """The frames, with another shown one."""
+        frames = list(self.frames)
+        frames[self.index] = replace(frames[self.index], **changes)
+        return tuple(frames)
+
+    def do(self, **changes) -> None:
+        """A whole gesture in the shown frame."""
+        self.release()
+        self.drag = self.changed(**changes)
+        self.release()
+
+    def go_to(self, position: int) -> None:
+        """Undo or redo; a frame that it changes is shown."""
+        self.release()
+        before = self.frames
+        self.position = min(max(position, 0), len(self.snapshots) - 1)
+        changed = [index for index in range(FRAMES) if self.frames[index] != before[index]]
+        if changed and self.index not in changed:
+            self.index = changed[0]
+
+
+def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachine]:
+    sequence = Sequence.open(path)
+    measured = [sequence.frame(index, cameras=[]).measured[ARM] for index in range(FRAMES)]
+
+    class AppMachine(RuleBasedStateMachine):
+        """What people do in the page, in any order."""
+
+        @initialize()
+        def begin(self) -> None:
+            self.model, self.values = AppModel(), 0
+            for file in path.parent.glob("machine.carts*"):
+                file.unlink()
+            self.desk = Desk(sequence, Project.open(sequence, path.with_name("machine.carts")), factory)
+
+        def teardown(self) -> None:
+            if hasattr(self, "desk"):
+                self.desk.session.close()
+                self.desk.session.editor.project.close()
+
+        def _joints(self) -> np.ndarray:
+            joints = self.model.frames[self.model.index].joints
+            return np.array(measured[self.model.index] if joints is None else joints)
+
+        @rule(joint=st.integers(0, 1), count=st.integers(1, 3), release=st.booleans())
+        def drag(self, joint: int, count: int, release: bool) -> None:
+            self.model.release()
+            self.desk.do(ask.Released())
+            for _ in range(count):
+                self.values += 1
+                self.desk.do(ask.SetJoint(ARM, joint, _STEP * self.values))
+            moved = self._joints()
+            moved[joint] = _STEP * self.values
+            self.model.drag = self.model.changed(joints=tuple(moved), copied=False)
+            if release:
+                self.desk.do(ask.Released())
+                self.model.release()
+
+        @rule(degrees=st.sampled_from((0.1, 1.0)))
+        def nudge(self, degrees: float) -> None:
+            self.desk.do(ask.ChooseJoint((ARM, 1)), ask.Nudge(degrees))
+            moved = self._joints()
+            moved[1] += np.deg2rad(degrees)
+            self.model.do(joints=tuple(moved), copied=False)
+
+        @rule()
+        def back_to_measured(self) -> None:
+            self.desk.do(ask.BackToMeasured(ARM))
+            self.model.do(joints=None, copied=False)
+
+        @rule(step=st.sampled_from((-1, 1)))
+        def copy(self, step: int) -> None:
+            source = self.model.index + step
+            if not 0 <= source < FRAMES or self.model.frames[source].joints is None:
+                with pytest.raises(CartsError):
+                    self.desk.do(ask.CopyCorrection(step))
+                return
+            self.desk.do(ask.CopyCorrection(step))
+            change = np.array(self.model.frames[source].joints) - measured[source]
+            copied = tuple(measured[self.model.index] + change)
+            self.model.release()
+            before = self.model.frames[self.model.index]
+            if before.joints is None or not np.allclose(before.joints, copied, atol=1e-6, rtol=0):
+                self.model.do(joints=copied, copied=True)
+
+        @rule(state=st.sampled_from(list(ReviewState)))
+        def review(self, state: ReviewState) -> None:
+            self.desk.do(ask.SetReview(state))
+            self.model.do(review=state)
+
+        @rule(text=st.text(max_size=20), release=st.booleans())
+        def note(self, text: str, release: bool) -> None:
+            self.model.release()
+            self.desk.do(ask.Released(), ask.SetNote(text))
+            self.model.drag = self.model.changed(note=self.desk.state.review.note)
+            if release:
+                self.desk.do(ask.Released())
+                self.model.release()
+
+        @rule(on=st.booleans())
+        def keyframe(self, on: bool) -> None:
+            self.desk.do(ask.HoldKeyframe(on))
+            self.model.do(marked=on)
+
+        @rule(index=st.integers(0, FRAMES - 1))
+        def show(self, index: int) -> None:
+            self.desk.do(ask.Released(), ask.ShowFrame(index))
+            self.model.release()
+            self.model.index = index
+
+        @rule()
+        def undo(self) -> None:
+            self.model.release()
+            self.desk.do(ask.Undo())
+            self.model.go_to(self.model.position - 1)
+
+        @rule()
+        def redo(self) -> None:
+            self.model.release()
+            self.desk.do(ask.Redo())
+            self.model.go_to(self.model.position + 1)
+
+        @rule(share=st.floats(0, 1))
+        def go_to(self, share: float) -> None:
+            self.model.release()
+            position = round(share * (len(self.model.snapshots) - 1))
+            self.desk.do(ask.GoToStep(position))
+            self.model.go_to(position)
+
+        @rule()
+        def reopen(self) -> None:
+            self.model.release()
+            self.desk.controller.close()
+            self.desk = self.desk.reopened()
+            self.model.index = 0
+
+        @invariant()
+        def they_say_the_same(self) -> None:
+            if not hasattr(self, "desk"):
+                return
+            state, model = self.desk.state, self.model
+            assert state.index == model.index and state.frame.index == model.index
+            steps = len(model.snapshots) - 1
+            assert (self.desk.saved.position, len(self.desk.saved.steps)) == (model.position, steps)
+            assert state.unsaved == (model.drag is not None and model.drag != model.snapshots[model.position])
+            for index, expected in enumerate(model.frames):
+                review, joints = state.project.review(index), state.project.joints(index)
+                assert (review.state, review.note) == (expected.review, expected.note)
+                assert state.project.is_keyframe(index) == expected.keyframe
+                assert (expected.joints is None) == (not joints)
+                if expected.joints is not None:
+                    np.testing.assert_allclose(joints[ARM].joint_positions, expected.joints, atol=1e-6)
+                    source = Source.PROPAGATED if expected.copied else Source.HAND
+                    assert joints[ARM].provenance.source is source
+            shown = self.desk.session.joints(state.pose.scene)[ARM]
+            np.testing.assert_allclose(shown, self._joints(), atol=1e-6)
+
+    return AppMachine
+
+
+@pytest.fixture
+def machine(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> type[RuleBasedStateMachine]:
+    factory = OptimizerFactory(weights=(untrained_weights,), report=lambda line: None)
+    return _machine(tiny_sequence(frames=FRAMES), factory)
+
+
+def test_the_app_says_what_the_model_says_after_every_action(machine: type[RuleBasedStateMachine]) -> None:
+    run_state_machine_as_test(
+        machine, settings=settings(max_examples=10, stateful_step_count=30, deadline=None, derandomize=True)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_app_says_what_the_model_says_after_each_of_10000_actions(machine: type[RuleBasedStateMachine]) -> None:
+    checks = 0
+
+    class CountingMachine(machine):
+        @invariant()
+        def count(self) -> None:
+            nonlocal checks
+            checks += 1
+
+    # A run may stop before its last action, so there are some more runs than 100.
+    runs = 130
+    run_state_machine_as_test(
+        CountingMachine, settings=settings(max_examples=runs, stateful_step_count=100, deadline=None, database=None)
+    )
+    assert checks - 2 * runs >= 10_000, "the first checks of a run are before its first action"
