@@ -86,6 +86,7 @@ class AppModel:
 
 def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachine]:
     sequence = Sequence.open(path)
+    low, high = sequence.scene.arm(ARM).robot.joint_limits.numpy().T
     measured = [sequence.frame(index, cameras=[]).measured[ARM] for index in range(FRAMES)]
 
     class AppMachine(RuleBasedStateMachine):
@@ -125,8 +126,10 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
         def nudge(self, degrees: float) -> None:
             self.desk.do(ask.ChooseJoint((ARM, 1)), ask.Nudge(degrees))
             moved = self._joints()
-            moved[1] += np.deg2rad(degrees)
-            self.model.do(joints=tuple(moved), copied=False)
+            moved[1] = min(moved[1] + np.deg2rad(degrees), high[1])
+            self.model.release()
+            if abs(moved[1] - self._joints()[1]) > 1e-5:  # Else it is at its limit.
+                self.model.do(joints=tuple(moved), copied=False)
 
         @rule()
         def back_to_measured(self) -> None:
@@ -141,7 +144,7 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
                     self.desk.do(ask.CopyCorrection(step))
                 return
             change = np.array(self.model.frames[source].joints) - measured[source]
-            copied = measured[self.model.index] + change
+            copied = np.clip(measured[self.model.index] + change, low, high)
             if np.abs(copied - self._joints()).max() > 1e-5:  # Else it is a matter of rounding whether that is a step.
                 self.desk.do(ask.CopyCorrection(step))
                 self.model.do(joints=tuple(copied), copied=True)
