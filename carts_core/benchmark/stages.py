@@ -33,9 +33,11 @@ def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
     if known_stages(path, extractor):
         return
     sequence = Sequence.open(sample_sequence())
-    # The optimizer first, as in `carts_core.bench`.
-    optimizer = optimizer_figures(sequence, _RUNS)
-    figures = {**render_figures(sequence, _RUNS), **network_figures(sequence.scene, extractor), **optimizer}
+    figures = {
+        **render_figures(sequence, _RUNS),
+        **network_figures(sequence.scene, extractor),
+        **optimizer_figures(sequence, _RUNS),
+    }
     write_bytes(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1).encode())
 
 

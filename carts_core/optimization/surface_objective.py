@@ -42,8 +42,8 @@ _SPREAD = 1.5
 _FINE = 2
 """Number of stages of the second look."""
 
-_COARSEST = 8
-"""Pixels of the look per side of a pixel in the coarsest stages."""
+_FACTORS = (1, 2, 4, 8)
+"""How many times smaller than the compared images those of a stage can be."""
 
 _SMALLEST_BLUR = 1.2
 """A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
@@ -218,7 +218,7 @@ class _Stage:
         settings: OptimizerSettings,
     ) -> None:
         blur *= zoom
-        factor = max(f for f in (1, 2, 4, _COARSEST) if f == 1 or blur / f >= _SMALLEST_BLUR)
+        factor = max(f for f in _FACTORS if f == 1 or blur / f >= _SMALLEST_BLUR)
         self._blur, self._robust = blur / factor, settings.robust
         self.area = (factor / zoom) ** 2
         """Of a pixel [px of the working image]."""

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+from many_actions import check_after_each_of_10000_actions
 from project_model import FRAMES, IDENTITY, POSSIBLE_EDITS, ProjectModel, visible
 
 from carts_core.project import Figures, Project
@@ -93,17 +94,4 @@ def test_a_project_says_what_the_model_says_after_every_action() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_project_says_what_the_model_says_after_each_of_10000_actions() -> None:
-    checks = 0
-
-    class CountingMachine(ProjectMachine):
-        @invariant()
-        def count(self) -> None:
-            nonlocal checks
-            checks += 1
-
-    # A run may stop before its last action, so there are some more runs than 100.
-    runs = 130
-    run_state_machine_as_test(
-        CountingMachine, settings=settings(max_examples=runs, stateful_step_count=100, deadline=None, database=None)
-    )
-    assert checks - runs >= 10_000, "the first check of a run is before its first action"
+    check_after_each_of_10000_actions(ProjectMachine)

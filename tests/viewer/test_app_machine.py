@@ -9,6 +9,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from many_actions import check_after_each_of_10000_actions
 from viewer_desk import Desk
 
 from carts_core.data import Sequence
@@ -239,17 +240,4 @@ def test_the_app_says_what_the_model_says_after_every_action(machine: type[RuleB
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_the_app_says_what_the_model_says_after_each_of_10000_actions(machine: type[RuleBasedStateMachine]) -> None:
-    checks = 0
-
-    class CountingMachine(machine):
-        @invariant()
-        def count(self) -> None:
-            nonlocal checks
-            checks += 1
-
-    # A run may stop before its last action, so there are some more runs than 100.
-    runs = 130
-    run_state_machine_as_test(
-        CountingMachine, settings=settings(max_examples=runs, stateful_step_count=100, deadline=None, database=None)
-    )
-    assert checks - 2 * runs >= 10_000, "the first checks of a run are before its first action"
+    check_after_each_of_10000_actions(machine)

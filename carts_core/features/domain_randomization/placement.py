@@ -10,7 +10,7 @@ from .geometry import Intrinsics, RobotGeometry
 DEPTH = (0.05, 0.25)
 """Distance of the wrist from the camera [m]."""
 FOCAL_LENGTH = (0.7, 2.0)
-"""Focal length in image widths [1]: of whole endoscope images, and of enlarged ones, which are looked at last."""
+"""Focal length in image widths [1]: of whole endoscope images, and of enlarged ones."""
 OUTSIDE = 0.12
 """How far outside the image a wrist may be, in image sizes [1]."""
 ELEVATION = (-20.0, 60.0)
