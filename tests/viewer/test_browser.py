@@ -142,10 +142,11 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     start = app.stage.sent("/overlay")
     tab.button("Run")
     eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
-    loss = app.state.run.curves.loss
+    curves = app.state.run.curves
+    loss = curves.loss
     assert min(loss[1:]) < loss[0]
     expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
-    expect(tab.page.get_by_text(f"iteration {int(np.argmin(loss))}").first).to_be_visible()
+    expect(tab.page.get_by_text(f"kept {loss[curves.best]:.3g} of iteration {curves.best}").first).to_be_visible()
     app.wait_until_shown()
     assert app.stage.sent("/overlay") != start
     charts = tab.page.evaluate(
