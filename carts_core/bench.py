@@ -18,12 +18,12 @@ from .data import Sequence
 from .evaluation import start_positions
 from .features import FeatureExtractor
 from .optimization import FrameOptimizer, OptimizerSettings
+from .process import tune_process
 from .rendering import Renderer, visibility_torch
 from .rendering.geometry import link_transforms, vertices_in_camera
 from .rendering.visibility_numba import rasterize
 from .resources import sample_sequence
 from .scene import SceneState
-from .threads import leave_a_core_free
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
@@ -95,7 +95,7 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
 
 def main() -> None:
     """Print the table."""
-    leave_a_core_free()
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--runs", type=int, default=30)

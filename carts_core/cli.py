@@ -16,7 +16,7 @@ from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
 from .errors import CartsError
-from .threads import leave_a_core_free
+from .process import tune_process
 
 BAD_INPUT = 2
 """Exit status when a file or an option is not usable."""
@@ -36,7 +36,7 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors that are meant for people end it with one message and status 2."""
-    leave_a_core_free()
+    tune_process()
     try:
         command = tyro.cli(
             Command,

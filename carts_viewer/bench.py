@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from carts_core.data.bench import resident_megabytes
+from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.raw_tab import RawTab
@@ -163,7 +163,7 @@ def _figures(latency: Latency) -> str:
 
 def main() -> None:
     """Print the figures."""
-    leave_a_core_free()
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--weights", type=Path, nargs="*", default=())

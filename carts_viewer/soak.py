@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from carts_core.data.bench import resident_megabytes
+from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_core.threads import leave_a_core_free
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture import Painter
 from carts_viewer.raw_tab import RawTab
@@ -172,7 +172,7 @@ def _newest(tab: RawTab) -> bytes:
 
 def main() -> None:
     """Print what was seen; ends with code 1 if that is not good."""
-    leave_a_core_free()
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--minutes", type=float, default=60.0)

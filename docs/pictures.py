@@ -17,8 +17,8 @@ import numpy as np
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from carts_core.keypoints import project_keypoints
+from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_core.threads import leave_a_core_free
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.marks import labelled_keypoints
@@ -127,7 +127,7 @@ def take(work: Photographer) -> None:
 
 def main() -> None:
     """Write docs/images/*.jpg."""
-    leave_a_core_free()
+    tune_process()
     chromium = os.environ.get("CARTS_CHROMIUM") or shutil.which("chromium")
     IMAGES.mkdir(exist_ok=True)
     with (

@@ -14,10 +14,10 @@ from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import FrameOptimizer
 from carts_core.perturbation import perturb
+from carts_core.process import tune_process
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 from carts_core.scene import SceneState
-from carts_core.threads import leave_a_core_free
 
 
 def overlay(renderer: Renderer, state: SceneState, image: np.ndarray) -> np.ndarray:
@@ -31,7 +31,7 @@ def overlay(renderer: Renderer, state: SceneState, image: np.ndarray) -> np.ndar
 
 def main(path: Path, picture: Path) -> None:
     """Optimize the first frame in its first camera."""
-    leave_a_core_free()
+    tune_process()
     sequence = Sequence.open(path, progress=print)
     camera = sequence.scene.cameras[0].name
     frame = sequence.frame(0)

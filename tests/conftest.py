@@ -12,10 +12,10 @@ import pytest
 import torch
 from tiny import TinyScene, tiny_scene
 
+from carts_core.process import tune_process
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
 from carts_core.robot import Robot
-from carts_core.threads import leave_a_core_free
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,8 +35,8 @@ def _projects_of_the_shipped_sequence_beside_the_test(tmp_path: Path, monkeypatc
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _as_many_threads_as_the_command_uses() -> None:
-    leave_a_core_free()
+def _tuned_as_the_command() -> None:
+    tune_process()
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ..threads import leave_a_core_free
+from ..process import tune_process
 from .frame_reader import FrameReader
 from .sequence import Sequence
 
@@ -127,7 +127,7 @@ images = "{images}"
 
 def main() -> None:
     """Print the table."""
-    leave_a_core_free()
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--runs", type=int, default=5, help="how often each is opened")

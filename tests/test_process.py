@@ -1,0 +1,46 @@
+"""What a program of ours asks of the machine."""
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+FAULTS = """
+import resource
+import torch
+{tune}
+def images():
+    return [torch.zeros(4, 640, 480) + index for index in range(8)]
+images()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    images()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def page_faults(tune: str) -> int:
+    """How often the system had to hand out memory while images were made and dropped in a process of its own."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    ran = subprocess.run(
+        [sys.executable, "-c", FAULTS.format(tune=tune)], capture_output=True, text=True, check=True, env=environment
+    )
+    return int(ran.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to keep memory")
+def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
+    tuned = page_faults("from carts_core.process import tune_process; tune_process()")
+    assert tuned < 0.1 * page_faults("")
+
+
+@pytest.mark.parametrize(("given", "expected"), [({"OMP_NUM_THREADS": "2"}, 2), ({}, None)])
+def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
+    given: dict[str, str], expected: int | None
+) -> None:
+    code = "import torch; from carts_core.process import tune_process; tune_process(); print(torch.get_num_threads())"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | given
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert int(ran.stdout) == (expected or max(1, min((os.cpu_count() or 2) - 1, 4)))
