@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ..rendering import Renderer
 from ..rendering.geometry import link_transforms
-from ..rendering.shading import visible_points
+from ..rendering.points import visible_points
 from ..scene import Scene
 from ..synthesis.config import EndoscopeConfig
 from ..synthesis.path_tracer import Surface

@@ -11,7 +11,8 @@ from torch import Tensor
 from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
-from .shading import nonzero, phong, visible_points
+from .points import nonzero, visible_points
+from .shading import phong
 from .surface import SurfaceRendering, Tangents, surface_maps
 from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch

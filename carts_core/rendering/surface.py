@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ..scene import Light
 from ..surface import NORMALS, SURFACE_CHANNELS
-from .shading import VisiblePoints, phong
+from .points import VisiblePoints
+from .shading import phong
 
 
 @dataclass(frozen=True)

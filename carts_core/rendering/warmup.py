@@ -1,4 +1,4 @@
-"""`python -m carts_core.rendering.warmup`: compile the visibility kernel, and prepare the shipped robot's meshes.
+"""`python -m carts_core.rendering.warmup`: compile the kernels, and prepare the shipped robot's meshes.
 
 Both are kept on disk, so that the first picture does not wait for them.
 """
@@ -17,7 +17,7 @@ def main() -> None:
     robot = Robot.load(shipped_robot(), progress=print)
     camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), np.eye(4))
     scene = Scene((Arm("arm", robot, np.eye(4)),), (camera,))
-    Renderer(scene).segment(scene.state({"arm": np.zeros(len(robot.joint_names))}))
+    Renderer(scene).surface(scene.state({"arm": np.zeros(len(robot.joint_names))}))
 
 
 if __name__ == "__main__":

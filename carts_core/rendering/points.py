@@ -1,0 +1,128 @@
+"""Visible surface points: what each pixel sees, in the frame of the link it belongs to.
+
+There a point stands still; what the state moves is the link. Vectors are columns (`3 K`), and points stand in the order
+of their links, so that a link's points move by one product.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .geometry import SceneGeometry
+from .points_numba import gather_points
+from .shading import unit
+
+
+@dataclass(frozen=True)
+class VisiblePoints:
+    """What the visible pixels see. `K` counts visible pixels through all views. Nothing here carries a gradient."""
+
+    pixel: Int[Tensor, " K"]
+    """Index into the flattened `views x height x width`."""
+    face: Int[Tensor, " K"]
+    groups: tuple[tuple[int, int, int], ...]
+    """View, link and number of points of each run of points on the same link in the same view."""
+    point_link: Float[Tensor, "3 K"]
+    """The surface point, in the frame of its link [m]."""
+    normal_link: Float[Tensor, "3 K"]
+    """Interpolated normal there, in the frame of its link."""
+
+    def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
+        """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
+        counts = [count for _, _, count in self.groups]
+        points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
+        moved, turned = [], []
+        for (view, link, _), point, normal in zip(self.groups, points, normals, strict=True):
+            T = Ts_camera_link[view, link]
+            moved.append(T[:3, :3] @ point + T[:3, 3:])
+            turned.append(T[:3, :3] @ normal)
+        if not moved:
+            return self.point_link, self.normal_link
+        return torch.cat(moved, 1), torch.cat(turned, 1)
+
+    def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
+        """fx, fy, cx, cy of each point's view."""
+        if len(intrinsics) == 1:
+            return intrinsics[0][:, None]
+        views = [intrinsics[view][:, None].expand(-1, count) for view, _, count in self.groups]
+        return torch.cat(views, 1) if views else intrinsics.new_zeros(4, 0)
+
+
+@torch.no_grad()
+def visible_points(
+    geometry: SceneGeometry,
+    face_ids: Int[Tensor, "views height width"],
+    inverse_depth: Float[Tensor, "views height width"],
+    Ts_camera_link: Float[Tensor, "views links 4 4"],
+    intrinsics: Float[Tensor, "views 4"],
+) -> VisiblePoints:
+    """The surface point and the normal that each visible pixel sees."""
+    if face_ids.device.type != "cpu":
+        return visible_points_torch(geometry, face_ids, inverse_depth, Ts_camera_link, intrinsics)
+    pixel, face, point, normal, counts = gather_points(
+        face_ids.numpy(),
+        inverse_depth.numpy(),
+        Ts_camera_link.contiguous().numpy(),
+        intrinsics.contiguous().numpy(),
+        geometry.face_links.numpy(),
+        geometry.face_barycentric.numpy(),
+        geometry.face_normals.numpy(),
+    )
+    groups = _groups(counts, Ts_camera_link.shape[1])
+    return VisiblePoints(
+        torch.from_numpy(pixel), torch.from_numpy(face), groups, torch.from_numpy(point), torch.from_numpy(normal)
+    )
+
+
+def _groups(counts: list[int], links: int) -> tuple[tuple[int, int, int], ...]:
+    return tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
+
+
+@torch.no_grad()
+def visible_points_torch(
+    geometry: SceneGeometry,
+    face_ids: Int[Tensor, "views height width"],
+    inverse_depth: Float[Tensor, "views height width"],
+    Ts_camera_link: Float[Tensor, "views links 4 4"],
+    intrinsics: Float[Tensor, "views 4"],
+) -> VisiblePoints:
+    """The same without the compiled kernel, for any device."""
+    views, height, width = face_ids.shape
+    links = Ts_camera_link.shape[1]
+    pixel = nonzero(face_ids.flatten() >= 0)
+    face = face_ids.flatten()[pixel].long()
+    view = pixel // (height * width)
+    key = (view * links + geometry.face_links[face]).short()
+    key, order = key.sort(stable=True)
+    pixel, face = pixel[order], face[order]
+    counts = torch.bincount(key, minlength=views * links).tolist()
+    groups = _groups(counts, links)
+    fx, fy, cx, cy = VisiblePoints(pixel, face, groups, pixel, pixel).intrinsics(intrinsics)
+    inside = pixel % (height * width)
+    depth = 1.0 / inverse_depth.flatten()[pixel]
+    x, y = ((inside % width) + 0.5 - cx) / fx, ((inside // width) + 0.5 - cy) / fy
+    points = torch.stack([x * depth, y * depth, depth])
+    point_link = torch.cat(
+        [
+            Ts_camera_link[view, link, :3, :3].T @ (part - Ts_camera_link[view, link, :3, 3:])
+            for (view, link, _), part in zip(groups, points.split([count for *_, count in groups], 1), strict=True)
+        ]
+        or [points],
+        1,
+    )
+    maps = geometry.face_barycentric.index_select(1, face).view(2, 4, -1)
+    # A pixel at the rim of its triangle may leave it by a rounding error.
+    weight = ((maps[:, :3] * point_link).sum(1) + maps[:, 3]).clamp(0.0, 1.0)
+    a, b, c = geometry.face_normals.index_select(1, face).view(3, 3, -1)
+    normal = a + weight[0] * (b - a) + weight[1] * (c - a)
+    return VisiblePoints(pixel, face, groups, point_link, unit(normal))
+
+
+def nonzero(flags: Bool[Tensor, " n"]) -> Int[Tensor, " K"]:
+    """Where flags are set; NumPy is several times faster on a CPU."""
+    if flags.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(flags.numpy()))
+    return flags.nonzero()[:, 0]

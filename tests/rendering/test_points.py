@@ -1,0 +1,62 @@
+"""What each pixel sees: the compiled kernel against plain torch."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from carts_core.data import Sequence
+from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
+from carts_core.rendering.points import visible_points, visible_points_torch
+from carts_core.rendering.visibility_numba import rasterize
+
+WIDTH, HEIGHT = 160, 120
+
+
+@pytest.fixture(scope="module")
+def views(sample_sequence_path: Path) -> tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]:
+    """Two arms in three views: as measured in two frames, and with nothing before the camera."""
+    sequence = Sequence.open(sample_sequence_path)
+    scene = sequence.scene.with_cameras([sequence.scene.cameras[0].name])
+    geometry = SceneGeometry.of(scene)
+    states = [scene.state(sequence.frame(index).measured) for index in (0, 9)]
+    Ts = torch.cat([link_transforms(scene, state) for state in states]).float()
+    Ts = torch.cat([Ts, Ts[:1] - torch.tensor([[0.0] * 4, [0.0] * 4, [0, 0, 0, 10], [0.0] * 4])])
+    intrinsics = torch.cat([state.intrinsics for state in [*states, states[0]]]).float() * (WIDTH / 640)
+    seen = [
+        rasterize(vertices_in_camera(geometry, T).T.numpy(), geometry.faces.numpy(), K.tolist(), WIDTH, HEIGHT)
+        for T, K in zip(Ts, intrinsics, strict=True)
+    ]
+    face_ids, inverse_depth = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*seen, strict=True))
+    return geometry, face_ids, inverse_depth, Ts, intrinsics
+
+
+def test_the_compiled_kernel_agrees_with_torch(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
+    compiled, plain = visible_points(*views), visible_points_torch(*views)
+    assert {view for view, _, _ in compiled.groups} == {0, 1}
+    assert compiled.groups == plain.groups
+    assert torch.equal(compiled.pixel, plain.pixel) and torch.equal(compiled.face, plain.face)
+    torch.testing.assert_close(compiled.point_link, plain.point_link, atol=1e-6, rtol=0)
+    torch.testing.assert_close(compiled.normal_link, plain.normal_link, atol=1e-3, rtol=0)
+
+
+def test_points_lie_where_their_pixels_look(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
+    _, _, _, Ts, intrinsics = views
+    points = visible_points(*views)
+    moved, _ = points.transformed(Ts)
+    K = points.intrinsics(intrinsics)
+    column, row = K[:2] * moved[:2] / moved[2:] + K[2:] - 0.5
+    inside = points.pixel % (WIDTH * HEIGHT)
+    torch.testing.assert_close(column, (inside % WIDTH).float(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(row, (inside // WIDTH).float(), atol=1e-3, rtol=0)
+
+
+def test_nothing_is_seen_where_nothing_is(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
+    geometry, *rest = views
+    face_ids, inverse_depth, Ts, intrinsics = (value[2:] for value in rest)
+    for find in (visible_points, visible_points_torch):
+        points = find(geometry, face_ids, inverse_depth, Ts, intrinsics)
+        assert points.groups == () and points.point_link.shape == (3, 0)
+        assert points.transformed(Ts)[0].shape == (3, 0)
