@@ -95,7 +95,7 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
 
 def main() -> None:
     """Print the table."""
-    tune_process()
+    tune_process(keep_memory=True)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--runs", type=int, default=30)

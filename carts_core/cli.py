@@ -36,7 +36,6 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors that are meant for people end it with one message and status 2."""
-    tune_process()
     try:
         command = tyro.cli(
             Command,
@@ -44,6 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
             description="Correct a surgical robot's kinematics from its endoscope image.",
             args=arguments,
         )  # pyright: ignore
+        tune_process(keep_memory=not isinstance(command, View))
         command.run()
     except CartsError as error:
         Console(stderr=True).print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)

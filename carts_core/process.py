@@ -18,10 +18,16 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Numbers of these parameters in glibc's malloc.h."""
 
 
-def tune_process() -> None:
-    """Leave a core to others, and keep memory for the next image. For the start of a program, not for a library."""
+def tune_process(*, keep_memory: bool) -> None:
+    """Set up a program, at its start; a library leaves both to its caller.
+
+    Args:
+        keep_memory: keep freed memory for the next image, which is faster. A server that runs for days had rather give
+            it back: in an hour of use it held 1.09 GB instead of 1.00 GB, and took longer to stop growing.
+    """
     _leave_a_core_free()
-    _keep_memory()
+    if keep_memory:
+        _keep_memory()
 
 
 def _leave_a_core_free() -> None:

@@ -172,7 +172,7 @@ def _newest(tab: RawTab) -> bytes:
 
 def main() -> None:
     """Print what was seen; ends with code 1 if that is not good."""
-    tune_process()
+    tune_process(keep_memory=False)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--minutes", type=float, default=60.0)

@@ -31,7 +31,7 @@ def overlay(renderer: Renderer, state: SceneState, image: np.ndarray) -> np.ndar
 
 def main(path: Path, picture: Path) -> None:
     """Optimize the first frame in its first camera."""
-    tune_process()
+    tune_process(keep_memory=True)
     sequence = Sequence.open(path, progress=print)
     camera = sequence.scene.cameras[0].name
     frame = sequence.frame(0)

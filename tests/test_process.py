@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+TUNED = "from carts_core.process import tune_process; tune_process(keep_memory=True)"
+
 FAULTS = """
 import resource
 import torch
@@ -33,7 +35,7 @@ def page_faults(tune: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to keep memory")
 def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
-    tuned = page_faults("from carts_core.process import tune_process; tune_process()")
+    tuned = page_faults(TUNED)
     assert tuned < 0.5 * page_faults("")
 
 
@@ -41,7 +43,7 @@ def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
 def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
     given: dict[str, str], expected: int | None
 ) -> None:
-    code = "import torch; from carts_core.process import tune_process; tune_process(); print(torch.get_num_threads())"
+    code = f"import torch; {TUNED}; print(torch.get_num_threads())"
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | given
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert int(ran.stdout) == (expected or max(1, min((os.cpu_count() or 2) - 1, 4)))
