@@ -18,6 +18,9 @@ from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
 from .selection import Mode, Network, Selection, SequencePath
 
+_WIDTH = 110
+"""Characters of the table's lines in a file or a pipe."""
+
 
 @dataclass(frozen=True)
 class Evaluate:
@@ -44,6 +47,8 @@ class Evaluate:
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""
         console = Console()
+        if not console.is_terminal:
+            console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
         sequence = Sequence.open(self.sequence, progress=console.print)
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)
@@ -78,7 +83,7 @@ def _table(scores: list[FrameScore], title: str) -> Table:
         "Dice\nbefore",
         "\nafter",
         "worst\nchange",
-        "MAE [deg]\nbefore",
+        "MAE \\[deg]\nbefore",
         "\nafter",
         "std",
         "steps",

@@ -43,7 +43,7 @@ class OptimizerSettings:
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
     blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.6, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
-    looks: int = 3
+    looks: int = 4
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     zoom: float = 1.5
     """`surface`: how many times larger than the working image the compared images are, up to the camera's image [1]."""

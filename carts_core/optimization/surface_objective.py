@@ -42,6 +42,11 @@ _SPREAD = 1.5
 _FINE = 2
 """Number of stages of the second look."""
 
+_OVERSHOOT = 1.5
+"""How much further than it came from one look to the next the network is told the arms are, from the third look on [1].
+What it sees leans towards what it believes, so each look leaves a share of the error (about three quarters where blood
+lies over the arms, next to nothing elsewhere); overshooting undoes that, as over-relaxation does."""
+
 _FACTORS = (1, 2, 4, 8)
 """How many times smaller than the compared images those of a stage can be."""
 
@@ -56,7 +61,8 @@ class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
-    look serves the coarse stages, the second one the last two, each later one the last.
+    look serves the coarse stages, the second one the last two, each later one the last. Before later ones what is known
+    is exaggerated, see `_OVERSHOOT`.
 
     Args:
         scene: with the cameras that take part.
@@ -94,7 +100,7 @@ class SurfaceObjective:
         self._weight = _weights(scene, ignore or {}, self._size).to(device)
         self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
-        self._look = -1
+        self._look, self._belief = -1, torch.empty(0)
 
     def epoch(self, stage: int) -> int:
         """Losses compare within an epoch only: which look at the image a stage belongs to."""
@@ -138,14 +144,17 @@ class SurfaceObjective:
 
     def _look_at(self, offsets: Tensor, look: int) -> None:
         """Have the network say what the image shows, knowing the present estimate."""
-        believed = self._whole.surface(self.parameters.state(offsets)).maps
+        belief = offsets
+        if look > 1 and self._look == look - 1:
+            belief = self.parameters.clamp(offsets + _OVERSHOOT * (offsets - self._belief))
+        believed = self._whole.surface(self.parameters.state(belief)).maps
         margin, reach = round(_MARGIN * self._zoom), round(_ATTENTION[min(look, 1)] * self._zoom)
         window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() else torch.ones_like(silhouette)
         weight = window.of(self._weight) * near[:, None]
-        self._look = look
+        self._look, self._belief = look, belief
         self._seen = float((observed[:, COVERAGE].sum(1) * weight[:, 0]).sum()) / self._zoom**2
         self._stages = [
             _Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
