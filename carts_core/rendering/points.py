@@ -6,9 +6,8 @@ of their links, so that a link's points move by one product.
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .geometry import SceneGeometry
@@ -92,7 +91,7 @@ def visible_points_torch(
     """The same without the compiled kernel, for any device."""
     views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
-    pixel = nonzero(face_ids.flatten() >= 0)
+    pixel = (face_ids.flatten() >= 0).nonzero()[:, 0]
     face = face_ids.flatten()[pixel].long()
     view = pixel // (height * width)
     key = (view * links + geometry.face_links[face]).short()
@@ -119,10 +118,3 @@ def visible_points_torch(
     a, b, c = geometry.face_normals.index_select(1, face).view(3, 3, -1)
     normal = a + weight[0] * (b - a) + weight[1] * (c - a)
     return VisiblePoints(pixel, face, groups, point_link, unit(normal))
-
-
-def nonzero(flags: Bool[Tensor, " n"]) -> Int[Tensor, " K"]:
-    """Where flags are set; NumPy is several times faster on a CPU."""
-    if flags.device.type == "cpu":
-        return torch.from_numpy(np.flatnonzero(flags.numpy()))
-    return flags.nonzero()[:, 0]

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
-from .points import nonzero, visible_points
+from .points import visible_points
 from .shading import phong
 from .surface import SurfaceRendering, Tangents, surface_maps
 from .visibility_numba import rasterize
@@ -124,11 +124,9 @@ class Renderer:
         """Label of the visible triangle per pixel, -1 for background."""
         Ts, intrinsics = self._views(state)
         face_ids, _ = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
-        seen = face_ids.flatten()
-        pixel = nonzero(seen >= 0)
-        labels = face_labels.new_full(seen.shape, -1)
-        labels[pixel] = face_labels[seen[pixel].long()]
-        return labels.view(*Ts.shape[:-3], self.height, self.width).cpu().numpy()
+        # Background is face -1, which is the last label.
+        labels = np.append(face_labels.cpu().numpy(), -1)[face_ids.cpu().numpy()]
+        return labels.reshape(*Ts.shape[:-3], self.height, self.width)
 
     @torch.no_grad()
     def surface(self, state: SceneState, tangents: Tangents | None = None, margin: int = 1) -> SurfaceRendering:
@@ -172,4 +170,6 @@ class Renderer:
                 inverse_depth = torch.where(face_ids >= 0, 1.0 / depth, 0.0)
             ids.append(face_ids)
             depths.append(inverse_depth)
+        if len(ids) == 1:  # the usual case, without a copy
+            return ids[0][None], depths[0][None]
         return torch.stack(ids), torch.stack(depths)

@@ -17,7 +17,7 @@ _WIDE = 8
 """Width of a bounding box [px] from which on it pays to find where each of its rows enters and leaves the triangle."""
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _first_and_last(value, slope, first, last):
     """Those of steps 0 to `last` at which `value + slope * step` may be positive; one too many on either side."""
     if slope > 0.0:
@@ -29,7 +29,7 @@ def _first_and_last(value, slope, first, last):
     return first, last
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
     """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z)."""
     height, width = face_ids.shape
@@ -69,7 +69,7 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
                 face_ids[y, x] = face
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z):
     """Cut a triangle off at the near plane (Sutherland-Hodgman); the number of corners that are left, 0, 3 or 4."""
     count = 0
@@ -90,7 +90,7 @@ def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, cl
     return count
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _rasterize(vertices, faces, fx, fy, cx, cy, face_ids, inverse_depth):
     count = vertices.shape[0]
     u, v, inverse_z = np.zeros(count), np.zeros(count), np.zeros(count)
