@@ -61,8 +61,8 @@ class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
-    look serves the coarse stages, the second one the last two, each later one the last. Before later ones what is known
-    is exaggerated, see `_OVERSHOOT`.
+    look serves the coarse stages, the second one the last two, each later one the last. From the
+    third look on it is told more than what came of the one before, see `_OVERSHOOT`.
 
     Args:
         scene: with the cameras that take part.
