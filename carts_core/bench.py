@@ -78,7 +78,7 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
 
     def optimizer(settings: OptimizerSettings) -> FrameOptimizer:
         return FrameOptimizer(
-            sequence.scene, frame, backgrounds, extractor, start=start, settings=settings, cameras=[camera]
+            sequence.scene, frame, backgrounds, extractor, start=start, settings=settings, cameras=[camera], live=False
         )
 
     seconds = [iterate.seconds for iterate in optimizer(OptimizerSettings.acs(iterations))][:-1]

@@ -96,7 +96,8 @@ def _convergence(data: Measurements) -> Figure | None:
         steps = max(m.iterations for m in measurements)
         dice = _padded(measurements, steps, lambda m: [score.dice for score in m.best_so_far()])
         _band(by_step, np.arange(steps + 1), dice, method)
-        _band(loss, np.arange(steps + 1), _padded(measurements, steps, _loss_to_go), method)
+        if all(score.loss is not None for m in measurements for score in m.trace):
+            _band(loss, np.arange(steps + 1), _padded(measurements, steps, _loss_to_go), method)
         seconds = _padded(measurements, steps, lambda m: [score.seconds for score in m.trace])
         _band(by_time, np.median(seconds, axis=0), dice, method)
     by_step.set(title="Dice by iteration", xlabel="iteration", ylabel="Dice")

@@ -168,7 +168,9 @@ def optimize(
     """
     start = start_of(scene, frame, run.error_deg, truth.measured_joints)
     began = time.perf_counter()
-    optimizer = FrameOptimizer(scene, frame, background, extractor, ignore=ignore, start=start, settings=settings)
+    optimizer = FrameOptimizer(
+        scene, frame, background, extractor, ignore=ignore, start=start, settings=settings, live=False
+    )
     seconds = time.perf_counter() - began
     trace: list[Score] = []
     best: list[int] = []
@@ -180,7 +182,8 @@ def optimize(
             break
         best.append(len(trace) if optimizer.best is iterate else best[-1])
         known, first = iterate.uncertainty, not trace
-        trace.append(truth.score(iterate.state, known, iterate.loss, renderer, seconds, depth=first))
+        loss = None if settings.loss == "surface" else iterate.loss
+        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, depth=first))
     assert optimizer.best is not None and optimizer.stop_reason is not None
     end = optimizer.best
     final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)

@@ -12,7 +12,7 @@ class Score:
     """How good one estimate is."""
 
     loss: float | None
-    """None for a method without one."""
+    """None for a method without one, and where losses do not compare from one iterate to the next."""
     dice: float
     nsd: float
     """Normalized surface distance within `frame.TOLERANCE`."""

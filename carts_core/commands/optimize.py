@@ -106,6 +106,7 @@ class Optimize:
                 settings=self.optimizer,
                 free=self.free,
                 cameras=[camera],
+                live=False,
             )
             for _ in optimizer:
                 pass

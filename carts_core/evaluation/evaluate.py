@@ -75,7 +75,7 @@ def evaluate(
                 start = start_positions(sequence, frame, perturb_deg, seed)
                 began = time.perf_counter()
                 optimizer = FrameOptimizer(
-                    scene, frame, backgrounds, extractor, start=start, settings=settings, free=free
+                    scene, frame, backgrounds, extractor, start=start, settings=settings, free=free, live=False
                 )
                 for _ in optimizer:
                     pass

@@ -116,7 +116,7 @@ class CalibrationObjective:
         for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):
             unknowns = _FrameUnknowns(scene, start, free, settings.lever, len(self.parameters), joint_prior_deg)
             ignored = ignore[index] if ignore else None
-            objective = SurfaceObjective(scene, frame.images, extractor, unknowns, settings, ignored)
+            objective = SurfaceObjective(scene, frame.images, extractor, unknowns, settings, ignored, live=False)
             self._observations.append(_Observation(unknowns, objective))
         self.stages = self._observations[0].objective.stages
         self._prior = self.parameters.prior_precision(
@@ -127,13 +127,14 @@ class CalibrationObjective:
         self._stage, self._lowest = -1, math.inf
 
     def epoch(self, stage: int) -> int:
-        """Losses compare within an epoch only: which look at the images a stage belongs to."""
+        """Losses compare within an epoch only."""
         return self._observations[0].objective.epoch(stage)
 
     def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> CalibrationEvaluation:
         """Evaluate at a calibration; free joints follow it."""
         if stage != self._stage:
-            if self._stage >= 0 and self.epoch(stage) != self.epoch(self._stage):
+            look = self._observations[0].objective.look
+            if self._stage >= 0 and look(stage) != look(self._stage):
                 self._weights = trust_of_frames(self._losses)
             self._stage, self._lowest = stage, math.inf
         for observation in self._observations:
@@ -154,7 +155,7 @@ class CalibrationObjective:
         return combined
 
     def frame_losses(self, offsets: Float[Tensor, " n"]) -> Float[np.ndarray, " frames"]:
-        """Loss of every frame at a calibration with joints as measured, as of the present look at the images."""
+        """Loss of every frame at a calibration with joints as measured, as of the present stage."""
         at_measured = [torch.zeros_like(observation.own) for observation in self._observations]
         evaluations = self._evaluate(offsets, max(self._stage, 0), False, at_measured)
         return np.array([evaluation.loss for evaluation in evaluations])

@@ -17,7 +17,7 @@ class Evaluation:
     value: float
     """What is descended, in the stage that was asked for: the loss there, and the prior."""
     loss: float
-    """The loss as of the last stage of the same epoch and without the prior, so comparable within it."""
+    """Without the prior, and comparable through all stages of the same epoch."""
     prior: float
     gradient: Float[Tensor, " n"]
     """Of `value`; zero if it was not asked for."""

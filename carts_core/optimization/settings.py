@@ -50,7 +50,8 @@ class OptimizerSettings:
     stage_iterations: int = 6
     """`gauss_newton`: largest number of steps in a stage [1]."""
     candidates: int = 64
-    """`gauss_newton`: random starts per arm that are tried where the first look ended badly [1]; 0 never tries."""
+    """`gauss_newton`: random starts per arm that are tried, seen in the whole image, where the first look ended badly
+    or lost an arm [1]; 0 never tries."""
     bad_loss: float = 0.045
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
     noise: float = 1.33

@@ -15,6 +15,7 @@ from .error_model import Gaussian, Information
 from .evaluation import Evaluation, Objective
 from .parameters import ParameterVector
 from .prior import Prior
+from .restart import Restart
 from .settings import OptimizerSettings
 from .solvers import make_solver
 from .surface_objective import SurfaceObjective
@@ -84,7 +85,7 @@ class Eye:
 
     def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
         ignore = self._ignore(frame.index)
-        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings, ignore)
+        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings, ignore, live=False)
 
 
 def _prior(expected: Gaussian, parameters: ParameterVector) -> Prior:
@@ -98,15 +99,18 @@ def _descend(
 ) -> Sight:
     solver = make_solver(settings, parameters, objective.stages)
     offsets = parameters.clamp(torch.from_numpy(start).to(parameters.lower))
+    restart = Restart(settings, objective, solver)
     best: tuple[Tensor, Evaluation] | None = None
     iterations, last = 0, objective.stages - 1
+    lowest: dict[int, float] = {}
     while solver.finished is None:
         stage = solver.stage
         evaluation = objective(offsets, stage, gradient=True)
         iterations += 1
         if stage == last and (best is None or evaluation.value < best[1].value):
             best = offsets, evaluation
-        offsets = solver(offsets, evaluation)
+        lowest[stage] = min(evaluation.loss, lowest.get(stage, evaluation.loss))
+        offsets = restart(stage, solver(offsets, evaluation), lowest[stage])
     best = best or (offsets, objective(offsets, last, gradient=True))
     return Sight(_double(best[0]), _information(*best, parameters), best[1].loss, iterations)
 

@@ -36,6 +36,12 @@ _ATTENTION = (27, 8)
 """Distance from the arms as they are believed to be, beyond which nothing counts [px of the working image]: of the
 first look and of those that know better. What is taken for an arm further off is none."""
 
+_SUPPORT = 0.5
+"""Share of an arm's silhouette that has to be seen as an arm, or the arm is lost [1]."""
+
+_LEFT = 0.3
+"""Share of the silhouette it started with that an arm has to keep, or it has gone elsewhere to be rid of it [1]."""
+
 _SPREAD = 1.5
 """Deviation of random starts, in expected errors."""
 
@@ -71,6 +77,8 @@ class SurfaceObjective:
         parameters: the unknowns.
         settings: blurs, noise and prior.
         ignore: camera name -> pixels that show an occluder.
+        live: whether coarse stages are also rendered at the finest blur of their look, for someone who watches: losses
+            compare through a look then, and maps are sharp. It takes a third more time and changes no step.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -84,8 +92,11 @@ class SurfaceObjective:
         parameters: ParameterVector,
         settings: OptimizerSettings,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+        *,
+        live: bool = True,
     ) -> None:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
+        self._live = live
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
         self._plan = [(0, blur) for blur in coarse]
         second = min(1, settings.looks - 1)
@@ -103,20 +114,39 @@ class SurfaceObjective:
         self._look, self._belief = -1, torch.empty(0)
 
     def epoch(self, stage: int) -> int:
-        """Losses compare within an epoch only: which look at the image a stage belongs to."""
+        """Losses compare within an epoch only: a look at the image, or a stage if nobody watches."""
+        return self.look(stage) if self._live else stage
+
+    def look(self, stage: int) -> int:
+        """Which look at the image a stage belongs to."""
         return self._plan[stage][0]
 
     def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> Evaluation:
         """Evaluate at the given offsets; each stage of a look blurs less than the one before."""
         with torch.no_grad():
-            look, _ = self._plan[stage]
+            look = self.look(stage)
             if look != self._look:
                 self._look_at(offsets, look)
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._stages[stage - first], gradient)
 
+    def lost(self, offsets: Float[Tensor, " n"]) -> bool:
+        """Whether an arm that should be in sight is not where the offsets have it: nothing there is seen as an arm."""
+        start = self._whole.segment(self.parameters.state(torch.zeros_like(offsets)))
+        found = self._window.of(torch.from_numpy(self._whole.segment(self.parameters.state(offsets))))
+        found = found.to(self._coverage.device)
+        for arm in range(len(self.scene.arms)):
+            here = found == arm
+            area, before = int(here.sum()), int((start == arm).sum())
+            if before and (area < _LEFT * before or float(self._coverage[here].mean()) < _SUPPORT):
+                return True
+        return False
+
+    @torch.no_grad()
     def better_start(self, offsets: Float[Tensor, " n"], candidates: int, seed: int = 0) -> Float[Tensor, " n"]:
         """Offsets worth starting from again: the best of random ones, arm by arm, in the coarsest stage.
+
+        The network looks again for the first time, and now at the whole image.
 
         Args:
             offsets: what has been found so far; it and the start are among the candidates.
@@ -126,36 +156,38 @@ class SurfaceObjective:
         generator = torch.Generator().manual_seed(seed)
         spread = _SPREAD * self._prior.marginal.rsqrt().cpu()
         best = offsets
-        with torch.no_grad():
-            best_cost = self._coarse_cost(best)
-            for group in self.parameters.groups:
-                for index in range(candidates + 1):
-                    drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
-                    trial = best.clone()
-                    trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
-                    cost = self._coarse_cost(self.parameters.clamp(trial))
-                    if cost < best_cost:
-                        best, best_cost = self.parameters.clamp(trial), cost
+        self._look_at(torch.zeros_like(offsets), 0, whole=True)
+        best_cost = self._coarse_cost(best)
+        for group in self.parameters.groups:
+            for index in range(candidates + 1):
+                drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
+                trial = best.clone()
+                trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
+                cost = self._coarse_cost(self.parameters.clamp(trial))
+                if cost < best_cost:
+                    best, best_cost = self.parameters.clamp(trial), cost
         return best
 
     def _coarse_cost(self, offsets: Tensor) -> float:
         cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
         return cost / self.settings.noise**2 + self._prior.value(offsets)
 
-    def _look_at(self, offsets: Tensor, look: int) -> None:
-        """Have the network say what the image shows, knowing the present estimate."""
+    def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:
+        """Have the network say what the image shows, knowing the present estimate: near the arms, or in all of it."""
         belief = offsets
         if look > 1 and self._look == look - 1:
             belief = self.parameters.clamp(offsets + _OVERSHOOT * (offsets - self._belief))
         believed = self._whole.surface(self.parameters.state(belief)).maps
-        margin, reach = round(_MARGIN * self._zoom), round(_ATTENTION[min(look, 1)] * self._zoom)
+        margin = max(self._size) if whole else round(_MARGIN * self._zoom)
+        reach = round(_ATTENTION[min(look, 1)] * self._zoom)
         window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
-        near = attention(silhouette, reach) if silhouette.any() else torch.ones_like(silhouette)
+        near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
         weight = window.of(self._weight) * near[:, None]
         self._look, self._belief = look, belief
-        self._seen = float((observed[:, COVERAGE].sum(1) * weight[:, 0]).sum()) / self._zoom**2
+        self._window, self._coverage = window, observed[:, COVERAGE].sum(1)
+        self._seen = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
         self._stages = [
             _Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
             for number, blur in self._plan
@@ -166,8 +198,8 @@ class SurfaceObjective:
         state = self.parameters.state(offsets)
         neighbours = _neighbours(self.parameters, offsets) if gradient else None
         compared = stage.compare(state, neighbours)
-        last = self._stages[-1]
-        final = compared if stage is last else last.compare(state, None)
+        shown = self._stages[-1] if self._live else stage
+        final = compared if stage is shown else shown.compare(state, None)
         prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None:
@@ -177,9 +209,9 @@ class SurfaceObjective:
             if bool((self._prior.precision.diagonal() > 0).all()):
                 known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
-        area = 0.5 * max(float(coverage.sum()) * last.area + self._seen, 1.0)
-        empty = coverage.new_zeros(len(coverage), last.size[1], last.size[0])
-        paste = last.window.paste
+        area = 0.5 * max(float(coverage.sum()) * shown.area + self._seen, 1.0)
+        empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
+        paste = shown.window.paste
         return Evaluation(
             value=compared.cost / self.settings.noise**2 + prior,
             loss=2.0 * final.cost / area,

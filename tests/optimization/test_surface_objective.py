@@ -41,6 +41,39 @@ def test_gauss_newton_finds_the_truth_that_the_network_sees(sequence: Sequence, 
     assert abs(found - truth)[2] < 0.0006
 
 
+def test_nobody_watching_changes_no_step(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
+    runs = [FrameOptimizer(sequence.scene, frame, {}, sight, start=start, live=live) for live in (True, False)]
+    seen, unseen = map(list, runs)
+    for a, b in zip(seen, unseen, strict=True):
+        assert torch.equal(a.state.joint_positions[0], b.state.joint_positions[0])
+        assert a.silhouette.shape[-1] >= b.silhouette.shape[-1]
+    assert seen[0].silhouette.shape[-1] > unseen[0].silhouette.shape[-1], "a coarse stage is compared coarsely"
+    for run in runs:
+        assert run.best is not None
+    ends = [run.best for run in runs if run.best is not None]
+    assert ends[0].index == ends[1].index and ends[0].loss == ends[1].loss
+    assert np.array_equal(ends[0].silhouette, ends[1].silhouette)
+
+
+def test_an_arm_that_the_first_look_misses_is_searched_in_the_whole_image(
+    sequence: Sequence, sight: FeatureExtractor
+) -> None:
+    frame = sequence.frame(0)
+    truth = (frame.truth or {})["PSM1"]
+    start = {"PSM1": truth + np.deg2rad([7.0, -7.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
+    ends = {}
+    for candidates in (0, 64):
+        settings = OptimizerSettings(candidates=candidates)
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=start, settings=settings)
+        list(optimizer)
+        assert optimizer.best is not None
+        ends[candidates] = np.abs(optimizer.best.joint_positions()["PSM1"] - truth)[:2].max()
+    assert ends[0] > np.deg2rad(5.0), "the first look alone does not see the arm"
+    assert ends[64] < np.deg2rad(0.5)
+
+
 def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: FeatureExtractor) -> None:
     frame = sequence.frame(0)
     scene, state = sequence.scene, sequence.scene.state(frame.measured)
