@@ -91,13 +91,14 @@ def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
 
 def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch cameras links 4 4"]:
     """Ts_camera_link of every link in every camera, differentiable (f_FK of the paper, then F_B and C)."""
-    Ts_world_link = torch.cat(
-        [
-            state.T_world_base[..., index, None, :, :] @ arm.robot.forward_kinematics(state.joint_positions[index])
-            for index, arm in enumerate(scene.arms)
-        ],
-        dim=-3,
-    )
+    Ts_base_link: dict[int, Tensor] = {}
+    for robot in {id(arm.robot): arm.robot for arm in scene.arms}.values():
+        # Arms of one kind go through forward kinematics together, which takes as long for all as for one.
+        same = [index for index, arm in enumerate(scene.arms) if arm.robot is robot]
+        Ts = robot.forward_kinematics(torch.stack([state.joint_positions[index] for index in same]))
+        Ts_base_link.update(zip(same, Ts, strict=True))
+    bases = state.T_world_base.unbind(-3)
+    Ts_world_link = torch.cat([base[..., None, :, :] @ Ts_base_link[index] for index, base in enumerate(bases)], -3)
     return state.T_camera_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
 
 
