@@ -14,6 +14,7 @@ from carts_core.features.domain_randomization import (
     variants,
 )
 from carts_core.features.domain_randomization.backgrounds import random_background
+from carts_core.features.domain_randomization.clutter import contact_shadow
 from carts_core.features.domain_randomization.gbuffer import render_gbuffer
 from carts_core.features.domain_randomization.geometry import RobotGeometry
 from carts_core.features.domain_randomization.lens import tone
@@ -197,6 +198,20 @@ def test_occluders_hide_some_of_the_arms_and_only_what_is_near_them():
     hidden = [(occlude(rng, image, coverage).max(2) > 0.02)[coverage > 0].mean() for _ in range(40)]
     assert 0.02 < np.mean(hidden) < 0.4
     assert np.min(hidden) > 0
+
+
+def test_a_contact_shadow_darkens_what_is_beside_the_arms_and_nothing_else():
+    rng, coverage = np.random.default_rng(4), np.zeros((120, 160), np.float32)
+    coverage[50:70, :90] = 1
+    image = rng.uniform(0.3, 0.9, (120, 160, 3)).astype(np.float32)
+    beside = 0
+    for _ in range(40):
+        shaded = contact_shadow(rng, image, coverage, 0.1)
+        assert shaded.dtype == np.float32 and (shaded <= image + 1e-6).all() and shaded.min() >= 0
+        darker = (shaded < 0.8 * image).all(2)
+        assert not darker[:20].any() and not darker[100:].any()
+        beside += int(darker[coverage == 0].sum() > 50)
+    assert beside > 30
 
 
 def test_no_occluder_is_red_as_blood_is():

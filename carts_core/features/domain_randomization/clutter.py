@@ -38,6 +38,31 @@ def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarr
     return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
 
 
+def contact_shadow(
+    rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"], darkness: float
+) -> Image:
+    """A crisp shadow right beside the arms, about as dark and as grey as they are, so that only shape tells it apart.
+
+    Args:
+        rng: random numbers.
+        image: the background.
+        coverage: of the arms.
+        darkness: typical brightness of the arms [1].
+    """
+    height, width = coverage.shape
+    reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * width
+    heading = rng.uniform(0, 2 * np.pi)
+    turn = cv2.getRotationMatrix2D((rng.uniform(0, width), rng.uniform(0, height)), rng.normal(0, 2), 1.0)
+    turn[:, 2] += reach * np.cos(heading), reach * np.sin(heading)
+    moved = cv2.warpAffine(coverage, turn, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    shape = cv2.GaussianBlur(moved, (0, 0), rng.uniform(0.4, 1.5))[..., None]
+    brightness = darkness * np.exp(rng.normal(0, 0.4))
+    tinted = image * np.clip(brightness / max(float(image.mean()), 1e-3), 0.03, 0.8)
+    grey = brightness * np.clip(rng.normal(1, 0.05, 3), 0.8, 1.2)
+    dark = tinted + rng.uniform(0, 0.9) * (grey - tinted)
+    return (image + shape * (np.minimum(dark, image) - image)).astype(np.float32)
+
+
 def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, strongest: float = 0.6) -> np.ndarray:
     strength = rng.uniform(0.12, strongest) * np.clip(rng.normal(1, 0.06, 3), 0.8, 1.2)
     return image * np.clip(1 - shape[..., None] * strength.astype(np.float32), 0.05, 1)

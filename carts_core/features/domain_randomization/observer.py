@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ...errors import SettingsError
 from ...robot import Robot
 from .backgrounds import random_background
-from .clutter import add_clutter, cast_shadow
+from .clutter import add_clutter, cast_shadow, contact_shadow
 from .gbuffer import GBuffer, render_gbuffer
 from .geometry import Intrinsics, RobotGeometry
 from .lens import photograph
@@ -24,6 +24,8 @@ SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 40
 _TRIES = 12
+_CONTACT = 0.4
+"""Share of images with a crisp shadow beside the arms."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,8 @@ class Observer:
         arms = cv2.resize(fine.image(color.astype(np.float32)), coverage.shape[::-1], interpolation=cv2.INTER_AREA)
         for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
             background = cast_shadow(rng, background, coverage)
+        if rng.random() < _CONTACT and (coverage > 0.5).any():
+            background = contact_shadow(rng, background, coverage, float(np.median(arms[coverage > 0.5])))
         composed = background * (1 - coverage[..., None]) + arms
         if rng.random() < self.settings.occluded:
             composed = occlude(rng, composed, coverage)
