@@ -208,7 +208,7 @@ def test_a_contact_shadow_darkens_what_is_beside_the_arms_and_nothing_else():
     for _ in range(40):
         shaded = contact_shadow(rng, image, coverage, 0.1)
         assert shaded.dtype == np.float32 and (shaded <= image + 1e-6).all() and shaded.min() >= 0
-        darker = (shaded < 0.8 * image).all(2)
+        darker = np.all(shaded < 0.8 * image, axis=2)
         assert not darker[:20].any() and not darker[100:].any()
         beside += int(darker[coverage == 0].sum() > 50)
     assert beside > 30
