@@ -25,14 +25,9 @@ def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarr
 
     The arms themselves are put over it later, so the shadow shows beside them only.
     """
-    height, width = coverage.shape
+    width = coverage.shape[1]
     reach = np.exp(rng.uniform(np.log(0.01), np.log(0.35))) * width
-    heading = rng.uniform(0, 2 * np.pi)
-    turn = cv2.getRotationMatrix2D(
-        (rng.uniform(0, width), rng.uniform(0, height)), rng.normal(0, 6), rng.uniform(0.9, 1.15)
-    )
-    turn[:, 2] += reach * np.cos(heading), reach * np.sin(heading)
-    moved = cv2.warpAffine(coverage, turn, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    moved = _displaced(rng, coverage, reach, turn=6, scale=(0.9, 1.15))
     soft = cv2.GaussianBlur(moved, (0, 0), np.clip(reach * rng.uniform(0.03, 0.2), 0.6, 8))
     # Close to what casts it a shadow can be nearly black.
     return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
@@ -49,18 +44,26 @@ def contact_shadow(
         coverage: of the arms.
         darkness: typical brightness of the arms [1].
     """
-    height, width = coverage.shape
-    reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * width
-    heading = rng.uniform(0, 2 * np.pi)
-    turn = cv2.getRotationMatrix2D((rng.uniform(0, width), rng.uniform(0, height)), rng.normal(0, 2), 1.0)
-    turn[:, 2] += reach * np.cos(heading), reach * np.sin(heading)
-    moved = cv2.warpAffine(coverage, turn, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * coverage.shape[1]
+    moved = _displaced(rng, coverage, reach, turn=2, scale=(1.0, 1.0))
     shape = cv2.GaussianBlur(moved, (0, 0), rng.uniform(0.4, 1.5))[..., None]
     brightness = darkness * np.exp(rng.normal(0, 0.4))
     tinted = image * np.clip(brightness / max(float(image.mean()), 1e-3), 0.03, 0.8)
     grey = brightness * np.clip(rng.normal(1, 0.05, 3), 0.8, 1.2)
     dark = tinted + rng.uniform(0, 0.9) * (grey - tinted)
     return (image + shape * (np.minimum(dark, image) - image)).astype(np.float32)
+
+
+def _displaced(
+    rng: np.random.Generator, coverage: np.ndarray, reach: float, turn: float, scale: tuple[float, float]
+) -> np.ndarray:
+    """A silhouette moved by `reach` [px] any way, turned with a deviation of `turn` [deg] and scaled."""
+    height, width = coverage.shape
+    heading = rng.uniform(0, 2 * np.pi)
+    centre = rng.uniform(0, width), rng.uniform(0, height)
+    motion = cv2.getRotationMatrix2D(centre, rng.normal(0, turn), rng.uniform(*scale))
+    motion[:, 2] += reach * np.cos(heading), reach * np.sin(heading)
+    return cv2.warpAffine(coverage, motion, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, strongest: float = 0.6) -> np.ndarray:
