@@ -13,7 +13,7 @@ from ..data import Frame
 from ..evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ..features.extractor import FeatureExtractor
 from ..keypoints import keypoints
-from ..optimization import FrameOptimizer, OptimizerSettings
+from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings
 from ..optimization.observability import Uncertainty
 from ..perturbation import perturb
 from ..rendering import Renderer
@@ -149,6 +149,7 @@ def optimize(
     background: dict[str, UInt8[np.ndarray, "h w 3"]],
     extractor: FeatureExtractor,
     settings: OptimizerSettings,
+    free: FreeParameters,
     truth: Truth,
     renderer: Renderer,
     ignore: dict[str, Bool[np.ndarray, "h w"]] | None = None,
@@ -162,6 +163,7 @@ def optimize(
         background: camera name -> mean background.
         extractor: the feature network.
         settings: of the method.
+        free: what is unknown.
         truth: what estimates are compared with.
         renderer: draws the masks of the camera that is scored, at its size.
         ignore: camera name -> pixels that show an occluder.
@@ -169,7 +171,7 @@ def optimize(
     start = start_of(scene, frame, run.error_deg, truth.measured_joints)
     began = time.perf_counter()
     optimizer = FrameOptimizer(
-        scene, frame, background, extractor, ignore=ignore, start=start, settings=settings, live=False
+        scene, frame, background, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False
     )
     seconds = time.perf_counter() - began
     trace: list[Score] = []

@@ -19,6 +19,8 @@ class Method:
     """It is given the occluders' pixels."""
     every_camera: bool = False
     """All cameras enter one objective."""
+    poses: bool = False
+    """The poses of all cameras but the first are free, too."""
     calibrated: bool = False
     """Base frames are those of one calibration of the whole recording."""
     together: bool = False
@@ -42,6 +44,7 @@ METHODS = {
     "ours_told": Method("ours, occluder given", _ours, told=True),
     "ours_proposed": Method("ours, ignore mask proposed", lambda _: OptimizerSettings(propose_ignore=True)),
     "stereo": Method("ours, all cameras", _ours, every_camera=True),
+    "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
     "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
     "sequence": Method("ours, sequence mode", _ours, together=True),

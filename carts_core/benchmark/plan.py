@@ -48,7 +48,7 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
     for error in (None, *hard):
         runs += [Run(source.name, OCCLUSION, frame, method, error) for method in _UNDER_OCCLUDERS]
         if len(source.cameras) > 1:
-            runs += [Run(source.name, "regular", frame, "stereo", error)]
+            runs += [Run(source.name, "regular", frame, method, error) for method in ("stereo", "stereo_posed")]
     if source.name == REAL:
         runs += [Run(source.name, "regular", frame, method) for method, entry in METHODS.items() if entry.calibrated]
     return runs

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
+from ..optimization import FreeParameters
 from ..rendering import Renderer
 from ..scene import Scene
 from .fingerprints import code_fingerprint, run_fingerprint
@@ -122,7 +123,8 @@ class _Bench:
         ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
         scene = known.with_cameras(cameras)
-        return optimize(run, scene, frame, background, extractor, settings, truth, renderer, ignore)
+        free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))
+        return optimize(run, scene, frame, background, extractor, settings, free, truth, renderer, ignore)
 
     def _truth(self, frame: Frame) -> Truth:
         recording, _ = self._open()

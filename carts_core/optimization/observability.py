@@ -46,6 +46,7 @@ def uncertainty(
     curvature: Float[Tensor, "n n"],
     prior: Float[Tensor, " n"],
     scales: Float[Tensor, " n"],
+    common: Float[Tensor, " n"],
 ) -> Uncertainty:
     """From the second derivative of an objective in units of its noise.
 
@@ -54,8 +55,11 @@ def uncertainty(
         curvature: J^T J / noise^2 and the prior, per offset.
         prior: inverse variance of each offset before the image was looked at.
         scales: what an offset of 1 is in units of its unknown.
+        common: what the gradient would be off by for one standard deviation of an error that all pixels share. Pixels
+            cannot average it out, so it comes on top of what their noise does, but never above what was expected.
     """
     covariance = torch.linalg.inv(curvature.double())
-    std = covariance.diagonal().clamp(min=0).sqrt() * scales.double()
     expected = prior.double().rsqrt() * scales.double()
+    variance = covariance.diagonal().clamp(min=0) + (covariance @ common.double()).square()
+    std = (variance.sqrt() * scales.double()).minimum(expected)
     return Uncertainty(tuple(names), tuple(std.tolist()), tuple(expected.tolist()))

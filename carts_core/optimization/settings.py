@@ -41,7 +41,7 @@ class OptimizerSettings:
     """Which loss; see `carts_core.losses.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
-    blurs: tuple[float, ...] = (12.0, 6.0, 3.0, 1.6, 0.8)
+    blurs: tuple[float, ...] = (8.0, 3.0, 1.6, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 4
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""

@@ -6,31 +6,30 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 """
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, replace
-from itertools import combinations
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn import functional
 
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..losses import attention
-from ..rendering import JacobianBlock, Renderer, SurfaceRendering
+from ..rendering import Renderer
 from ..scene import Scene, SceneState
-from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ..surface import COVERAGE
+from .comparison import STEP, Stage
 from .evaluation import Evaluation
-from .inputs import kernel_radius, smoothed, stacked_images, working_size
+from .inputs import stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
 from .window import Window
 
-_MARGIN = 27
-"""What is compared beyond the arms as they are believed to be [px of the working image]."""
+_MARGIN = (27, 16)
+"""What the network sees beyond the arms as they are believed to be [px of the working image]: in the first look and in
+those that know better."""
 
 _ATTENTION = (27, 8)
 """Distance from the arms as they are believed to be, beyond which nothing counts [px of the working image]: of the
@@ -46,29 +45,24 @@ _SPREAD = 1.5
 """Deviation of random starts, in expected errors."""
 
 _FINE = 2
-"""Number of stages of the second look."""
+"""Number of blurs that the first look leaves to the others."""
+
+_OUTLINE = 0.5
+"""Expected error that all outlines seen in an image have in common, too far out or in [px of the working image]. It
+says how near an arm is, so it matters most to the joints that move it along the line of sight."""
 
 _OVERSHOOT = 1.5
 """How much further than it came from one look to the next the network is told the arms are, from the third look on [1].
 What it sees leans towards what it believes, so each look leaves a share of the error (about three quarters where blood
 lies over the arms, next to nothing elsewhere); overshooting undoes that, as over-relaxation does."""
 
-_FACTORS = (1, 2, 4, 8)
-"""How many times smaller than the compared images those of a stage can be."""
-
-_SMALLEST_BLUR = 1.2
-"""A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
-
-_EPSILON = 1e-3
-"""Distance of the states that transforms are differentiated between [rad]."""
-
 
 class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
-    look serves the coarse stages, the second one the last two, each later one the last. From the
-    third look on it is told more than what came of the one before, see `_OVERSHOOT`.
+    look serves the coarse stages, the second one the last but one, each later one the last; with two looks, the second
+    serves both. From the third look on it is told more than what came of the one before, see `_OVERSHOOT`.
 
     Args:
         scene: with the cameras that take part.
@@ -99,9 +93,10 @@ class SurfaceObjective:
         self._live = live
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
         self._plan = [(0, blur) for blur in coarse]
-        second = min(1, settings.looks - 1)
-        self._plan += [(second, blur) for blur in fine]
-        self._plan += [(look, fine[-1]) for look in range(second + 1, settings.looks)]
+        if settings.looks > _FINE:
+            self._plan += [(1, fine[0]), *((look, fine[-1]) for look in range(2, settings.looks))]
+        else:
+            self._plan += [(settings.looks - 1, blur) for blur in fine]
         self.stages = len(self._plan)
         width = round(settings.working_width * settings.zoom)
         self._size = working_size(scene, width, extractor.stride)
@@ -178,8 +173,9 @@ class SurfaceObjective:
         if look > 1 and self._look == look - 1:
             belief = self.parameters.clamp(offsets + _OVERSHOOT * (offsets - self._belief))
         believed = self._whole.surface(self.parameters.state(belief)).maps
-        margin = max(self._size) if whole else round(_MARGIN * self._zoom)
-        reach = round(_ATTENTION[min(look, 1)] * self._zoom)
+        later = min(look, 1)
+        margin = max(self._size) if whole else round(_MARGIN[later] * self._zoom)
+        reach = round(_ATTENTION[later] * self._zoom)
         window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, self._size)
         observed = self._extractor.surface(window.of(self._images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
@@ -189,12 +185,12 @@ class SurfaceObjective:
         self._window, self._coverage = window, observed[:, COVERAGE].sum(1)
         self._seen = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
         self._stages = [
-            _Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
+            Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
             for number, blur in self._plan
             if number == look
         ]
 
-    def _evaluate(self, offsets: Tensor, stage: "_Stage", gradient: bool) -> Evaluation:
+    def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)
         neighbours = _neighbours(self.parameters, offsets) if gradient else None
         compared = stage.compare(state, neighbours)
@@ -202,12 +198,18 @@ class SurfaceObjective:
         final = compared if stage is shown else shown.compare(state, None)
         prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None
-        if compared.gradient is not None and compared.curvature is not None:
+        if compared.gradient is not None and compared.curvature is not None and compared.outline is not None:
             slope = self._prior.gradient(offsets) + compared.gradient
             curvature = self._prior.precision + compared.curvature
             # As a part of a larger objective, unknowns have no prior here and are not judged.
             if bool((self._prior.precision.diagonal() > 0).all()):
-                known = uncertainty(self.parameters.names, curvature, self._prior.marginal, self.parameters.scales)
+                known = uncertainty(
+                    self.parameters.names,
+                    curvature,
+                    self._prior.marginal,
+                    self.parameters.scales,
+                    _OUTLINE * compared.outline,
+                )
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         area = 0.5 * max(float(coverage.sum()) * shown.area + self._seen, 1.0)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
@@ -244,104 +246,7 @@ def _weights(
     return torch.from_numpy(weight)
 
 
-class _Stage:
-    """The comparison under one blur, at the resolution that the blur leaves."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        size: tuple[int, int],
-        zoom: float,
-        window: Window,
-        observed: Float[Tensor, "cameras 6 h w"],
-        weight: Float[Tensor, "cameras 1 h w"],
-        blur: float,
-        settings: OptimizerSettings,
-    ) -> None:
-        blur *= zoom
-        factor = max(f for f in _FACTORS if f == 1 or blur / f >= _SMALLEST_BLUR)
-        self._blur, self._robust = blur / factor, settings.robust
-        self.area = (factor / zoom) ** 2
-        """Of a pixel [px of the working image]."""
-        self._precision = self.area / settings.noise**2
-        self.size = size[0] // factor, size[1] // factor
-        self.window = window.reduced(factor)
-        self.renderer = Renderer(
-            scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=observed.device
-        )
-        self._weight = functional.avg_pool2d(weight, factor)
-        maps = functional.avg_pool2d(observed * weight, factor)
-        self._observed = _compared(smoothed(maps, self._blur))
-        self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
-        self._channels[1 : COVERAGE.stop] = settings.parts_weight
-        self._channels[NORMALS] = settings.normals_weight
-
-    def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "_Comparison":
-        """Compare a state; with neighbours, also say how the cost changes."""
-        tangents = self.renderer.tangents(*neighbours, 2 * _EPSILON) if neighbours else None
-        rendering = self.renderer.surface(state, tangents, 1 + kernel_radius(self._blur))
-        residual = self._observed - _compared(smoothed(rendering.maps * self._weight, self._blur))
-        squared = (residual.square() * self._channels).sum(1, keepdim=True)
-        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
-        ratio = 1.0 / (1.0 + squared / self._robust**2)
-        comparison = _Comparison(
-            0.5 * self.area * float((squared * ratio).sum()),
-            rendering,
-            (1.0 - squared[:, 0]).clamp(min=-1.0),
-            (ratio.square() * self._weight)[:, 0],
-        )
-        if tangents is None:
-            return comparison
-        weight = ratio.square() * self._channels * self._precision
-        gradient, curvature = self._normal_equations(rendering.jacobian, residual, weight, len(tangents.intrinsics))
-        return replace(comparison, gradient=gradient, curvature=curvature)
-
-    def _normal_equations(
-        self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, weight: Tensor, unknowns: int
-    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
-        """-J^T W r and J^T W J, under the blur."""
-        gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
-        windows, blocks = [], []
-        for block in jacobian:
-            rows, columns = block.values.shape[-2:]
-            window = Window(block.left, block.top, columns, rows)
-            values = _compared(smoothed(block.values * window.of(self._weight), self._blur))
-            weighted = (values * window.of(weight)).flatten(1)
-            gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
-            curvature[block.unknowns[:, None], block.unknowns] = weighted @ values.flatten(1).T
-            windows.append(window)
-            blocks.append((block.unknowns, values))
-        for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
-            common = a.common(b)
-            if common is None:
-                continue
-            ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
-            cross = ours @ common.inside(b).of(second).flatten(1).T
-            curvature[mine[:, None], others] = cross
-            curvature[others[:, None], mine] = cross.T
-        return gradient, curvature
-
-
-@dataclass(frozen=True)
-class _Comparison:
-    cost: float
-    """Half the sum of robust squared residuals [px of the working image]."""
-    rendering: SurfaceRendering
-    similarity: Float[Tensor, "cameras h w"]
-    trust: Float[Tensor, "cameras h w"]
-    """Weight of each pixel, in [0, 1]."""
-    gradient: Float[Tensor, " n"] | None = None
-    """Of the cost in units of the noise."""
-    curvature: Float[Tensor, "n n"] | None = None
-
-
-def _compared(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
-    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
-    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
-    return maps
-
-
 def _neighbours(parameters: ParameterVector, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
     """Batches of states a little below and above, one unknown each."""
-    step = _EPSILON * torch.eye(len(offsets), device=offsets.device)
+    step = STEP * torch.eye(len(offsets), device=offsets.device)
     return parameters.state(offsets - step), parameters.state(offsets + step)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,8 @@ from carts_core.benchmark.runner import _Bench
 from carts_core.cli import BAD_INPUT, main
 
 QUIET = Console(quiet=True)
-RUNS = 42
-"""30 of the main table, 2 with an error at the start, 6 with occluders, 2 with both cameras, 2 in sequence mode."""
+RUNS = 44
+"""30 of the main table, 2 with an error at the start, 6 with occluders, 4 with both cameras, 2 in sequence mode."""
 
 
 @pytest.fixture
@@ -45,6 +46,8 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     by_method = {measurement.run.method: measurement for measurement in measurements}
     assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
     assert 1 <= by_method["ours"].iterations <= 2
+    held, posed = by_method["stereo"], by_method["stereo_posed"]
+    assert replace(posed.run, method="stereo") == held.run and posed.final.dice != held.final.dice
     for measurement in measurements:
         assert 0.0 <= measurement.final.nsd <= 1.0 and 0.3 < measurement.final.dice <= 1.0
         assert measurement.final.seconds > 0

@@ -130,6 +130,7 @@ def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_fram
             *(make_measurement((0.7, 0.9), domain="occlusion", frame=frame) for frame in range(2)),
             *(make_measurement((0.7, 0.96), domain="occlusion", method=m) for m in ("ours_told", "ours_proposed")),
             make_measurement((0.8, 0.97), source="real", method="stereo"),
+            make_measurement((0.8, 0.98), source="real", method="stereo_posed"),
             make_measurement((0.95,), source="real", method="calibrated"),
             make_measurement((0.95, 0.98), source="real", method="calibrated_ours"),
             *(make_measurement((0.9, 0.95), method="sequence", frame=frame, stopped="warm") for frame in range(5)),
@@ -140,7 +141,7 @@ def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_fram
     occlusion, camera, calibration, sequence = texts
     assert [row[1] for row in occlusion] == ["1"] * 4
     assert [row[4] for row in occlusion] == ["70.0", "90.0", "96.0", "96.0"]
-    assert [row[4] for row in camera] == ["80.0", "90.0", "97.0"]
+    assert [row[4] for row in camera] == ["80.0", "90.0", "97.0", "98.0"]
     assert [row[4] for row in calibration] == ["80.0", "90.0", "95.0", "98.0"]
     assert sequence[0][2] == "5" and sequence[0][-3:] == ["2", "92.0 ± 2.0", "95.0 ± 0.0"]
     assert not any(table(Measurements(_measurements())) for table in (occlusion_table, camera_table, sequence_table))

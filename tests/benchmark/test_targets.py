@@ -98,7 +98,7 @@ def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_a
 def test_stereo_and_calibration_have_their_own_lines_on_real_frames() -> None:
     runs = [
         make_measurement((0.87, dice), source="real", method=method)
-        for method, dice in (("stereo", 0.97), ("calibrated", 0.93))
+        for method, dice in (("stereo_posed", 0.97), ("calibrated", 0.93))
     ]
     assert _target("real frames, both cameras", *runs).met is True
     assert _target("real frames, one calibration", *runs).met is False

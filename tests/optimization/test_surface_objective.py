@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 from perfect_sight import PerfectSight
+from torch.nn import functional
 
 from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.surface_objective import SurfaceObjective
+from carts_core.surface import COVERAGE
 
 
 @pytest.fixture
@@ -125,3 +127,26 @@ def test_what_is_not_in_the_image_stays_and_is_said_to_be_unknown(sequence: Sequ
     assert blind.best is not None and blind.best.uncertainty is not None
     assert blind.best.uncertainty.verdict("PSM1/wrist_yaw") == "not visible"
     assert np.allclose(blind.best.joint_positions()["PSM1"], away["PSM1"], atol=1e-4)
+
+
+def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = sequence.frame(0)
+    assert frame.truth is not None
+    sight = PerfectSight(sequence, sequence.scene.state(frame.truth))
+    sight.follow_windows(monkeypatch)
+    # A pixel at twice the working width: half a pixel, as `_OUTLINE` says.
+    sight.maps[:, COVERAGE] = functional.max_pool2d(sight.maps[:, COVERAGE], 3, stride=1, padding=1)
+    truth = frame.truth["PSM1"]
+
+    def errors() -> np.ndarray:
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=frame.truth)  # pyright: ignore[reportArgumentType]
+        list(optimizer)
+        assert optimizer.best is not None
+        found = optimizer.best
+        return np.abs(found.joint_positions()["PSM1"] - truth) / found.joint_std()["PSM1"]
+
+    assert errors().max() < 2
+    monkeypatch.setattr("carts_core.optimization.surface_objective._OUTLINE", 0.0)
+    assert errors().max() > 4, "pixels that are taken to err one by one promise too much"

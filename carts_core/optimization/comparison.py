@@ -1,0 +1,136 @@
+"""Two surface maps under one blur: how much they differ, and how the difference changes with the unknowns."""
+
+import math
+from dataclasses import astuple, dataclass, replace
+from itertools import combinations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from ..rendering import JacobianBlock, Renderer, SurfaceRendering
+from ..scene import Scene, SceneState
+from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from .inputs import kernel_radius, smoothed
+from .settings import OptimizerSettings
+from .window import Window
+
+STEP = 1e-3
+"""Distance of an unknown's two neighbouring states from its value [rad]."""
+
+_FACTORS = (1, 2, 4, 8)
+"""How many times smaller than the compared images those of a stage can be."""
+
+_SMALLEST_BLUR = 1.2
+"""A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
+
+
+class Stage:
+    """The comparison under one blur, at the resolution that the blur leaves."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        size: tuple[int, int],
+        zoom: float,
+        window: Window,
+        observed: Float[Tensor, "cameras 6 h w"],
+        weight: Float[Tensor, "cameras 1 h w"],
+        blur: float,
+        settings: OptimizerSettings,
+    ) -> None:
+        blur *= zoom
+        factor = max(f for f in _FACTORS if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._blur, self._robust = blur / factor, settings.robust
+        self.area = (factor / zoom) ** 2
+        """Of a pixel [px of the working image]."""
+        self._precision = self.area / settings.noise**2
+        self.size = size[0] // factor, size[1] // factor
+        self.window = window.reduced(factor)
+        self.renderer = Renderer(
+            scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=observed.device
+        )
+        self._weight = functional.avg_pool2d(weight, factor)
+        maps = functional.avg_pool2d(observed * weight, factor)
+        self._observed = compared(smoothed(maps, self._blur))
+        self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
+        self._channels[1 : COVERAGE.stop] = settings.parts_weight
+        self._channels[NORMALS] = settings.normals_weight
+
+    def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "Comparison":
+        """Compare a state; with neighbours, also say how the cost changes."""
+        tangents = self.renderer.tangents(*neighbours, 2 * STEP) if neighbours else None
+        rendering = self.renderer.surface(state, tangents, 1 + kernel_radius(self._blur))
+        model = compared(smoothed(rendering.maps * self._weight, self._blur))
+        residual = self._observed - model
+        squared = (residual.square() * self._channels).sum(1, keepdim=True)
+        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
+        ratio = 1.0 / (1.0 + squared / self._robust**2)
+        comparison = Comparison(
+            0.5 * self.area * float((squared * ratio).sum()),
+            rendering,
+            (1.0 - squared[:, 0]).clamp(min=-1.0),
+            (ratio.square() * self._weight)[:, 0],
+        )
+        if tangents is None:
+            return comparison
+        weight = ratio.square() * self._channels * self._precision
+        grown = torch.zeros_like(residual)
+        grown[:, COVERAGE.start] = _growth(model[:, COVERAGE.start]) / math.sqrt(self.area)
+        equations = self._normal_equations(rendering.jacobian, residual, grown, weight, len(tangents.intrinsics))
+        return replace(comparison, **equations)
+
+    def _normal_equations(
+        self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
+    ) -> dict[str, Tensor]:
+        """-J^T W r, J^T W J and J^T W g, under the blur."""
+        gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
+        outline = torch.zeros_like(gradient)
+        windows, blocks = [], []
+        for block in jacobian:
+            rows, columns = block.values.shape[-2:]
+            window = Window(block.left, block.top, columns, rows)
+            values = compared(smoothed(block.values * window.of(self._weight), self._blur))
+            weighted = (values * window.of(weight)).flatten(1)
+            gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
+            outline[block.unknowns] = weighted @ window.of(grown).flatten()
+            curvature[block.unknowns[:, None], block.unknowns] = weighted @ values.flatten(1).T
+            windows.append(window)
+            blocks.append((block.unknowns, values))
+        for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
+            common = a.common(b)
+            if common is None:
+                continue
+            ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
+            cross = ours @ common.inside(b).of(second).flatten(1).T
+            curvature[mine[:, None], others] = cross
+            curvature[others[:, None], mine] = cross.T
+        return {"gradient": gradient, "curvature": curvature, "outline": outline}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    cost: float
+    """Half the sum of robust squared residuals [px of the working image]."""
+    rendering: SurfaceRendering
+    similarity: Float[Tensor, "cameras h w"]
+    trust: Float[Tensor, "cameras h w"]
+    """Weight of each pixel, in [0, 1]."""
+    gradient: Float[Tensor, " n"] | None = None
+    """Of the cost in units of the noise."""
+    curvature: Float[Tensor, "n n"] | None = None
+    outline: Float[Tensor, " n"] | None = None
+    """What the gradient loses when all observed outlines move outwards by a pixel of the working image [1/px]."""
+
+
+def _growth(coverage: Float[Tensor, "cameras h w"]) -> Float[Tensor, "cameras h w"]:
+    """What coverage gains when outlines move outwards by a pixel."""
+    down, right = torch.gradient(coverage, dim=(-2, -1))
+    return torch.hypot(down, right)
+
+
+def compared(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
+    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
+    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
+    return maps
