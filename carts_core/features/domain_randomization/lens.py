@@ -33,7 +33,8 @@ def tone(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Im
     # The floor holds for the whole image; white balance moves colours about it.
     factor *= max(1.0, ranges.brightness[0] / factor.mean())
     image = np.clip(image * factor.astype(np.float32), 0, 1.2)
-    image = 0.5 + (image - 0.5) * rng.uniform(*ranges.contrast)
+    mean = image.mean()
+    image = mean + (image - mean) * rng.uniform(*ranges.contrast)
     return np.clip(image, 0, 1) ** np.float32(rng.uniform(*ranges.gamma))
 
 

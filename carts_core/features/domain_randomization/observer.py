@@ -44,7 +44,7 @@ class ImageSettings:
     """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
     same_background: float = 0.7
     """Share of pairs whose mean background is that of the observed image."""
-    occluded: float = 0.3
+    occluded: float = 0.4
     """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
     coverage: tuple[float, float] = (0.004, 0.5)
     """Allowed share of the image that shows arms."""

@@ -20,8 +20,8 @@ class AppearanceRanges:
 
     brightness: Range = (0.65, 1.35)
     """Factor on the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
-    contrast: Range = (0.8, 1.2)
-    """Factor on the distance from mid grey [1]."""
+    contrast: Range = (0.6, 1.3)
+    """Factor on the distance from the image's mean [1]."""
     gamma: Range = (0.8, 1.25)
     """Exponent of the tone curve [1]."""
     white_balance: Range = (0.82, 1.2)
