@@ -111,6 +111,8 @@ class Stage:
 
 @dataclass(frozen=True)
 class Comparison:
+    """How a state compares with what is observed, in one stage."""
+
     cost: float
     """Half the sum of robust squared residuals [px of the working image]."""
     rendering: SurfaceRendering

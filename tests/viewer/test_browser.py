@@ -310,11 +310,11 @@ def test_a_shift_click_places_a_keypoint_there_and_a_shift_drag_takes_it_along(
 
     tab.page.keyboard.down("Shift")
     tab.page.mouse.click(*on_screen(150.0, 110.0))
-    eventually(lambda: app.state, lambda state: bool(state.keypoints.pins) and not state.unsaved)
+    eventually(lambda: app.state, lambda state: state.undoable == 1 and not state.unsaved)
     (pin,) = app.state.keypoints.pins
     # A screen pixel is less than half an image pixel here.
     assert pin.pixel == pytest.approx((150.0, 110.0), abs=1.0)
-    assert app.state.keypoints.residuals[0] < 1.0 and app.state.undoable == 1
+    assert app.state.keypoints.residuals[0] < 1.0
     tab.page.mouse.down()
     for step in range(8):
         tab.page.mouse.move(*on_screen(150.0 + 2 * step, 110.0 + step))
