@@ -56,10 +56,11 @@ def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
     with torch.no_grad():
         vertices = vertices_in_camera(renderer.geometry, link_transforms(renderer.scene, state)[0])
     faces, K = renderer.geometry.faces, state.intrinsics[0]
+    surfaces = renderer.geometry.face_surfaces.numpy()
     size = (renderer.width, renderer.height)
     return {
         "visibility, compiled kernel": milliseconds(
-            lambda: rasterize(vertices.T.numpy(), faces.numpy(), K.tolist(), *size), runs
+            lambda: rasterize(vertices.T.numpy(), faces.numpy(), K.tolist(), *size, surfaces), runs
         ),
         "visibility, torch (as on a GPU)": milliseconds(lambda: visibility_torch(vertices.T, faces, K, *size), 5),
         "segmentation": milliseconds(lambda: renderer.segment(state), runs),

@@ -32,6 +32,13 @@ class LinkMesh:
     """Linear RGB in [0, 1]."""
 
 
+def is_closed(mesh: LinkMesh) -> bool:
+    """Whether a mesh encloses a volume, with its normals outwards; copies of a vertex at sharp edges count as one."""
+    joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    joined.merge_vertices(merge_norm=True, digits_vertex=7)
+    return bool(joined.is_watertight and joined.is_winding_consistent and joined.volume > 0)
+
+
 def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
     """Meshes of one URDF visual in its link's frame, each with its colour.
 

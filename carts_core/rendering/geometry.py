@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..meshes import is_closed
 from ..parts import link_parts
 from ..robot import Robot
 from ..scene import Scene, SceneState
@@ -29,6 +30,8 @@ class SceneGeometry:
     face_arms: Int[Tensor, " F"]
     face_parts: Int[Tensor, " F"]
     """Index into `carts_core.parts.PARTS`."""
+    face_surfaces: Int[Tensor, " F"]
+    """Index of the closed surface that a triangle is part of, -1 for none; a camera outside sees no back of it."""
     face_colors: Float[Tensor, "3 F"]
     face_barycentric: Float[Tensor, "8 F"]
     """Affine maps from a point on the triangle to its second and third barycentric coordinate, one after the other."""
@@ -43,7 +46,7 @@ class SceneGeometry:
     @staticmethod
     @lru_cache(maxsize=4)
     def _of(robots: tuple[Robot, ...], device: torch.device) -> "SceneGeometry":
-        vertices, normals, faces, face_links, arms, face_parts, colors, counts = [], [], [], [], [], [], [], []
+        vertices, normals, faces, face_links, arms, face_parts, surfaces, colors, counts = ([] for _ in range(9))
         first_link, first_vertex = 0, 0
         for arm_index, robot in enumerate(robots):
             counts += [0] * len(robot.link_names)
@@ -57,6 +60,7 @@ class SceneGeometry:
                 face_links.append(np.full(count, link))
                 arms.append(np.full(count, arm_index))
                 face_parts.append(np.full(count, parts[mesh.link]))
+                surfaces.append(np.full(count, len(surfaces) if is_closed(mesh) else -1))
                 colors.append(np.broadcast_to(mesh.color, (count, 3)))
                 first_vertex += len(mesh.vertices)
             first_link += len(robot.link_names)
@@ -72,6 +76,7 @@ class SceneGeometry:
             tensor(np.concatenate(face_links), torch.int64),
             tensor(np.concatenate(arms), torch.int64),
             tensor(np.concatenate(face_parts), torch.int64),
+            tensor(np.concatenate(surfaces), torch.int64),
             tensor(np.concatenate(colors).T),
             tensor(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
             tensor(np.concatenate(normals)[face].reshape(-1, 9).T),

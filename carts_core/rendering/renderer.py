@@ -76,7 +76,7 @@ class Renderer:
         self.height = height or self.scene.cameras[0].height
         self.device = torch.device(device)
         self.geometry = SceneGeometry.of(scene, device)
-        self._faces = self.geometry.faces.cpu().numpy()
+        self._faces, self._surfaces = self.geometry.faces.cpu().numpy(), self.geometry.face_surfaces.cpu().numpy()
         scale = [[self.width / camera.width, self.height / camera.height] * 2 for camera in self.scene.cameras]
         self._scale = torch.tensor(scale, dtype=torch.float32, device=device)
         left, top, self.width, self.height = window or (0, 0, self.width, self.height)
@@ -163,7 +163,8 @@ class Renderer:
         for T_camera_link, intrinsics in zip(views_T, views_K, strict=True):
             vertices = vertices_in_camera(self.geometry, T_camera_link)
             if self.device.type == "cpu":
-                seen = rasterize(vertices.T.numpy(), self._faces, intrinsics.tolist(), self.width, self.height)
+                size = (self.width, self.height)
+                seen = rasterize(vertices.T.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
                 face_ids, inverse_depth = (torch.from_numpy(array) for array in seen)
             else:
                 face_ids, depth = visibility_torch(vertices.T, self.geometry.faces, intrinsics, self.width, self.height)

@@ -30,8 +30,8 @@ def _first_and_last(value, slope, first, last):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
-    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z)."""
+def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
+    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z), seen from behind if two-sided."""
     height, width = face_ids.shape
     # Only pixel centres (x + 0.5, y + 0.5) inside the bounding box can be covered.
     first_x = max(int(np.ceil(max(min(u[a], u[b], u[c]) - 0.5, 0.0))), 0)
@@ -41,7 +41,8 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth):
     if first_x > last_x or first_y > last_y:
         return
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
-    if area == 0.0:
+    # An image's y points down, so corners that go round counterclockwise span a negative area.
+    if area == 0.0 or (area > 0.0 and not two_sided):
         return
     scale = 1.0 / area
     # Barycentric coordinates and 1/z are affine in the image.
@@ -91,7 +92,25 @@ def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, cl
 
 
 @numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _rasterize(vertices, faces, fx, fy, cx, cy, face_ids, inverse_depth):
+def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width, height):
+    """Whether the near plane may open each closed surface where the camera sees it: by the bounds of the cut."""
+    u, v, inverse_near = np.empty(4), np.empty(4), np.empty(4)
+    low, high = np.full((closed, 2), np.inf), np.full((closed, 2), -np.inf)
+    for face in range(faces.shape[0]):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        surface = surfaces[face]
+        if surface < 0 or (inverse_z[a] > 0.0 and inverse_z[b] > 0.0 and inverse_z[c] > 0.0):
+            continue
+        corners = _clip(faces[face], inverse_z, vertices, fx, fy, cx, cy, u, v, inverse_near)
+        for k in range(corners):
+            if inverse_near[k] == 1.0 / NEAR:
+                low[surface, 0], high[surface, 0] = min(low[surface, 0], u[k]), max(high[surface, 0], u[k])
+                low[surface, 1], high[surface, 1] = min(low[surface, 1], v[k]), max(high[surface, 1], v[k])
+    return (low[:, 0] <= width) & (high[:, 0] >= 0.0) & (low[:, 1] <= height) & (high[:, 1] >= 0.0)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _rasterize(vertices, faces, surfaces, closed, fx, fy, cx, cy, face_ids, inverse_depth):
     count = vertices.shape[0]
     u, v, inverse_z = np.zeros(count), np.zeros(count), np.zeros(count)
     for index in range(count):
@@ -100,15 +119,20 @@ def _rasterize(vertices, faces, fx, fy, cx, cy, face_ids, inverse_depth):
             inverse_z[index] = 1.0 / z
             u[index] = fx * vertices[index, 0] * inverse_z[index] + cx
             v[index] = fy * vertices[index, 1] * inverse_z[index] + cy
+    height, width = face_ids.shape
+    opened = _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width, height)
     clipped_u, clipped_v, clipped_inverse_z = np.empty(4), np.empty(4), np.empty(4)
     for face in range(faces.shape[0]):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        two_sided = surfaces[face] < 0 or opened[surfaces[face]]
         if inverse_z[a] > 0.0 and inverse_z[b] > 0.0 and inverse_z[c] > 0.0:
-            _fill_triangle(face, u, v, inverse_z, a, b, c, face_ids, inverse_depth)
+            _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth)
             continue
         corners = _clip(faces[face], inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z)
         for last in range(2, corners):
-            _fill_triangle(face, clipped_u, clipped_v, clipped_inverse_z, 0, last - 1, last, face_ids, inverse_depth)
+            _fill_triangle(
+                face, clipped_u, clipped_v, clipped_inverse_z, 0, last - 1, last, two_sided, face_ids, inverse_depth
+            )
 
 
 def rasterize(
@@ -117,6 +141,7 @@ def rasterize(
     intrinsics: Sequence[float],
     width: int,
     height: int,
+    surfaces: Int[np.ndarray, " F"] | None = None,
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
     """The nearest triangle at every pixel centre, and the inverse of its depth.
 
@@ -125,6 +150,9 @@ def rasterize(
         faces: vertex indices.
         intrinsics: fx, fy, cx, cy [px].
         width, height: size of the image [px].
+        surfaces: index of the closed surface that a triangle is part of, -1 for none (the default). Seen from outside,
+            its corners go round counterclockwise. Unless the near plane opens it before the camera's eyes, its front
+            hides its back, which is then skipped; that changes nothing and takes about half as long.
 
     Returns:
         `face_ids` (int32, `BACKGROUND` where nothing is seen) and `inverse_depth` (float32, [1/m], 0 there).
@@ -133,7 +161,12 @@ def rasterize(
     inverse_depth = np.zeros((height, width), np.float32)
     vertices = np.ascontiguousarray(vertices_camera, np.float64)
     fx, fy, cx, cy = (float(value) for value in intrinsics)
-    _rasterize(vertices, np.ascontiguousarray(faces, np.int32), fx, fy, cx, cy, face_ids, inverse_depth)
+    if surfaces is None:
+        surfaces = np.full(len(faces), -1)
+    closed = int(surfaces.max(initial=-1)) + 1
+    _rasterize(
+        vertices, np.ascontiguousarray(faces, np.int32), surfaces, closed, fx, fy, cx, cy, face_ids, inverse_depth
+    )
     return face_ids, inverse_depth
 
 

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+from carts_core.meshes import LinkMesh, is_closed
 from carts_core.rendering import visibility, visibility_torch
 from carts_core.rendering.reference import visibility_ref
+from carts_core.rendering.visibility_numba import rasterize
 
 INTRINSICS = (30.0, 34.0, 17.3, 11.8)
 WIDTH, HEIGHT = 36, 24
@@ -70,3 +73,52 @@ def test_shared_edges_leave_no_gap() -> None:
     vertices = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
     ids, _ = visibility(vertices, np.array([[0, 1, 2], [0, 2, 3]]), (10.0, 10.0, 18.0, 12.0), WIDTH, HEIGHT)
     assert (ids[3:21, 9:27] >= 0).all()
+
+
+def closed_bodies(seed: int, count: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes and balls before, across, around and behind the camera, and which of them a triangle is part of."""
+    rng = np.random.default_rng(seed)
+    vertices, faces, surfaces = [], [], []
+    for index in range(count):
+        body = trimesh.creation.icosphere(subdivisions=2) if index % 2 else trimesh.creation.box()
+        body.apply_scale(rng.uniform(0.02, 0.15, 3))
+        body.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
+        body.apply_translation(rng.uniform([-0.2, -0.2, -0.1], [0.2, 0.2, 0.4]))
+        faces.append(body.faces + sum(map(len, vertices)))
+        vertices.append(body.vertices)
+        surfaces.append(np.full(len(body.faces), index))
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(surfaces)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_skipping_the_backs_of_closed_surfaces_changes_nothing(seed: int) -> None:
+    vertices, faces, surfaces = closed_bodies(seed)
+    every = rasterize(vertices, faces, INTRINSICS, WIDTH, HEIGHT)
+    fronts = rasterize(vertices, faces, INTRINSICS, WIDTH, HEIGHT, surfaces)
+    np.testing.assert_array_equal(fronts[0], every[0])
+    np.testing.assert_array_equal(fronts[1], every[1])
+
+
+def test_the_inside_of_a_closed_surface_is_seen_from_within() -> None:
+    room = trimesh.creation.box((1.0, 1.0, 1.0))
+    ids, inverse_depth = rasterize(room.vertices, room.faces, INTRINSICS, WIDTH, HEIGHT, np.zeros(12, int))
+    assert (ids >= 0).all()
+    np.testing.assert_allclose(1.0 / inverse_depth[HEIGHT // 2, WIDTH // 2], 0.5, rtol=1e-5)
+
+
+def test_backs_are_skipped_where_a_surface_is_said_to_be_closed() -> None:
+    back = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1]], float)
+    for faces, seen in (([[0, 1, 2]], False), ([[0, 2, 1]], True)):
+        ids, _ = rasterize(back, np.array(faces), INTRINSICS, WIDTH, HEIGHT, np.zeros(1, int))
+        assert (ids >= 0).any() == seen
+
+
+@pytest.mark.parametrize(("change", "closed"), [("none", True), ("hole", False), ("inside out", False)])
+def test_what_counts_as_closed(change: str, closed: bool) -> None:
+    ball = trimesh.graph.smooth_shade(trimesh.creation.box(), angle=0.5)
+    if change == "inside out":
+        ball.invert()
+    faces = np.array(ball.faces)[int(change == "hole") :]
+    mesh = LinkMesh(0, np.array(ball.vertices), np.array(ball.vertex_normals), faces, np.ones(3))
+    assert len(mesh.vertices) == 24
+    assert is_closed(mesh) == closed
