@@ -41,6 +41,9 @@ class Optimizer(Protocol):
     def step(self) -> Iterate | None:
         """The next iterate, the start itself at first; None when there are no more."""
 
+    def base_frame_gain(self) -> float | None:
+        """At the end, what free base frames would explain of the difference that is left [1]; None if not known."""
+
 
 class OptimizerFactory:
     """Makes optimizers; loads the networks once, when they are first needed."""
@@ -229,6 +232,10 @@ class ActiveRun:
     def best(self) -> Iterate | None:
         """The best iterate so far: of the present look at the image, the one of the lowest loss."""
         return self._optimizer.best
+
+    def base_frame_gain(self) -> float | None:
+        """At the end, what free base frames would explain of the difference that is left [1]; None if not known."""
+        return self._optimizer.base_frame_gain()
 
     def pose(self, iterate: Iterate) -> Pose:
         """An iterate's state, which knows the run's cameras only, as a pose of the whole scene."""

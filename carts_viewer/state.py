@@ -82,6 +82,8 @@ class RunState:
     curves: Curves = field(default_factory=Curves)
     reason: str | None = None
     """Why the run stopped, for people."""
+    base_frame_gain: float | None = None
+    """What free base frames would explain of the difference that is left [1]; None where it is not known."""
 
 
 @dataclass(frozen=True)

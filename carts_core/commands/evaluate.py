@@ -16,6 +16,7 @@ from ..evaluation import FrameScore, evaluate, evaluate_sequence, mean_score, to
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
+from .hints import base_frame_hint
 from .selection import Mode, Network, Selection, SequencePath
 
 _WIDTH = 110
@@ -70,6 +71,10 @@ class Evaluate:
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
         console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
+        for camera in cameras:
+            hint = base_frame_hint(camera, [score.base_frame_gain for score in scores if score.camera == camera])
+            if hint is not None:
+                console.print(hint, style="yellow")
         if self.json is not None:
             write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
             console.print(f"wrote {self.json}")

@@ -19,6 +19,7 @@ from ..export import KinematicsRow, read_kinematics_csv, write_bytes
 from ..features.extractor import FeatureExtractor
 from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
 from .frame_folder import FrameFolder
+from .hints import base_frame_hint
 from .selection import Mode, Network, Selection, SequencePath
 
 
@@ -95,6 +96,7 @@ class Optimize:
     ) -> None:
         needed = todo and self.optimizer.needs_background
         background = {camera: sequence.background(camera, domain)} if needed else {}
+        gains = []
         for index in track(todo, f"{domain}, {camera}", console=console, disable=not todo):
             frame = sequence.frame(index, domain, [camera])
             optimizer = FrameOptimizer(
@@ -114,6 +116,10 @@ class Optimize:
             assert best is not None
             row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
             output.write([(row, best.state)])
+            gains.append(optimizer.base_frame_gain())
+        hint = base_frame_hint(camera, gains)
+        if hint is not None:
+            console.print(hint, style="yellow")
 
     def _together(
         self,

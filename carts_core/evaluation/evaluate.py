@@ -34,6 +34,8 @@ class FrameScore:
     """Why the optimization ended, or in sequence mode where the frame's values come from."""
     joint_std_deg: float | None = None
     """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
+    base_frame_gain: float | None = None
+    """What free base frames would explain of the remaining difference [1]; None where it is not known."""
 
 
 def evaluate(
@@ -95,6 +97,7 @@ def evaluate(
                         len(optimizer.history) - 1,
                         seconds,
                         optimizer.stop_reason,
+                        optimizer.base_frame_gain(),
                     )
 
 
@@ -121,6 +124,7 @@ def frame_score(
     iterations: int,
     seconds: float,
     stopped: str,
+    base_frame_gain: float | None = None,
 ) -> FrameScore:
     """Compare an estimate of a frame with the truth.
 
@@ -129,7 +133,7 @@ def frame_score(
         renderer: of that camera in full size.
         start: arm name -> joint positions before [rad, m].
         state, joint_positions, joint_std: after.
-        iterations, seconds, stopped: as in the score.
+        iterations, seconds, stopped, base_frame_gain: as in the score.
     """
     mask = (frame.masks or {}).get(camera)
     truth = frame.truth or {}
@@ -152,6 +156,7 @@ def frame_score(
         seconds=round(seconds, 4),
         stopped=stopped,
         joint_std_deg=joint_std_deg(sequence.scene, joint_std, sequence.measured_joints),
+        base_frame_gain=base_frame_gain,
     )
 
 

@@ -6,6 +6,7 @@ from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
+from .frame import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
@@ -17,6 +18,7 @@ from .settings import FreeParameters as FreeParameters
 from .settings import OptimizerSettings as OptimizerSettings
 
 __all__ = [
+    "BASE_FRAME_GAIN",
     "CALIBRATION",
     "CALIBRATION_SETTINGS",
     "CalibrationIterate",

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -62,6 +62,11 @@ class Iterate:
         return {arm: known.joint_std(arm, joints) for arm, joints in zip(self.arm_names, self.joint_names, strict=True)}
 
 
+BASE_FRAME_GAIN = 0.12
+"""Share of what an image still holds against the best iterate, from which on a base frame that would explain it is
+suspected [1]; see `FrameOptimizer.base_frame_gain`."""
+
+
 @dataclass(frozen=True)
 class Progress:
     """What is kept of every iterate, in a few bytes."""
@@ -111,7 +116,8 @@ class FrameOptimizer:
         self._arm_names = tuple(arm.name for arm in scene.arms)
         self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         state = scene.state(frame.measured if start is None else start, extractor.device)
-        self._parameters = ParameterVector(scene, state, free or FreeParameters(), self.settings.lever)
+        self._free = free or FreeParameters()
+        self._parameters = ParameterVector(scene, state, self._free, self.settings.lever)
         self._scene, self._images, self._extractor, self._given = scene, frame.images, extractor, ignore or {}
         self._live = live
         self._first: Objective
@@ -164,12 +170,30 @@ class FrameOptimizer:
         iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
-            self.best, self._epoch = iterate, epoch
+            self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
         self._offsets = self._restart(stage, self._offsets, self.best.loss)
         self.stop_reason = solver.finished
         if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
         return iterate
+
+    def base_frame_gain(self) -> float | None:
+        """Share of what the images still hold against the best iterate that free base frames would explain [1].
+
+        By the linear model, so it costs one more comparison and no run; see docs/calibration.md for what it is where
+        base frames are right and where they are wrong.
+
+        Returns:
+            None before the end, where base frames are free already, or for losses that cannot say.
+        """
+        objective = self._objective
+        if self.stop_reason in (None, "cancelled", "not optimized") or self._free.base_frames:
+            return None
+        if not isinstance(objective, SurfaceObjective):
+            return None
+        free = replace(self._free, base_frames=True)
+        wider = ParameterVector(self._scene, self._parameters.start, free, self.settings.lever)
+        return objective.promised(self._best_offsets, wider)
 
     def _look_past_occluders(self) -> None:
         """Begin again without what contradicts the best iterate, if there is such."""

@@ -138,6 +138,35 @@ class SurfaceObjective:
         return False
 
     @torch.no_grad()
+    def promised(self, offsets: Float[Tensor, " n"], wider: ParameterVector) -> float:
+        """Share of what the image still holds against a state that more unknowns would explain, by the linear model.
+
+        What the present unknowns alone would still explain does not count. Compared is what the last look saw, under
+        the finest blur of the first one: a linear model reaches about as far as the blur.
+
+        Args:
+            offsets: of the present unknowns.
+            wider: the present unknowns and others, from the same start.
+        """
+        settings = self.settings
+        own = [wider.names.index(name) for name in self.parameters.names]
+        point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(own, device=offsets.device), offsets)
+        blur = settings.blurs[: max(len(settings.blurs) - _FINE, 1)][-1]
+        stage = Stage(self.scene, self._size, self._zoom, self._window, *self._seen, blur, settings)
+        compared = stage.compare(wider.state(point), _neighbours(wider, point))
+        assert compared.gradient is not None and compared.curvature is not None
+        prior = wider.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
+        gradient, curvature = compared.gradient.double(), compared.curvature.double()
+        slope = prior.gradient(point).double() + gradient
+        stiffness = prior.precision.double() + curvature
+        explained = []
+        for free in (list(range(len(wider))), own):
+            step = torch.zeros_like(slope)
+            step[free] = torch.linalg.solve(stiffness[free][:, free], -slope[free])
+            explained.append(-float(gradient @ step + 0.5 * step @ curvature @ step))
+        return (explained[0] - explained[1]) * settings.noise**2 / max(compared.cost, 1e-12)
+
+    @torch.no_grad()
     def better_start(self, offsets: Float[Tensor, " n"], candidates: int, seed: int = 0) -> Float[Tensor, " n"]:
         """Offsets worth starting from again: the best of random ones, arm by arm, in the coarsest stage.
 
@@ -183,9 +212,10 @@ class SurfaceObjective:
         weight = window.of(self._weight) * near[:, None]
         self._look, self._belief = look, belief
         self._window, self._coverage = window, observed[:, COVERAGE].sum(1)
-        self._seen = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
+        self._seen = observed, weight
+        self._seen_area = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
         self._stages = [
-            Stage(self.scene, self._size, self._zoom, window, observed, weight, blur, self.settings)
+            Stage(self.scene, self._size, self._zoom, window, *self._seen, blur, self.settings)
             for number, blur in self._plan
             if number == look
         ]
@@ -211,7 +241,7 @@ class SurfaceObjective:
                     _OUTLINE * compared.outline,
                 )
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
-        area = 0.5 * max(float(coverage.sum()) * shown.area + self._seen, 1.0)
+        area = 0.5 * max(float(coverage.sum()) * shown.area + self._seen_area, 1.0)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(

@@ -5,6 +5,7 @@ from typing import get_args
 import viser
 
 from carts_core.losses import Loss
+from carts_core.optimization import BASE_FRAME_GAIN
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
@@ -57,7 +58,9 @@ class OptimizePanel:
         self._reset.disabled = not state.run.curves.loss
         write(self._loss, _label(self._losses, state.settings.loss))
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        self._status.content = f'<p class="carts-status">{status_line(state)}</p>{observability_lines(state)}'
+        self._status.content = (
+            f'<p class="carts-status">{status_line(state)}</p>{observability_lines(state)}{calibration_line(state)}'
+        )
 
 
 def status_line(state: ViewState) -> str:
@@ -89,6 +92,18 @@ def observability_lines(state: ViewState) -> str:
         if names:
             lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
     return "".join(lines)
+
+
+def calibration_line(state: ViewState) -> str:
+    """That base frames look wrong, if what the run left of the difference says so, as HTML."""
+    gain = state.run.base_frame_gain
+    if gain is None or gain < BASE_FRAME_GAIN:
+        return ""
+    return (
+        '<p class="carts-caption">Base frames or the camera\'s pose look wrong: free base frames would take '
+        f"{100 * gain:.0f} % off what is left of the loss. Tick Base frames under Free parameters and run again, or "
+        "correct the whole recording with <code>carts calibrate</code>.</p>"
+    )
 
 
 def _spoken(unknown: str) -> str:

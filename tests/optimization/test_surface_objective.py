@@ -1,6 +1,7 @@
 """The surface objective and Gauss-Newton, with a network that sees exactly what is there."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from torch.nn import functional
 
 from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, OptimizerSettings
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.surface_objective import SurfaceObjective
+from carts_core.scene import Scene
 from carts_core.surface import COVERAGE
 
 
@@ -150,3 +152,37 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
     assert errors().max() < 2
     monkeypatch.setattr("carts_core.optimization.surface_objective._OUTLINE", 0.0)
     assert errors().max() > 4, "pixels that are taken to err one by one promise too much"
+
+
+def test_a_base_frame_that_joints_cannot_stand_in_for_is_suspected(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame, scene = sequence.frame(0), sequence.scene
+    arm = scene.arms[0]
+    T_world_base = arm.T_world_base.copy()
+    T_world_base[:3, 3] += 0.0005
+    wrong = replace(scene, arms=(replace(arm, T_world_base=T_world_base),))
+    held = FreeParameters(locked_joints=arm.robot.joint_names[:-1])
+
+    def run(scene: Scene, free: FreeParameters) -> FrameOptimizer:
+        optimizer = FrameOptimizer(scene, frame, {}, sight, start=frame.truth, free=free)
+        assert optimizer.base_frame_gain() is None, "nothing is known before the end"
+        list(optimizer)
+        return optimizer
+
+    suspected = run(wrong, held)
+    gain = suspected.base_frame_gain()
+    assert gain is not None and gain > 0.5
+    freed = run(wrong, replace(held, base_frames=True))
+    assert freed.base_frame_gain() is None, "they are free already"
+    assert suspected.best is not None and freed.best is not None
+    assert freed.best.loss < 0.5 * suspected.best.loss, "the linear model promised no more than there was"
+
+
+def test_joints_that_explain_the_image_leave_base_frames_unsuspected(
+    sequence: Sequence, sight: FeatureExtractor
+) -> None:
+    frame = sequence.frame(0)
+    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=start)
+    list(optimizer)
+    gain = optimizer.base_frame_gain()
+    assert gain is not None and abs(gain) < BASE_FRAME_GAIN

@@ -1,10 +1,10 @@
-"""What the optimizer's panel says about joints that the image does not determine."""
+"""What the optimizer's panel says about joints that the image does not determine, and about base frames."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 from carts_core.optimization.observability import Uncertainty
-from carts_viewer.panels.optimize import observability_lines
+from carts_viewer.panels.optimize import calibration_line, observability_lines
 from carts_viewer.state import Maps, Phase, RunState
 
 
@@ -26,3 +26,9 @@ def test_joints_that_the_image_leaves_open_are_named_by_how_much() -> None:
 def test_nothing_is_said_while_running_or_by_losses_that_cannot_say() -> None:
     assert observability_lines(_state(KNOWN, Phase.RUNNING)) == ""  # pyright: ignore
     assert observability_lines(_state(None, Phase.IDLE)) == ""  # pyright: ignore
+
+
+def test_base_frames_are_suspected_from_a_share_on_that_joints_leave_rarely() -> None:
+    for gain, said in ((None, False), (0.05, False), (0.31, True)):
+        line = calibration_line(SimpleNamespace(run=RunState(base_frame_gain=gain)))  # pyright: ignore
+        assert ("31 %" in line) == said and bool(line) == said
