@@ -45,6 +45,10 @@ class Information:
         precision = np.where(known, _EXACT, 0.0)
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
+    def further_from(self, start: Float[np.ndarray, " n"], share: float) -> "Information":
+        """The same, said of corrections that are that share further away from `start` than it says they are."""
+        return Information(self.precision, self.vector + share * (self.vector - self.precision @ start))
+
     def surprise(self, expected: Gaussian) -> float:
         """Squared distance from what was expected, in standard deviations, mean over the unknowns [1]; about 1."""
         n = len(self.vector)

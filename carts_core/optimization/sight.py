@@ -25,6 +25,10 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 _WARM_STEPS, _WARM_TOLERANCE = 3, 1e-2
 """As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
 
+_OVERSHOOT = 0.5
+"""How much further than it came a warm look says it is [1]. It is a single one, and what the network sees leans towards
+where it is told the arms are; see `surface_objective`, which overshoots between looks."""
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -65,7 +69,8 @@ class Eye:
     def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
         """Find the correction near `start` [n]."""
         parameters.prior = _prior(expected, parameters)
-        return _descend(self._objective(frame, parameters, self._fine), parameters, self._fine, start)
+        end = _descend(self._objective(frame, parameters, self._fine), parameters, self._fine, start)
+        return replace(end, information=end.information.further_from(start, _OVERSHOOT))
 
     def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
         """Find the correction from the measured values on, coarse to fine."""

@@ -102,3 +102,14 @@ def test_a_combination_is_the_weighted_mean() -> None:
     found = combined(belief, Information(np.array([[300.0]]), np.array([300.0 * 0.3])))
     assert found.mean[0] == pytest.approx((100 * 0.1 + 300 * 0.3) / 400)
     assert found.covariance[0, 0] == pytest.approx(1 / 400)
+
+
+def test_further_from_a_start_is_further_where_something_is_known_and_nothing_elsewhere() -> None:
+    start = np.array([0.01, -0.02, 0.005])
+    seen = information(2, 2)
+    further = seen.further_from(start, 0.5)
+    assert further.precision is seen.precision
+    step, longer = (np.linalg.pinv(one.precision) @ (one.vector - one.precision @ start) for one in (seen, further))
+    np.testing.assert_allclose(longer, 1.5 * step, rtol=1e-6)
+    agreeing = Information(seen.precision, seen.precision @ start)
+    np.testing.assert_allclose(agreeing.further_from(start, 0.5).vector, agreeing.vector)

@@ -18,7 +18,11 @@ from carts_core.optimization import (
     OptimizerSettings,
     SequenceOptimizer,
     SequenceSettings,
+    sight,
 )
+from carts_core.optimization.error_model import Gaussian, combined
+from carts_core.optimization.parameters import ParameterVector
+from carts_core.optimization.sight import Eye
 from carts_core.rendering import Renderer
 
 FRAMES = 6
@@ -229,3 +233,23 @@ def test_frames_and_times_that_do_not_fit_are_refused(sights: Sights, times: dic
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"{name} is {value!r}; allowed is"):
         SequenceSettings(**{name: value})  # pyright: ignore[reportArgumentType]
+
+
+def test_a_warm_look_is_taken_to_have_come_less_than_all_the_way(
+    sights: Sights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it says is exaggerated, away from where it was told that the arms are."""
+    frame = sights.load(0)
+    scene, settings = sights.sequence.scene, OptimizerSettings()
+    told = np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    start = {ARM: (frame.truth or {})[ARM]}
+    found = {}
+    for overshoot in (0.0, 0.5):
+        monkeypatch.setattr(sight, "_OVERSHOOT", overshoot)
+        parameters = ParameterVector(scene, scene.state(start), FreeParameters(), settings.lever)
+        eye = Eye(scene, sights, settings, 4.0, lambda _: {})  # pyright: ignore[reportArgumentType]
+        expected = Gaussian(told, np.eye(len(parameters)) * np.deg2rad(1.5) ** 2)
+        found[overshoot] = combined(expected, eye.warm(frame, parameters, expected, told).information).mean
+    assert np.abs(found[0.0][:2]).max() < 0.3 * np.deg2rad(0.2), "all the way to the truth, at 0"
+    # Half as far again: beyond the truth, where told and found lie on either side of it.
+    np.testing.assert_allclose(found[0.5][:2], -0.5 * told[:2], atol=0.3 * np.deg2rad(0.2))
