@@ -1,0 +1,35 @@
+"""Whether base frames are suspected, with the shipped networks: on frames whose base frames are right, and real ones."""
+
+from pathlib import Path
+
+import pytest
+
+from carts_core.data import Sequence
+from carts_core.evaluation import start_positions
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer
+from carts_core.resources import sample_sequence
+
+REAL = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
+
+
+def gain(sequence: Sequence, index: int, domain: str, camera: str, perturb_deg: float) -> float:
+    frame = sequence.frame(index, domain, [camera])
+    start = start_positions(sequence, frame, perturb_deg, 0)
+    extractor = FeatureExtractor.load()
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, extractor, start=start, cameras=[camera], live=False)
+    list(optimizer)
+    found = optimizer.base_frame_gain()
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("domain", ["regular", "smoke"])
+def test_base_frames_that_are_right_are_not_suspected(domain: str) -> None:
+    sequence = Sequence.open(sample_sequence())
+    assert gain(sequence, 5, domain, sequence.scene.cameras[0].name, 2.0) < BASE_FRAME_GAIN
+
+
+@pytest.mark.usefixtures("shared_dir")
+def test_the_real_right_camera_contradicts_its_base_frame() -> None:
+    assert gain(Sequence.open(REAL), 0, "regular", "right", 0.0) > 2 * BASE_FRAME_GAIN
