@@ -18,6 +18,7 @@ CONTRAST_FLOOR = 0.02
 """Standard deviation [1] below which an image counts as empty and is not amplified any further."""
 
 _SMOOTHINGS = 2
+_CONTRAST_SMOOTHINGS = 5
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -34,6 +35,9 @@ class Architecture:
     """3x3 convolutions per level on the way up, from full resolution down."""
     local_mean: bool = True
     """Take the local mean off an image first, and not that of the whole image: a smooth veil then changes less."""
+    local_contrast: float = 0.0
+    """How much an image is divided by its local contrast instead of that of the whole image, from 0 (not at all) to 1
+    (entirely); needs `local_mean`. What takes contrast from a part of an image then changes less."""
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
@@ -46,6 +50,11 @@ class Architecture:
         if len(self.decoder_convolutions) != levels - 1 or any(n < 1 for n in self.decoder_convolutions):
             raise SettingsError(
                 f"decoder_convolutions are {self.decoder_convolutions}; give {levels - 1} counts of 1 or more."
+            )
+        if not 0 <= self.local_contrast <= float(self.local_mean):
+            raise SettingsError(
+                f"local_contrast is {self.local_contrast}; give 0 to 1, and 0 without local_mean, which is "
+                f"{self.local_mean}."
             )
 
     @property
@@ -66,9 +75,11 @@ class Architecture:
             SettingsError: it is one that cannot exist.
         """
         values = json.loads(text)
-        local_mean = bool(values.pop("local_mean"))
+        local_mean, local_contrast = bool(values.pop("local_mean")), float(values.pop("local_contrast", 0.0))
         return Architecture(
-            **{name: tuple(int(n) for n in counts) for name, counts in values.items()}, local_mean=local_mean
+            **{name: tuple(int(n) for n in counts) for name, counts in values.items()},
+            local_mean=local_mean,
+            local_contrast=local_contrast,
         )
 
 
@@ -116,7 +127,8 @@ class UNet(nn.Module):
     def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
         """Images as the first convolution gets them; see `standardize`."""
         self._check(images, 3)
-        return standardize(images, self.architecture.stride if self.architecture.local_mean else None)
+        block = self.architecture.stride if self.architecture.local_mean else None
+        return standardize(images, block, self.architecture.local_contrast)
 
     def _check(self, x: Tensor, channels: int) -> None:
         stride = self.architecture.stride
@@ -176,22 +188,34 @@ def channels_last(network: Network) -> Network:
     return network
 
 
-def standardize(images: Float[Tensor, "batch 3 h w"], block: int | None) -> Float[Tensor, "batch 3 h w"]:
-    """Images without their mean per channel, each with unit deviation over all pixels and channels.
+def standardize(
+    images: Float[Tensor, "batch 3 h w"], block: int | None, local_contrast: float = 0.0
+) -> Float[Tensor, "batch 3 h w"]:
+    """Images without their mean per channel, divided by their contrast: the deviation over all pixels and channels.
 
     Args:
         images: RGB in [0, 1]; h and w are multiples of `block`.
         block: the mean is a local one, smooth over about four blocks [px]; None takes that of the whole image.
+        local_contrast: share, as an exponent, of the deviation over about six blocks in what is divided by.
     """
     if block is None:
         detail = images - images.mean(dim=(2, 3), keepdim=True)
     else:
-        mean = functional.avg_pool2d(images, block)
-        for _ in range(_SMOOTHINGS):
-            mean = functional.avg_pool2d(mean, 3, stride=1, padding=1, count_include_pad=False)
-        detail = images - functional.interpolate(mean, scale_factor=block, mode="bilinear", align_corners=False)
-    variance = detail.square().mean(dim=(1, 2, 3), keepdim=True)
-    return detail * torch.rsqrt(variance + CONTRAST_FLOOR**2)
+        detail = images - _local(images, block, _SMOOTHINGS)
+    squares = detail.square().mean(1, keepdim=True)
+    variance = squares.mean(dim=(2, 3), keepdim=True) + CONTRAST_FLOOR**2
+    if block is not None and local_contrast > 0:
+        local = _local(squares, block, _CONTRAST_SMOOTHINGS) + CONTRAST_FLOOR**2
+        variance = variance ** (1.0 - local_contrast) * local**local_contrast
+    return detail * torch.rsqrt(variance)
+
+
+def _local(images: Float[Tensor, "batch channels h w"], block: int, smoothings: int) -> Tensor:
+    """Means of blocks, each smoothing with its neighbours, at full size again."""
+    mean = functional.avg_pool2d(images, block)
+    for _ in range(smoothings):
+        mean = functional.avg_pool2d(mean, 3, stride=1, padding=1, count_include_pad=False)
+    return functional.interpolate(mean, scale_factor=block, mode="bilinear", align_corners=False)
 
 
 def _block(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:

@@ -47,9 +47,23 @@ def test_a_slope_of_brightness_disappears_with_the_local_mean_only():
     assert change(4) < 0.1 * change(None)
 
 
+def test_a_loss_of_contrast_in_a_part_disappears_with_the_local_contrast_only():
+    texture = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(0)) - 0.5
+    dull = texture * torch.linspace(0.2, 1.0, 96)
+    middle = (..., slice(16, 80), slice(16, 80))
+
+    def change(local_contrast: float) -> float:
+        return float(
+            (standardize(dull, 4, local_contrast) - standardize(texture, 4, local_contrast))[middle].abs().mean()
+        )
+
+    assert change(1.0) < 0.5 * change(0.7) < 0.5 * change(0.0)
+
+
 def test_an_empty_image_is_not_amplified_to_noise():
     flat = torch.full((1, 3, 16, 16), 0.4) + 1e-4 * torch.randn(1, 3, 16, 16)
     assert standardize(flat, 4).abs().max() < 0.05
+    assert standardize(flat, 4, 1.0).abs().max() < 0.05
 
 
 def test_an_architecture_survives_json():
@@ -57,11 +71,26 @@ def test_an_architecture_survives_json():
         widths=(8, 16), encoder_convolutions=(1, 2), decoder_convolutions=(3,), local_mean=False
     )
     assert Architecture.from_json(architecture.to_json()) == architecture
+    architecture = Architecture(local_contrast=0.7)
+    assert Architecture.from_json(architecture.to_json()) == architecture
+
+
+def test_weights_from_before_local_contrast_have_none():
+    older = Architecture().to_json().replace(', "local_contrast": 0.0', "")
+    assert "local_contrast" not in older
+    assert Architecture.from_json(older) == Architecture()
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"widths": (8,)}, {"widths": (8, 0)}, {"encoder_convolutions": (1,)}, {"decoder_convolutions": (1, 1, 1, 0)}],
+    [
+        {"widths": (8,)},
+        {"widths": (8, 0)},
+        {"encoder_convolutions": (1,)},
+        {"decoder_convolutions": (1, 1, 1, 0)},
+        {"local_contrast": 1.5},
+        {"local_contrast": 0.5, "local_mean": False},
+    ],
 )
 def test_an_impossible_architecture_is_refused(arguments: dict):
     with pytest.raises(SettingsError, match="give"):

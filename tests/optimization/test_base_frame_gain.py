@@ -1,4 +1,4 @@
-"""Whether base frames are suspected, with the shipped networks: on frames whose base frames are right, and real ones."""
+"""Whether base frames are suspected, with the shipped networks: where they are right, and on real frames."""
 
 from pathlib import Path
 
