@@ -33,10 +33,18 @@ class LinkMesh:
 
 
 def is_closed(mesh: LinkMesh) -> bool:
-    """Whether a mesh encloses a volume, with its normals outwards; copies of a vertex at sharp edges count as one."""
+    """Whether each part of a mesh encloses a volume, with its normals outwards.
+
+    Copies of a vertex at sharp edges count as one.
+    """
     joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     joined.merge_vertices(merge_norm=True, digits_vertex=7)
-    return bool(joined.is_watertight and joined.is_winding_consistent and joined.volume > 0)
+    if not (joined.is_watertight and joined.is_winding_consistent):
+        return False
+    parts = trimesh.graph.connected_component_labels(joined.face_adjacency, node_count=len(joined.faces))
+    a, b, c = joined.triangles.swapaxes(0, 1)
+    volumes = np.bincount(parts, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
+    return bool((volumes > 0).all())
 
 
 def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[tuple[trimesh.Trimesh, np.ndarray]]:

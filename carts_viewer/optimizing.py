@@ -63,9 +63,11 @@ class Runner:
         Raises:
             ProjectError: it could not be saved.
         """
+        if self._controller.state.run.base_frame_gain is not None:
+            self._set(base_frame_gain=None)
         if self._run is not None:
             self._run = None
-            self._set(phase=Phase.IDLE, reason=reason, base_frame_gain=None)
+            self._set(phase=Phase.IDLE, reason=reason)
             if save:
                 self._controller.save()
 
@@ -191,9 +193,8 @@ class Runner:
             best, reason = run.best(), run.stop_reason
             if best is not None:
                 self._accept(run, best)
-            gain = run.base_frame_gain()
             self.end(_REASONS.get(reason or "", reason))
-            self._set(base_frame_gain=gain)
+            self._set(base_frame_gain=run.base_frame_gain())
             return
         self._accept(run, iterate)
         self._controller.score()
@@ -219,7 +220,6 @@ class Runner:
 
     def _set_free(self, **changes: Any) -> None:
         self.end("Free parameters changed; Run starts anew from here")
-        self._set(base_frame_gain=None)
         self._controller.change(free=replace(self._controller.state.free, **changes), maps=None)
 
     def _set(self, **changes: Any) -> None:

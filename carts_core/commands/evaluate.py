@@ -71,8 +71,9 @@ class Evaluate:
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
         console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
-        for camera in cameras:
-            hint = base_frame_hint(camera, [score.base_frame_gain for score in scores if score.camera == camera])
+        for group in [cameras] if self.together else [[camera] for camera in cameras]:
+            gains = [score.base_frame_gain for score in scores if score.camera in group]
+            hint = base_frame_hint(", ".join(group), gains)
             if hint is not None:
                 console.print(hint, style="yellow")
         if self.json is not None:

@@ -7,18 +7,18 @@ import numpy as np
 from ..optimization import BASE_FRAME_GAIN
 
 
-def base_frame_hint(camera: str, gains: Sequence[float | None]) -> str | None:
-    """A suggestion, if on average over frames the base frames look wrong from a camera, else None.
+def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
+    """A suggestion, if on average over frames the base frames look wrong, else None.
 
     Args:
-        camera: name.
+        where: camera, or what else tells people which frames are meant.
         gains: what free base frames would explain of each frame's remaining difference, None where that is not known.
     """
     known = [gain for gain in gains if gain is not None]
     if not known or np.mean(known) < BASE_FRAME_GAIN:
         return None
     return (
-        f"{camera}: base frames or the camera's pose look wrong. Joints cannot explain what is left of the difference, "
+        f"{where}: base frames or the camera's pose look wrong. Joints cannot explain what is left of the difference, "
         f"and free base frames would take {100 * np.mean(known):.0f} % off it. Try `carts calibrate`, or add "
         "--base-frames."
     )

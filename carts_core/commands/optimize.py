@@ -117,7 +117,7 @@ class Optimize:
             row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
             output.write([(row, best.state)])
             gains.append(optimizer.base_frame_gain())
-        hint = base_frame_hint(camera, gains)
+        hint = base_frame_hint(f"{domain}, {camera}", gains)
         if hint is not None:
             console.print(hint, style="yellow")
 

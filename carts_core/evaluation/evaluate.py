@@ -84,6 +84,7 @@ def evaluate(
                 seconds = (time.perf_counter() - began) / len(group)
                 best = optimizer.best
                 assert best is not None and optimizer.stop_reason is not None
+                gain = optimizer.base_frame_gain()
                 for camera, renderer in renderers.items():
                     yield frame_score(
                         sequence,
@@ -97,7 +98,7 @@ def evaluate(
                         len(optimizer.history) - 1,
                         seconds,
                         optimizer.stop_reason,
-                        optimizer.base_frame_gain(),
+                        gain,
                     )
 
 

@@ -46,7 +46,7 @@ class Information:
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
     def further_from(self, start: Float[np.ndarray, " n"], share: float) -> "Information":
-        """The same, said of corrections that are that share further away from `start` than it says they are."""
+        """The same, with the correction that it speaks for moved away from `start` by `share` of their distance."""
         return Information(self.precision, self.vector + share * (self.vector - self.precision @ start))
 
     def surprise(self, expected: Gaussian) -> float:

@@ -63,8 +63,8 @@ class Iterate:
 
 
 BASE_FRAME_GAIN = 0.12
-"""Share of what an image still holds against the best iterate, from which on a base frame that would explain it is
-suspected [1]; see `FrameOptimizer.base_frame_gain`."""
+"""Base frames are suspected if, free, they would explain at least this share of the remaining difference [1]; see
+`FrameOptimizer.base_frame_gain`."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,8 @@ class FrameOptimizer:
         """Share of what the images still hold against the best iterate that free base frames would explain [1].
 
         By the linear model, so it costs one more comparison and no run; see docs/calibration.md for what it is where
-        base frames are right and where they are wrong.
+        base frames are right and where they are wrong. Pixels that are ignored, on a proposal too, do not count.
+        Several cameras count together, so a single one with a wrong pose shows less.
 
         Returns:
             None before the end, where base frames are free already, or for losses that cannot say.

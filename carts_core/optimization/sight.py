@@ -25,9 +25,10 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 _WARM_STEPS, _WARM_TOLERANCE = 3, 1e-2
 """As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
 
-_OVERSHOOT = 0.5
-"""How much further than it came a warm look says it is [1]. It is a single one, and what the network sees leans towards
-where it is told the arms are; see `surface_objective`, which overshoots between looks."""
+OVERSHOOT = 0.5
+"""Share by which the correction that a warm look finds is lengthened, away from where the look started [1]. It is a
+single look, and what the network sees leans towards where it is told that the arms are. (Where there are several looks,
+`surface_objective` exaggerates what the network is told instead.)"""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Sight:
     correction: Float[np.ndarray, " n"]
     """Best for image and prior together [rad]."""
     information: Information
-    """Of the image alone, linearized there."""
+    """Of the image alone, linearized there; exaggerated if it comes from a warm look."""
     loss: float
     iterations: int
 
@@ -67,10 +68,11 @@ class Eye:
         )
 
     def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
-        """Find the correction near `start` [n]."""
+        """Find the correction near `start` [n]; what it says of it is exaggerated by `OVERSHOOT`."""
         parameters.prior = _prior(expected, parameters)
+        start = _double(parameters.clamp(torch.from_numpy(start).to(parameters.lower)))
         end = _descend(self._objective(frame, parameters, self._fine), parameters, self._fine, start)
-        return replace(end, information=end.information.further_from(start, _OVERSHOOT))
+        return replace(end, information=end.information.further_from(start, OVERSHOOT))
 
     def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
         """Find the correction from the measured values on, coarse to fine."""

@@ -141,8 +141,9 @@ class SurfaceObjective:
     def promised(self, offsets: Float[Tensor, " n"], wider: ParameterVector) -> float:
         """Share of what the image still holds against a state that more unknowns would explain, by the linear model.
 
-        What the present unknowns alone would still explain does not count. Compared is what the last look saw, under
-        the finest blur of the first one: a linear model reaches about as far as the blur.
+        What the present unknowns alone would still explain does not count, and a joint at its limit stays there.
+        Compared is what the last look saw, under a blur as at the end of the coarse stages: a linear model reaches
+        about as far as the blur.
 
         Args:
             offsets: of the present unknowns.
@@ -159,8 +160,10 @@ class SurfaceObjective:
         gradient, curvature = compared.gradient.double(), compared.curvature.double()
         slope = prior.gradient(point).double() + gradient
         stiffness = prior.precision.double() + curvature
+        held = ((point <= wider.lower) & (slope > 0)) | ((point >= wider.upper) & (slope < 0))
         explained = []
-        for free in (list(range(len(wider))), own):
+        for unknowns in (range(len(wider)), own):
+            free = [index for index in unknowns if not held[index]]
             step = torch.zeros_like(slope)
             step[free] = torch.linalg.solve(stiffness[free][:, free], -slope[free])
             explained.append(-float(gradient @ step + 0.5 * step @ curvature @ step))

@@ -150,9 +150,9 @@ def rasterize(
         faces: vertex indices.
         intrinsics: fx, fy, cx, cy [px].
         width, height: size of the image [px].
-        surfaces: index of the closed surface that a triangle is part of, -1 for none (the default). Seen from outside,
-            its corners go round counterclockwise. Unless the near plane opens it before the camera's eyes, its front
-            hides its back, which is then skipped; that changes nothing and takes about half as long.
+        surfaces: of each triangle, the index of the closed surface that it is part of, -1 for none (the default). Seen
+            from outside, its corners go round counterclockwise. As long as the near plane does not cut a surface open
+            within the image, its front hides its back. The back is then skipped: the result is the same, in less time.
 
     Returns:
         `face_ids` (int32, `BACKGROUND` where nothing is seen) and `inverse_depth` (float32, [1/m], 0 there).

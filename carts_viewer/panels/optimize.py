@@ -101,8 +101,8 @@ def calibration_line(state: ViewState) -> str:
         return ""
     return (
         '<p class="carts-caption">Base frames or the camera\'s pose look wrong: free base frames would take '
-        f"{100 * gain:.0f} % off the rest of the loss. Tick <b>Base frames</b> under Free parameters and run again, or "
-        "use <code>carts calibrate</code>.</p>"
+        f"{100 * gain:.0f} % off what is left of the difference. Tick <b>Base frames</b> under Free parameters and "
+        "run again, or use <code>carts calibrate</code>.</p>"
     )
 
 

@@ -111,5 +111,7 @@ def test_further_from_a_start_is_further_where_something_is_known_and_nothing_el
     assert further.precision is seen.precision
     step, longer = (np.linalg.pinv(one.precision) @ (one.vector - one.precision @ start) for one in (seen, further))
     np.testing.assert_allclose(longer, 1.5 * step, rtol=1e-6)
+    unseen = np.linalg.svd(seen.precision)[2][-1]
+    assert abs(unseen @ further.vector) < 1e-9 * np.abs(further.vector).max()
     agreeing = Information(seen.precision, seen.precision @ start)
     np.testing.assert_allclose(agreeing.further_from(start, 0.5).vector, agreeing.vector)

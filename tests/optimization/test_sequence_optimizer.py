@@ -245,7 +245,7 @@ def test_a_warm_look_is_taken_to_have_come_less_than_all_the_way(
     start = {ARM: (frame.truth or {})[ARM]}
     found = {}
     for overshoot in (0.0, 0.5):
-        monkeypatch.setattr(sight, "_OVERSHOOT", overshoot)
+        monkeypatch.setattr(sight, "OVERSHOOT", overshoot)
         parameters = ParameterVector(scene, scene.state(start), FreeParameters(), settings.lever)
         eye = Eye(scene, sights, settings, 4.0, lambda _: {})  # pyright: ignore[reportArgumentType]
         expected = Gaussian(told, np.eye(len(parameters)) * np.deg2rad(1.5) ** 2)

@@ -174,7 +174,7 @@ def test_a_base_frame_that_joints_cannot_stand_in_for_is_suspected(sequence: Seq
     freed = run(wrong, replace(held, base_frames=True))
     assert freed.base_frame_gain() is None, "they are free already"
     assert suspected.best is not None and freed.best is not None
-    assert freed.best.loss < 0.5 * suspected.best.loss, "the linear model promised no more than there was"
+    assert freed.best.loss < 0.5 * suspected.best.loss, "freeing them more than halves it indeed"
 
 
 def test_joints_that_explain_the_image_leave_base_frames_unsuspected(

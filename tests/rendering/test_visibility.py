@@ -5,10 +5,13 @@ import pytest
 import torch
 import trimesh
 
+from carts_core.data import Sequence
 from carts_core.meshes import LinkMesh, is_closed
 from carts_core.rendering import visibility, visibility_torch
+from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
 from carts_core.rendering.reference import visibility_ref
 from carts_core.rendering.visibility_numba import rasterize
+from carts_core.resources import sample_sequence
 
 INTRINSICS = (30.0, 34.0, 17.3, 11.8)
 WIDTH, HEIGHT = 36, 24
@@ -113,12 +116,31 @@ def test_backs_are_skipped_where_a_surface_is_said_to_be_closed() -> None:
         assert (ids >= 0).any() == seen
 
 
-@pytest.mark.parametrize(("change", "closed"), [("none", True), ("hole", False), ("inside out", False)])
+@pytest.mark.parametrize(
+    ("change", "closed"), [("none", True), ("hole", False), ("inside out", False), ("one part inside out", False)]
+)
 def test_what_counts_as_closed(change: str, closed: bool) -> None:
-    ball = trimesh.graph.smooth_shade(trimesh.creation.box(), angle=0.5)
+    box, small = trimesh.creation.box(), trimesh.creation.box((0.1, 0.1, 0.1))
+    small.apply_translation([2.0, 0.0, 0.0])
     if change == "inside out":
-        ball.invert()
-    faces = np.array(ball.faces)[int(change == "hole") :]
-    mesh = LinkMesh(0, np.array(ball.vertices), np.array(ball.vertex_normals), faces, np.ones(3))
-    assert len(mesh.vertices) == 24
+        box.invert()
+    if change == "one part inside out":
+        small.invert()
+    body = trimesh.graph.smooth_shade(trimesh.util.concatenate([box, small]), angle=0.5)
+    faces = np.array(body.faces)[int(change == "hole") :]
+    mesh = LinkMesh(0, np.array(body.vertices), np.array(body.vertex_normals), faces, np.ones(3))
+    assert len(mesh.vertices) == 48
     assert is_closed(mesh) == closed
+
+
+def test_the_shipped_arms_look_the_same_without_their_backs() -> None:
+    sequence = Sequence.open(sample_sequence())
+    geometry = SceneGeometry.of(sequence.scene)
+    surfaces = geometry.face_surfaces.numpy()
+    assert (surfaces >= 0).all()
+    for index in (0, 12):
+        state = sequence.scene.state(sequence.frame(index).measured)
+        vertices = vertices_in_camera(geometry, link_transforms(sequence.scene, state)[0]).T.numpy()
+        view = (vertices, geometry.faces.numpy(), state.intrinsics[0].tolist(), 640, 480)
+        for fronts, every in zip(rasterize(*view, surfaces), rasterize(*view), strict=True):
+            np.testing.assert_array_equal(fronts, every)

@@ -6,7 +6,7 @@ from viewer_canvas import decoded
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.optimization import FreeParameters
+from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.project import Source
 from carts_viewer import intents as ask
 from carts_viewer.layers import Layer
@@ -86,6 +86,28 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     assert state.run.curves.loss[state.run.curves.best] == state.maps.iterate.loss
     assert state.pose.source is Source.OPTIMIZER
     assert desk.saved.joints(0)["PSM1"].joint_positions == tuple(state.pose.scene.joint_positions[0].tolist())
+
+
+@pytest.mark.parametrize(
+    "intent",
+    [
+        ask.SetJoint("PSM1", 0, 0.1),
+        ask.MoveFrame(1),
+        ask.SetSetting("iterations", 9),
+        ask.ShowDomain("smoke"),
+        ask.SetFreeGroup("base_frames", True),
+        ask.Run(),
+    ],
+)
+def test_a_suspicion_against_base_frames_lasts_until_something_changes(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: ask.Intent
+) -> None:
+    monkeypatch.setattr(FrameOptimizer, "base_frame_gain", lambda self: 0.4)
+    desk.do(ask.Run())
+    desk.controller.advance()
+    assert desk.state.run.base_frame_gain is None
+    assert desk.finish().run.base_frame_gain == 0.4
+    assert desk.do(intent).run.base_frame_gain is None
 
 
 def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:

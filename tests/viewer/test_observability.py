@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.optimization.observability import Uncertainty
 from carts_viewer.panels.optimize import calibration_line, observability_lines
 from carts_viewer.state import Maps, Phase, RunState
@@ -28,7 +29,7 @@ def test_nothing_is_said_while_running_or_by_losses_that_cannot_say() -> None:
     assert observability_lines(_state(None, Phase.IDLE)) == ""  # pyright: ignore
 
 
-def test_base_frames_are_suspected_from_a_share_on_that_joints_leave_rarely() -> None:
-    for gain, said in ((None, False), (0.05, False), (0.31, True)):
+def test_base_frames_are_named_only_above_the_threshold() -> None:
+    for gain, said in ((None, False), (BASE_FRAME_GAIN - 0.01, False), (BASE_FRAME_GAIN + 0.01, True)):
         line = calibration_line(SimpleNamespace(run=RunState(base_frame_gain=gain)))  # pyright: ignore
-        assert ("31 %" in line) == said and bool(line) == said
+        assert ("13 %" in line) == said and bool(line) == said
