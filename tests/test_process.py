@@ -38,7 +38,7 @@ def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
     # Untuned, glibc asks for anything from none to all of it anew, as the heap happens to end; this has it ask for all.
     anew = page_faults("", MALLOC_MMAP_THRESHOLD_="131072")
     assert anew > 500_000
-    assert page_faults(TUNED) < 0.05 * anew
+    assert page_faults(TUNED) < 0.01 * anew
 
 
 @pytest.mark.parametrize(("given", "expected"), [({"OMP_NUM_THREADS": "2"}, 2), ({}, None)])
