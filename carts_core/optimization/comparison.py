@@ -13,11 +13,9 @@ from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .inputs import kernel_radius, smoothed
+from .parameters import STEP
 from .settings import OptimizerSettings
 from .window import Window
-
-STEP = 1e-3
-"""Distance of an unknown's two neighbouring states from its value [rad]."""
 
 _FACTORS = (1, 2, 4, 8)
 """How many times smaller than the compared images those of a stage can be."""

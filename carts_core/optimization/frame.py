@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from .edges import EdgeRefinement
 from .evaluation import Evaluation, Objective
 from .feature_objective import FeatureObjective
 from .ignore import propose_ignore
@@ -147,6 +148,7 @@ class FrameOptimizer:
         self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
         self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._restart = Restart(self.settings, objective, self._solver)
+        self._ended: str | None = None
         self.stop_reason: str | None = None
 
     def cancel(self) -> None:
@@ -161,6 +163,8 @@ class FrameOptimizer:
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
+        if self._ended is not None:
+            return self._draw_to_edges(began)
         index, offsets, solver = len(self.history), self._offsets, self._solver
         stage = solver.stage
         epoch = self._round, self._restart.done, self._objective.epoch(stage)
@@ -170,11 +174,32 @@ class FrameOptimizer:
         iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
-            self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
+            self.best, self._best_offsets, self._best_evaluation, self._epoch = iterate, offsets, evaluation, epoch
         self._offsets = self._restart(stage, self._offsets, self.best.loss)
         self.stop_reason = solver.finished
         if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
+        if (
+            self.stop_reason is not None
+            and self.settings.draws_to_edges
+            and len(self.history) < self.settings.iterations
+        ):
+            self._ended, self.stop_reason = self.stop_reason, None
+        return iterate
+
+    def _draw_to_edges(self, began: float) -> Iterate:
+        """The last iterate: the best one with its outlines on the edges of the image."""
+        refinement = EdgeRefinement(
+            self._scene, self._images, self._parameters, self.settings, self._ignored(), self._extractor.device
+        )
+        known = self._best_evaluation
+        offsets = self._best_offsets = refinement(self._best_offsets, known)
+        evaluation = self._objective(offsets, self._objective.stages - 1, gradient=False)
+        # What edges say has no deviation of its own.
+        evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)
+        iterate = self._iterate(len(self.history), offsets, evaluation, time.perf_counter() - began)
+        self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
+        self.best, self.stop_reason = iterate, self._ended
         return iterate
 
     def base_frame_gain(self) -> float | None:
@@ -202,8 +227,12 @@ class FrameOptimizer:
         self.proposed = propose_ignore(self._scene, self.best.silhouette, self.best.similarity)
         if self.proposed:
             self._round = 1
-            masks = {name: mask | self._given.get(name, False) for name, mask in self.proposed.items()}
-            self._begin(self._surface({**self._given, **masks}))
+            self._begin(self._surface(self._ignored()))
+
+    def _ignored(self) -> dict[str, Bool[np.ndarray, "h w"]]:
+        """Camera name -> pixels that are left out, given and proposed ones."""
+        masks = {name: mask | self._given.get(name, False) for name, mask in self.proposed.items()}
+        return {**self._given, **masks}
 
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""

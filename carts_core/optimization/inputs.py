@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
@@ -37,6 +37,28 @@ def stacked_images(
             )
         resized.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def pixel_weights(
+    scene: Scene, ignore: Mapping[str, Bool[np.ndarray, "h w"]], size: tuple[int, int]
+) -> Float[Tensor, "cameras 1 h w"]:
+    """0 where an occluder is known to be, 1 elsewhere, at a size (width, height) [px].
+
+    Raises:
+        SettingsError: a mask is of another size than its camera.
+    """
+    weight = np.ones((len(scene.cameras), 1, size[1], size[0]), np.float32)
+    for index, camera in enumerate(scene.cameras):
+        mask = ignore.get(camera.name)
+        if mask is None:
+            continue
+        if mask.shape != (camera.height, camera.width):
+            raise SettingsError(
+                f"the ignore mask of camera {camera.name!r} has shape {mask.shape}, but its camera says "
+                f"({camera.height}, {camera.width})."
+            )
+        weight[index, 0] = 1.0 - cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(weight)
 
 
 def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:

@@ -16,6 +16,9 @@ from ..scene import Scene, SceneState
 from .prior import Prior
 from .settings import FreeParameters
 
+STEP = 1e-3
+"""Distance of an unknown's two neighbouring states from its value [rad]."""
+
 _FOCAL_SCALE = 1.0
 """One unit of a focal unknown is a factor of e; a principal point moves by the focal length."""
 
@@ -215,6 +218,11 @@ class ParameterVector:
             else:
                 intrinsics = _update(intrinsics, block.index, lambda K, s=part: _scaled_intrinsics(K, s), matrix=False)
         return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics)
+
+    def neighbours(self, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
+        """Batches of states `STEP` below and above, one unknown each."""
+        step = STEP * torch.eye(len(offsets), device=offsets.device)
+        return self.state(offsets - step), self.state(offsets + step)
 
     def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
         rotation = roma.rotvec_to_rotmat(step[..., :3])

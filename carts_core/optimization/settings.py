@@ -43,7 +43,7 @@ class OptimizerSettings:
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
     blurs: tuple[float, ...] = (8.0, 3.0, 1.6, 0.8)
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
-    looks: int = 4
+    looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     zoom: float = 1.5
     """`surface`: how many times larger than the working image the compared images are, up to the camera's image [1]."""
@@ -65,6 +65,11 @@ class OptimizerSettings:
     """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05
     """`surface`: weight of normals beside that [1]."""
+    edge_steps: int = 8
+    """`gauss_newton`: largest number of steps that draw outlines to edges of the image, as a last iterate; 0 for none.
+    """
+    edge_weight: float = 0.3
+    """`gauss_newton`: weight of a squared distance from an edge, per pixel of the outline [1/px^2]."""
     prior_deg: float = 3.0
     """`surface`: expected error of a joint position at the start [deg]; `lever` turns it into metres."""
     frame_prior_deg: float = 0.5
@@ -115,6 +120,8 @@ class OptimizerSettings:
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
         _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
         _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
+        _require(0 <= self.edge_steps <= 1000, "edge_steps", self.edge_steps, "0 to 1000")
+        _require(0 <= self.edge_weight <= 100, "edge_weight", self.edge_weight, "0 to 100")
         _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
         _require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
         _require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
@@ -144,6 +151,11 @@ class OptimizerSettings:
     def needs_background(self) -> bool:
         """Whether the loss compares images, which takes the mean background."""
         return self.loss != "surface"
+
+    @property
+    def draws_to_edges(self) -> bool:
+        """Whether outlines are drawn to edges at the end."""
+        return self.solver == "gauss_newton" and self.edge_steps > 0 and self.edge_weight > 0
 
     def with_loss(self, loss: Loss) -> "OptimizerSettings":
         """These settings for another loss, with a solver that can descend it.

@@ -7,21 +7,19 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 
 from collections.abc import Mapping
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..losses import attention
 from ..rendering import Renderer
-from ..scene import Scene, SceneState
+from ..scene import Scene
 from ..surface import COVERAGE
-from .comparison import STEP, Stage
+from .comparison import Stage
 from .evaluation import Evaluation
-from .inputs import stacked_images, working_size
+from .inputs import pixel_weights, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
@@ -103,7 +101,7 @@ class SurfaceObjective:
         self._zoom = self._size[0] / working_size(scene, settings.working_width, extractor.stride)[0]
         device = extractor.device
         self._images = stacked_images(scene, images, self._size, "image").to(device)
-        self._weight = _weights(scene, ignore or {}, self._size).to(device)
+        self._weight = pixel_weights(scene, ignore or {}, self._size).to(device)
         self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._look, self._belief = -1, torch.empty(0)
@@ -154,7 +152,7 @@ class SurfaceObjective:
         point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(own, device=offsets.device), offsets)
         blur = settings.blurs[: max(len(settings.blurs) - _FINE, 1)][-1]
         stage = Stage(self.scene, self._size, self._zoom, self._window, *self._seen, blur, settings)
-        compared = stage.compare(wider.state(point), _neighbours(wider, point))
+        compared = stage.compare(wider.state(point), wider.neighbours(point))
         assert compared.gradient is not None and compared.curvature is not None
         prior = wider.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         gradient, curvature = compared.gradient.double(), compared.curvature.double()
@@ -225,7 +223,7 @@ class SurfaceObjective:
 
     def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)
-        neighbours = _neighbours(self.parameters, offsets) if gradient else None
+        neighbours = self.parameters.neighbours(offsets) if gradient else None
         compared = stage.compare(state, neighbours)
         shown = self._stages[-1] if self._live else stage
         final = compared if stage is shown else shown.compare(state, None)
@@ -259,27 +257,3 @@ class SurfaceObjective:
             similarity=paste(final.similarity, torch.ones_like(empty)),
             attention=paste(final.trust, empty),
         )
-
-
-def _weights(
-    scene: Scene, ignore: Mapping[str, Bool[np.ndarray, "h w"]], size: tuple[int, int]
-) -> Float[Tensor, "cameras 1 h w"]:
-    """0 where an occluder is known to be, 1 elsewhere."""
-    weight = np.ones((len(scene.cameras), 1, size[1], size[0]), np.float32)
-    for index, camera in enumerate(scene.cameras):
-        mask = ignore.get(camera.name)
-        if mask is None:
-            continue
-        if mask.shape != (camera.height, camera.width):
-            raise SettingsError(
-                f"the ignore mask of camera {camera.name!r} has shape {mask.shape}, but its camera says "
-                f"({camera.height}, {camera.width})."
-            )
-        weight[index, 0] = 1.0 - cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(weight)
-
-
-def _neighbours(parameters: ParameterVector, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
-    """Batches of states a little below and above, one unknown each."""
-    step = STEP * torch.eye(len(offsets), device=offsets.device)
-    return parameters.state(offsets - step), parameters.state(offsets + step)

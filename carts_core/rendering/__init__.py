@@ -1,5 +1,6 @@
 """Differentiable rendering: hard visibility, sparse shading, silhouette gradient."""
 
+from .outline import Outline as Outline
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
 from .surface import JacobianBlock as JacobianBlock
@@ -8,4 +9,13 @@ from .surface import Tangents as Tangents
 from .visibility_numba import visibility_numba as visibility
 from .visibility_torch import visibility_torch as visibility_torch
 
-__all__ = ["JacobianBlock", "Renderer", "Rendering", "SurfaceRendering", "Tangents", "visibility", "visibility_torch"]
+__all__ = [
+    "JacobianBlock",
+    "Outline",
+    "Renderer",
+    "Rendering",
+    "SurfaceRendering",
+    "Tangents",
+    "visibility",
+    "visibility_torch",
+]

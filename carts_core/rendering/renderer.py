@@ -11,6 +11,7 @@ from torch import Tensor
 from ..scene import Scene, SceneState
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .motion import carry_motion
+from .outline import Outline, normal_motion, outline_pixels, outline_position
 from .points import visible_points
 from .shading import phong
 from .surface import SurfaceRendering, Tangents, surface_maps
@@ -137,6 +138,22 @@ class Renderer:
         parts = self.geometry.face_parts[points.face]
         colors = self.geometry.face_colors.index_select(1, points.face)
         return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents, margin)
+
+    @torch.no_grad()
+    def outline(self, state: SceneState, tangents: Tangents) -> Outline:
+        """The outlines of one state (no batch), and how they move with the unknowns."""
+        Ts, intrinsics = self._views(state)
+        face_ids, inverse_depth = self._visibility(Ts, intrinsics)
+        rim = torch.where(outline_pixels(inverse_depth), face_ids, -1)
+        points = visible_points(self.geometry, rim, inverse_depth, Ts, intrinsics)
+        position, normal = outline_position(inverse_depth, points.pixel)
+        return Outline(
+            points.pixel // (self.height * self.width),
+            position,
+            normal,
+            self.geometry.face_parts[points.face],
+            normal_motion(points, normal, Ts, intrinsics, tangents),
+        )
 
     @torch.no_grad()
     def tangents(self, low: SceneState, high: SceneState, distance: float) -> Tangents:

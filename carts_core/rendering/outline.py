@@ -1,0 +1,128 @@
+"""Where what is visible ends against something further away, to a fraction of a pixel, and how that moves with the state.
+
+Where a smooth surface turns away from the camera, its outline moves with the surface along the outline's normal; so the
+motion of the surface point that is seen there is all that is needed.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from .points import VisiblePoints
+from .surface import Tangents
+
+_BEHIND = 0.01
+"""How much further away what is beside an outline is at least, as a share [1]. With less, folds of a surface count."""
+
+_BLUR = 1.5
+"""Deviation of the blur that gives outlines their normals [px]."""
+
+BORDER = 6
+"""Outlines nearer than this to the border of the image are left out; their normals are not known there [px]."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Pixels along the outlines of arms and of their parts, in all cameras."""
+
+    camera: Int[Tensor, " K"]
+    position: Float[Tensor, "2 K"]
+    """Where the outline is, x and y; the centre of the first pixel is (0, 0) [px]."""
+    normal: Float[Tensor, "2 K"]
+    """Unit vectors, outwards."""
+    parts: Int[Tensor, " K"]
+    """Index into `carts_core.parts.PARTS`."""
+    motion: Float[Tensor, "unknowns K"]
+    """Along the normal [px per unit of each unknown]."""
+
+
+def outline_pixels(inverse_depth: Float[Tensor, "cameras height width"]) -> Bool[Tensor, "cameras height width"]:
+    """Pixels with something much further away beside, above or below them, but for those at the border.
+
+    Args:
+        inverse_depth: 1 / depth [1/m], 0 for background.
+    """
+    least = (1.0 - _BEHIND) * inverse_depth[:, 1:-1, 1:-1]
+    around = (
+        inverse_depth[:, :-2, 1:-1],
+        inverse_depth[:, 2:, 1:-1],
+        inverse_depth[:, 1:-1, :-2],
+        inverse_depth[:, 1:-1, 2:],
+    )
+    rim = torch.zeros_like(least, dtype=torch.bool)
+    for neighbour in around:
+        rim |= neighbour < least
+    rim = functional.pad(rim, (1, 1, 1, 1))
+    rim[:, :BORDER] = rim[:, -BORDER:] = False
+    rim[:, :, :BORDER] = rim[:, :, -BORDER:] = False
+    return rim
+
+
+def outline_position(
+    inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
+) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
+    """Where the outline is at its pixels, and its normal, away from what is nearer.
+
+    Args:
+        inverse_depth: 1 / depth [1/m], 0 for background.
+        pixel: of the outlines, as indices into the flattened images.
+    """
+    height, width = inverse_depth.shape[1:]
+    radius, kernels = _kernels(inverse_depth.device)
+    reach = torch.arange(-radius, radius + 1, device=pixel.device)
+    around = (reach[:, None] * width + reach).flatten()
+    near = inverse_depth.flatten()
+    soft, right, down = kernels @ (near[pixel + around[:, None]] >= (1.0 - _BEHIND) * near[pixel]).float()
+    slope = torch.stack([-right, -down])
+    steepness = torch.linalg.vector_norm(slope, dim=0).clamp(min=1e-6)
+    normal = slope / steepness
+    # The outline is where the blurred silhouette is one half; near a thin tip that is nowhere.
+    centre = torch.stack([pixel % width, pixel // width % height])
+    return centre + ((soft - 0.5) / steepness).clamp(-1.0, 1.0) * normal, normal
+
+
+def normal_motion(
+    points: VisiblePoints,
+    normal: Float[Tensor, "2 K"],
+    Ts_camera_link: Float[Tensor, "cameras links 4 4"],
+    intrinsics: Float[Tensor, "cameras 4"],
+    tangents: Tangents,
+) -> Float[Tensor, "unknowns K"]:
+    """How fast points move along a direction in the image [px per unit of each unknown].
+
+    Args:
+        points: what is seen there.
+        normal: the direction.
+        Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
+        tangents: derivatives of both by the unknowns.
+    """
+    counts = torch.tensor([count for *_, count in points.groups], device=normal.device)
+    runs = torch.arange(len(points.groups), device=normal.device).repeat_interleave(counts)
+    view, link = torch.tensor([run[:2] for run in points.groups], device=normal.device).reshape(-1, 2)[runs].T
+    T, K = Ts_camera_link[view, link], intrinsics[view].T
+    point = points.point_link
+    X, Y, Z = (T[:, :3, :3] @ point.T[..., None])[..., 0].T + T[:, :3, 3].T
+    ray = torch.stack([X / Z, Y / Z])
+    # By the position in the camera's frame, and from it by the link's pose, row by row.
+    slope = normal * K[:2] / Z
+    slope = torch.cat([slope, -(slope * ray).sum(0, keepdim=True)])
+    by_pose = slope[:, None] * torch.cat([point, torch.ones_like(point[:1])])
+    by_intrinsics = torch.cat([normal * ray, normal])
+    pose = tangents.Ts_camera_link[:, view, link, :3].flatten(2)
+    return (pose * by_pose.flatten(0, 1).T).sum(-1) + (tangents.intrinsics[:, view] * by_intrinsics.T).sum(-1)
+
+
+@lru_cache(maxsize=4)
+def _kernels(device: torch.device) -> tuple[int, Float[Tensor, "3 n"]]:
+    """Radius and weights of a Gaussian and of its derivatives, right and down."""
+    radius = BORDER - 1
+    steps = torch.arange(-radius, radius + 1, device=device, dtype=torch.float32)
+    bell = torch.exp(-0.5 * (steps / _BLUR).square())
+    bell = bell / bell.sum()
+    tilt = bell * steps / _BLUR**2
+    planes = (torch.outer(bell, bell), torch.outer(bell, tilt), torch.outer(tilt, bell))
+    return radius, torch.stack([plane.flatten() for plane in planes])
