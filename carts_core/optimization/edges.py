@@ -7,6 +7,7 @@ pulling, and what the network saw goes on counting.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from torch.nn import functional
 
 from ..rendering import Outline, Renderer
 from ..scene import Scene
-from .evaluation import Evaluation
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
 from .parameters import STEP, ParameterVector
 from .settings import OptimizerSettings
@@ -29,6 +29,9 @@ _REACH, _SAMPLING = 4.0, 0.5
 
 _LIKELY = 3.0
 """Deviation of how far from the outline the right edge is expected [px]."""
+
+_NEAR = 8
+"""How near an outline the network has to see an arm [px]."""
 
 _ROBUST = 1.5
 """Distance beyond which an edge is not believed [px]."""
@@ -43,6 +46,17 @@ _STILL = 0.03
 """Outlines that move by no more than this have arrived [px]."""
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """Outlines on edges."""
+
+    offsets: Float[Tensor, " n"]
+    gradient: Float[Tensor, " n"]
+    """Of what edges say there, by the linear model."""
+    curvature: Float[Tensor, "n n"]
+    """The same."""
+
+
 class EdgeRefinement:
     """Draws outlines to edges.
 
@@ -52,7 +66,7 @@ class EdgeRefinement:
         parameters: the unknowns.
         settings: how many steps, and how much edges count.
         ignore: camera name -> pixels that show an occluder.
-        device: where to compute.
+        seen: coverage of arms as the network saw it, of the whole image at any size; edges elsewhere are not theirs.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -65,14 +79,16 @@ class EdgeRefinement:
         parameters: ParameterVector,
         settings: OptimizerSettings,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]],
-        device: torch.device,
+        seen: Float[Tensor, "cameras rows columns"],
     ) -> None:
-        self._parameters, self._settings = parameters, settings
+        self._parameters, self._settings, device = parameters, settings, seen.device
         size = working_size(scene, round(settings.working_width * _ZOOM), 1)
         stacked = stacked_images(scene, images, size, "image").to(device)
         down, right = torch.gradient(smoothed(stacked, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
-        self._weight = pixel_weights(scene, ignore, size).to(device)
+        near = functional.interpolate(seen[:, None], size[::-1], mode="bilinear").clamp(0.0, 1.0)
+        near = functional.max_pool2d(near, 2 * _NEAR + 1, stride=1, padding=_NEAR)
+        self._weight = near * pixel_weights(scene, ignore, size).to(device)
         self._renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
@@ -80,26 +96,30 @@ class EdgeRefinement:
         self._share = torch.tensor(_SHARE, device=device)
 
     @torch.no_grad()
-    def __call__(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Float[Tensor, " n"]:
-        """Offsets near the given ones at which outlines are on edges, as far as what else is known agrees.
+    def __call__(
+        self, offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"]
+    ) -> Drawn:
+        """Draw the outlines to edges, as far as what else is known agrees.
 
         Args:
             offsets: where to begin.
-            evaluation: there, with a gradient and a curvature; they stand for all that is known but for edges.
+            gradient, curvature: of the objective there; they stand for all that is known but for edges.
         """
-        assert evaluation.curvature is not None
-        origin = offsets
+        origin, step = offsets, torch.zeros_like(offsets)
+        slope, stiffness = torch.zeros_like(gradient), torch.zeros_like(curvature)
         tangents = self._renderer.tangents(*self._parameters.neighbours(origin), 2 * STEP)
         for _ in range(self._settings.edge_steps):
             outline = self._renderer.outline(self._parameters.state(offsets), tangents)
-            gradient, curvature = self.equations(outline)
-            slope = evaluation.gradient + evaluation.curvature @ (offsets - origin) + gradient
-            step = torch.linalg.solve((evaluation.curvature + curvature).double(), -slope.double()).to(offsets)
-            before, offsets = offsets, self._parameters.clamp(offsets + step)
-            moved = (offsets - before) @ outline.motion
+            slope, stiffness = self.equations(outline)
+            total = gradient + curvature @ (offsets - origin) + slope
+            before = offsets
+            change = torch.linalg.solve((curvature + stiffness).double(), -total.double())
+            offsets = self._parameters.clamp(before + change.to(before))
+            step = offsets - before
+            moved = step @ outline.motion
             if not len(moved) or float(moved.abs().max()) < _STILL:
                 break
-        return offsets
+        return Drawn(offsets, slope + stiffness @ step, stiffness)
 
     def equations(self, outline: Outline) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
         """Gradient and curvature of half the weighted squared distances of outlines to edges."""

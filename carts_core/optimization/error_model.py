@@ -45,9 +45,9 @@ class Information:
         precision = np.where(known, _EXACT, 0.0)
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
-    def further_from(self, start: Float[np.ndarray, " n"], share: float) -> "Information":
-        """The same, with the correction that it speaks for moved away from `start` by `share` of their distance."""
-        return Information(self.precision, self.vector + share * (self.vector - self.precision @ start))
+    def scaled(self, share: float) -> "Information":
+        """The same, believed less."""
+        return Information(share * self.precision, share * self.vector)
 
     def surprise(self, expected: Gaussian) -> float:
         """Squared distance from what was expected, in standard deviations, mean over the unknowns [1]; about 1."""

@@ -174,27 +174,28 @@ class FrameOptimizer:
         iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
-            self.best, self._best_offsets, self._best_evaluation, self._epoch = iterate, offsets, evaluation, epoch
+            self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
+            self._known = evaluation, stage
         self._offsets = self._restart(stage, self._offsets, self.best.loss)
         self.stop_reason = solver.finished
         if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
-        if (
-            self.stop_reason is not None
-            and self.settings.draws_to_edges
-            and len(self.history) < self.settings.iterations
-        ):
+        if self.settings.draws_to_edges and len(self.history) < self.settings.iterations:
             self._ended, self.stop_reason = self.stop_reason, None
         return iterate
 
     def _draw_to_edges(self, began: float) -> Iterate:
         """The last iterate: the best one with its outlines on the edges of the image."""
-        refinement = EdgeRefinement(
-            self._scene, self._images, self._parameters, self.settings, self._ignored(), self._extractor.device
-        )
-        known = self._best_evaluation
-        offsets = self._best_offsets = refinement(self._best_offsets, known)
-        evaluation = self._objective(offsets, self._objective.stages - 1, gradient=False)
+        assert isinstance(self._objective, SurfaceObjective)
+        seen = self._objective.seen()
+        refinement = EdgeRefinement(self._scene, self._images, self._parameters, self.settings, self._ignored(), seen)
+        last = self._objective.stages - 1
+        known, stage = self._known
+        if stage != last:
+            known = self._objective(self._best_offsets, last, gradient=True)
+        assert known.curvature is not None
+        offsets = self._best_offsets = refinement(self._best_offsets, known.gradient, known.curvature).offsets
+        evaluation = self._objective(offsets, last, gradient=False)
         # What edges say has no deviation of its own.
         evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)
         iterate = self._iterate(len(self.history), offsets, evaluation, time.perf_counter() - began)

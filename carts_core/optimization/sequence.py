@@ -28,9 +28,8 @@ Start = Literal["warm", "cold", "keyframe", "carried"]
 """Where a frame's values come from: an optimization from the neighbour's correction or from the measured values, a
 person, or the other frames alone, because the image contradicts them and is not to be believed."""
 
-_SURPRISE = 20.0
-"""A correction three deviations off what was expected, on average, contradicts it: nine, times 1.5 squared, for a warm
-look says half as much again as it found (`sight.OVERSHOOT`)."""
+_SURPRISE = 9.0
+"""A correction three deviations off what was expected, on average, contradicts it."""
 
 
 @dataclass(frozen=True)

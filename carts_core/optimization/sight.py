@@ -11,6 +11,7 @@ from torch import Tensor
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene
+from .edges import EdgeRefinement
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation, Objective
 from .parameters import ParameterVector
@@ -22,13 +23,8 @@ from .surface_objective import SurfaceObjective
 
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
-_WARM_STEPS, _WARM_TOLERANCE = 3, 1e-2
+_WARM_STEPS, _WARM_TOLERANCE = 2, 1e-2
 """As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
-
-OVERSHOOT = 0.5
-"""Share by which the correction that a warm look finds is lengthened, away from where the look started [1]. It is a
-single look, and what the network sees leans towards where it is told that the arms are. (Where there are several looks,
-`surface_objective` exaggerates what the network is told instead.)"""
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ class Sight:
     correction: Float[np.ndarray, " n"]
     """Best for image and prior together [rad]."""
     information: Information
-    """Of the image alone, linearized there; exaggerated if it comes from a warm look."""
+    """Of the image alone, linearized there, and believed as far as `sight_noise` allows."""
     loss: float
     iterations: int
 
@@ -50,7 +46,7 @@ class Eye:
         scene: with the cameras that take part.
         extractor: the networks.
         settings: of a cold start; a warm one has its finest blur, one look and few steps.
-        sight_noise: as `OptimizerSettings.noise`, for all but the search of a cold start.
+        sight_noise: as `OptimizerSettings.noise`, for what a frame tells others.
         ignore: position of a frame -> camera name -> pixels that show an occluder.
     """
 
@@ -58,21 +54,40 @@ class Eye:
         self, scene: Scene, extractor: FeatureExtractor, settings: OptimizerSettings, sight_noise: float, ignore: Ignore
     ) -> None:
         self._scene, self._extractor, self._coarse, self._ignore = scene, extractor, settings, ignore
+        self._share = (settings.noise / sight_noise) ** 2
         self._fine = replace(
             settings,
             blurs=settings.blurs[-1:],
             looks=1,
-            noise=sight_noise,
             stage_iterations=min(settings.stage_iterations, _WARM_STEPS),
             tolerance=max(settings.tolerance, _WARM_TOLERANCE),
         )
 
     def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
-        """Find the correction near `start` [n]; what it says of it is exaggerated by `OVERSHOOT`."""
+        """Find the correction near `start` [n]."""
         parameters.prior = _prior(expected, parameters)
         start = _double(parameters.clamp(torch.from_numpy(start).to(parameters.lower)))
-        end = _descend(self._objective(frame, parameters, self._fine), parameters, self._fine, start)
-        return replace(end, information=end.information.further_from(start, OVERSHOOT))
+        objective = self._objective(frame, parameters, self._fine)
+        end = _descend(objective, parameters, self._fine, start)
+        if self._fine.draws_to_edges:
+            end = self._drawn_to_edges(frame, parameters, end, objective.seen())
+        return replace(end, information=end.information.scaled(self._share))
+
+    def _drawn_to_edges(self, frame: Frame, parameters: ParameterVector, end: Sight, coverage: Tensor) -> Sight:
+        """What is seen, and what edges near it say."""
+        assert parameters.prior is not None
+        refinement = EdgeRefinement(
+            self._scene, frame.images, parameters, self._fine, self._ignore(frame.index), coverage
+        )
+        seen, offsets = end.information, torch.from_numpy(end.correction).to(parameters.lower)
+        slope = torch.from_numpy(seen.precision @ end.correction - seen.vector).to(offsets)
+        gradient = parameters.prior.gradient(offsets) + slope
+        curvature = parameters.prior.precision + torch.from_numpy(seen.precision).to(offsets)
+        drawn = refinement(offsets, gradient, curvature)
+        correction, precision = _double(drawn.offsets), _double(drawn.curvature)
+        vector = precision @ correction - _double(drawn.gradient)
+        information = Information(seen.precision + precision, seen.vector + vector)
+        return replace(end, correction=correction, information=information)
 
     def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
         """Find the correction from the measured values on, coarse to fine."""
@@ -88,7 +103,8 @@ class Eye:
         objective = self._objective(frame, parameters, self._fine)
         offsets = torch.from_numpy(correction).to(parameters.lower)
         evaluation = objective(offsets, objective.stages - 1, gradient=True)
-        return Sight(correction, _information(offsets, evaluation, parameters), evaluation.loss, 0)
+        information = _information(offsets, evaluation, parameters).scaled(self._share)
+        return Sight(correction, information, evaluation.loss, 0)
 
     def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
         ignore = self._ignore(frame.index)

@@ -135,6 +135,11 @@ class SurfaceObjective:
                 return True
         return False
 
+    def seen(self) -> Float[Tensor, "cameras h w"]:
+        """Where the last look saw arms: their coverage, in the whole compared image."""
+        width, height = self._size
+        return self._window.paste(self._coverage, self._coverage.new_zeros(len(self._coverage), height, width))
+
     @torch.no_grad()
     def promised(self, offsets: Float[Tensor, " n"], wider: ParameterVector) -> float:
         """Share of what the image still holds against a state that more unknowns would explain, by the linear model.

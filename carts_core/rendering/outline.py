@@ -1,4 +1,4 @@
-"""Where what is visible ends against something further away, to a fraction of a pixel, and how that moves with the state.
+"""Where what is seen ends against something further away, to a fraction of a pixel, and how that moves with the state.
 
 Where a smooth surface turns away from the camera, its outline moves with the surface along the outline's normal; so the
 motion of the surface point that is seen there is all that is needed.
@@ -100,9 +100,8 @@ def normal_motion(
         Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
         tangents: derivatives of both by the unknowns.
     """
-    counts = torch.tensor([count for *_, count in points.groups], device=normal.device)
-    runs = torch.arange(len(points.groups), device=normal.device).repeat_interleave(counts)
-    view, link = torch.tensor([run[:2] for run in points.groups], device=normal.device).reshape(-1, 2)[runs].T
+    groups = torch.tensor(points.groups, dtype=torch.long, device=normal.device).reshape(-1, 3)
+    view, link = groups[:, :2].repeat_interleave(groups[:, 2], dim=0).T
     T, K = Ts_camera_link[view, link], intrinsics[view].T
     point = points.point_link
     X, Y, Z = (T[:, :3, :3] @ point.T[..., None])[..., 0].T + T[:, :3, 3].T

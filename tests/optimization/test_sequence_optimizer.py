@@ -18,9 +18,8 @@ from carts_core.optimization import (
     OptimizerSettings,
     SequenceOptimizer,
     SequenceSettings,
-    sight,
 )
-from carts_core.optimization.error_model import Gaussian, combined
+from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.sight import Eye
 from carts_core.rendering import Renderer
@@ -235,21 +234,18 @@ def test_settings_out_of_range_are_named(name: str, value: object) -> None:
         SequenceSettings(**{name: value})  # pyright: ignore[reportArgumentType]
 
 
-def test_a_warm_look_is_taken_to_have_come_less_than_all_the_way(
-    sights: Sights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What it says is exaggerated, away from where it was told that the arms are."""
+def test_what_a_frame_tells_others_is_as_firm_as_sight_noise_says(sights: Sights) -> None:
     frame = sights.load(0)
     scene, settings = sights.sequence.scene, OptimizerSettings()
-    told = np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     start = {ARM: (frame.truth or {})[ARM]}
-    found = {}
-    for overshoot in (0.0, 0.5):
-        monkeypatch.setattr(sight, "OVERSHOOT", overshoot)
+    precisions, corrections = [], []
+    for noise in (settings.noise, 2 * settings.noise):
         parameters = ParameterVector(scene, scene.state(start), FreeParameters(), settings.lever)
-        eye = Eye(scene, sights, settings, 4.0, lambda _: {})  # pyright: ignore[reportArgumentType]
-        expected = Gaussian(told, np.eye(len(parameters)) * np.deg2rad(1.5) ** 2)
-        found[overshoot] = combined(expected, eye.warm(frame, parameters, expected, told).information).mean
-    assert np.abs(found[0.0][:2]).max() < 0.3 * np.deg2rad(0.2), "all the way to the truth, at 0"
-    # Half as far again: beyond the truth, where told and found lie on either side of it.
-    np.testing.assert_allclose(found[0.5][:2], -0.5 * told[:2], atol=0.3 * np.deg2rad(0.2))
+        eye = Eye(scene, sights, settings, noise, lambda _: {})  # pyright: ignore[reportArgumentType]
+        expected = Gaussian(np.zeros(len(parameters)), np.eye(len(parameters)) * np.deg2rad(1.5) ** 2)
+        seen = eye.warm(frame, parameters, expected, np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        precisions.append(seen.information.precision)
+        corrections.append(seen.correction)
+    np.testing.assert_allclose(corrections[0], corrections[1], atol=1e-6)
+    np.testing.assert_allclose(precisions[0], 4.0 * precisions[1], rtol=1e-3, atol=1e-3 * precisions[0].max())
+    assert np.abs(corrections[0][:2]).max() < 0.3 * np.deg2rad(0.2), "the truth is at 0"

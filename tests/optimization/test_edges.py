@@ -1,0 +1,129 @@
+"""Outlines drawn to edges: on images that a renderer made, and with the shipped networks on the shipped sequence."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from perfect_sight import PerfectSight
+
+from carts_core.data import Sequence
+from carts_core.errors import SettingsError
+from carts_core.evaluation import dice, start_positions
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.optimization.edges import Drawn, EdgeRefinement
+from carts_core.optimization.parameters import ParameterVector
+from carts_core.rendering import Renderer
+from carts_core.resources import sample_sequence
+
+ARM = "PSM1"
+OFF = np.deg2rad([0.3, -0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Yaw and pitch move the outlines by one to two pixels."""
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=640, height=480))
+
+
+def draw(sequence: Sequence, image: np.ndarray | None = None, **given) -> tuple[Drawn, ParameterVector]:
+    """Draw to edges from `OFF` the truth, knowing nothing else but that joints are right within 3 degrees."""
+    frame = sequence.frame(0)
+    images = frame.images if image is None else {"left": image}
+    start = sequence.scene.state({ARM: (frame.truth or {})[ARM] + OFF})
+    parameters = ParameterVector(sequence.scene, start, FreeParameters(), 0.15)
+    settings = OptimizerSettings(**given.pop("settings", {"edge_steps": 20}))
+    seen = given.pop("seen", torch.ones(1, 360, 480))
+    refinement = EdgeRefinement(sequence.scene, images, parameters, settings, given.pop("ignore", {}), seen)
+    curvature = torch.diag(parameters.prior_precision(3.0))
+    return refinement(torch.zeros(len(parameters)), torch.zeros(len(parameters)), curvature), parameters
+
+
+def test_outlines_come_to_lie_on_the_edges_of_the_image(sequence: Sequence) -> None:
+    drawn, parameters = draw(sequence)
+    scene = sequence.scene
+    renderer = Renderer(scene)
+    truth = renderer.segment(scene.state(sequence.frame(0).truth or {}))[0] >= 0
+    before, after = (
+        dice(renderer.segment(parameters.state(offsets))[0] >= 0, truth)
+        for offsets in (torch.zeros_like(drawn.offsets), drawn.offsets)
+    )
+    assert 1.0 - after < 0.3 * (1.0 - before)
+    # What pulls at the end is held by what was known before.
+    held = parameters.prior_precision(3.0) * drawn.offsets
+    pulled = (drawn.gradient.abs() + held.abs()).max()
+    assert (drawn.gradient + held).abs().max() < 0.1 * pulled
+
+
+def test_where_there_is_no_edge_nothing_moves(sequence: Sequence) -> None:
+    drawn, _ = draw(sequence, np.full((480, 640, 3), 128, np.uint8))
+    assert drawn.offsets.abs().max() == 0
+    assert drawn.curvature.abs().max() == 0
+
+
+def test_edges_of_an_occluder_do_not_count(sequence: Sequence) -> None:
+    drawn, _ = draw(sequence, ignore={"left": np.ones((480, 640), bool)})
+    assert drawn.offsets.abs().max() == 0
+
+
+def test_edges_where_the_network_sees_no_arm_do_not_count(sequence: Sequence) -> None:
+    drawn, _ = draw(sequence, seen=torch.zeros(1, 360, 480))
+    assert drawn.offsets.abs().max() == 0
+
+
+def test_edges_further_away_than_they_are_looked_for_do_not_pull(sequence: Sequence) -> None:
+    image = sequence.frame(0).images["left"].copy()
+    far = np.roll(image, (40, 40), (0, 1))
+    near, _ = draw(sequence)
+    drawn, _ = draw(sequence, far)
+    assert drawn.curvature.diagonal().sum() < 0.5 * near.curvature.diagonal().sum()
+
+
+def test_an_image_of_another_size_is_refused(sequence: Sequence) -> None:
+    with pytest.raises(SettingsError, match="has shape"):
+        draw(sequence, np.zeros((240, 320, 3), np.uint8))
+
+
+def test_the_last_iterate_is_the_one_on_edges(
+    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
+    frame = sequence.frame(0)
+    sight = PerfectSight(sequence, sequence.scene.state(frame.truth or {}))
+    sight.follow_windows(monkeypatch)
+
+    def run(**settings) -> FrameOptimizer:
+        chosen = OptimizerSettings(**settings)
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, settings=chosen)  # pyright: ignore
+        list(optimizer)
+        return optimizer
+
+    plain, drawn = run(edge_steps=0), run()
+    assert drawn.stop_reason == plain.stop_reason
+    assert len(drawn.history) == len(plain.history) + 1
+    assert drawn.best is not None and drawn.best.index == len(drawn.history) - 1
+    assert drawn.best.uncertainty == plain.best.uncertainty  # type: ignore[union-attr]
+    short = run(iterations=3)
+    assert short.stop_reason == "iterations" and len(short.history) == 3, "no step more than was asked for"
+
+
+@pytest.mark.parametrize("domain", ["regular", "smoke", "bleeding"])
+def test_edges_bring_masks_nearer_to_the_truth(domain: str) -> None:
+    """On two frames of the shipped sequence, 2 degrees off."""
+    sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
+    camera = sequence.scene.cameras[0].name
+    scene = sequence.scene.with_cameras([camera])
+    renderer = Renderer(scene)
+    found: dict[int, list[float]] = {0: [], 8: []}
+    for index in (6, 18):
+        frame = sequence.frame(index, domain, [camera])
+        start = start_positions(sequence, frame, 2.0, 0)
+        for steps, dices in found.items():
+            settings = OptimizerSettings(edge_steps=steps)
+            optimizer = FrameOptimizer(scene, frame, {}, extractor, start=start, settings=settings, live=False)
+            list(optimizer)
+            assert optimizer.best is not None and frame.masks is not None
+            dices.append(dice(renderer.segment(optimizer.best.state)[0] >= 0, frame.masks[camera]))
+    assert np.mean(found[8]) > np.mean(found[0]) + 0.001

@@ -1,0 +1,121 @@
+"""Outlines against those of a much finer rendering, and their motion against where they are a little later."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import KDTree
+from tiny import tiny_scene
+
+from carts_core.optimization import FreeParameters
+from carts_core.optimization.parameters import STEP, ParameterVector
+from carts_core.rendering import Outline, Renderer
+from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
+from carts_core.robot import Robot
+from carts_core.scene import Scene, SceneState
+
+WIDTH, HEIGHT, FINER = 640, 480, 4
+
+
+@pytest.fixture(scope="module")
+def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
+    tiny = tiny_scene(shipped_psm, 1, ("left",), WIDTH, HEIGHT)
+    joint_positions = tiny.truth[0].copy()
+    joint_positions[3:] = [0.4, 0.3, -0.2, 0.5]
+    return tiny.scene, tiny.scene.state({"PSM1": joint_positions})
+
+
+def outline(renderer: Renderer, parameters: ParameterVector, offsets: torch.Tensor) -> Outline:
+    tangents = renderer.tangents(*parameters.neighbours(offsets), 2 * STEP)
+    return renderer.outline(parameters.state(offsets), tangents)
+
+
+def rims(renderer: Renderer, state: SceneState) -> np.ndarray:
+    """Where silhouettes end in a finer rendering, [n, 2] pixels of the coarse one, the first one's centre at 0."""
+    seen = renderer.segment(state)[0] >= 0
+    right = np.argwhere(seen[:, 1:] != seen[:, :-1]) + np.array([0.5, 1.0])
+    down = np.argwhere(seen[1:] != seen[:-1]) + np.array([1.0, 0.5])
+    return np.concatenate([right, down])[:, ::-1] / FINER - 0.5
+
+
+def test_outlines_are_where_a_finer_rendering_has_them(scene_and_state: tuple[Scene, SceneState]) -> None:
+    scene, state = scene_and_state
+    parameters = ParameterVector(scene, state, FreeParameters(), 0.15)
+    found = outline(Renderer(scene), parameters, torch.zeros(len(parameters)))
+    true = rims(Renderer(scene, width=FINER * WIDTH, height=FINER * HEIGHT), state)
+    distance, nearest = KDTree(true).query(found.position.numpy().T)
+    against_background = distance < 3.0  # the others are where one part hides another
+    assert against_background.mean() > 0.6
+    # Along a row or a column of pixels nobody can tell to less than half a pixel.
+    assert np.quantile(distance[against_background], 0.9) < 0.6
+    along = ((true[nearest] - found.position.numpy().T) * found.normal.numpy().T).sum(1)[against_background]
+    assert abs(along.mean()) < 0.05
+    assert torch.linalg.vector_norm(found.normal, dim=0).sub(1.0).abs().max() < 1e-4
+    # Two pixels outwards there is less of the arm than two pixels inwards.
+    mask = Renderer(scene).segment(state)[0] >= 0
+    sides = []
+    for step in (2.0, -2.0):
+        column, row = (found.position + step * found.normal).round().long().numpy()[:, against_background]
+        sides.append(mask[row.clip(0, HEIGHT - 1), column.clip(0, WIDTH - 1)].mean())
+    assert sides[0] < 0.1 and sides[1] > 0.9
+
+
+@pytest.mark.parametrize("free", ["joints", "base_frames", "extrinsics", "intrinsics"])
+def test_outlines_move_as_they_say(free: str, scene_and_state: tuple[Scene, SceneState]) -> None:
+    scene, state = scene_and_state
+    chosen = replace(FreeParameters(joints=False), **{free: True})
+    parameters = ParameterVector(scene, state, chosen, 0.15)
+    renderer, fine = Renderer(scene), Renderer(scene, width=FINER * WIDTH, height=FINER * HEIGHT)
+    zero = torch.zeros(len(parameters))
+    found = outline(renderer, parameters, zero)
+    position, normal = found.position.numpy().T, found.normal.numpy().T
+
+    def residual(offsets: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """How far away silhouettes end, and how far along the normals."""
+        ends = rims(fine, parameters.state(offsets))
+        distance, nearest = KDTree(ends).query(position)
+        return distance, ((ends[nearest] - position) * normal).sum(1)
+
+    distance, before = residual(zero)
+    predicted, seen = [], []
+    for unknown, name in enumerate(parameters.names):
+        offsets = zero.clone()
+        offsets[unknown] = min(1.5 / max(float(found.motion[unknown].abs().max()), 1e-3), 0.1)
+        later, after = residual(offsets)
+        usable = (distance < 0.6) & (later < 2.1)
+        assert usable.sum() > 100, name
+        predicted.append((found.motion[unknown].numpy() * float(offsets[unknown]))[usable])
+        seen.append((after - before)[usable])
+    predicted, seen = np.concatenate(predicted), np.concatenate(seen)
+    assert np.abs(seen).max() > 1.0
+    assert np.median(np.abs(predicted - seen)) < 0.5 / FINER
+    assert np.corrcoef(predicted, seen)[0, 1] > 0.97
+
+
+def test_what_is_little_further_away_is_no_outline_and_the_border_has_none() -> None:
+    depth = torch.full((1, 40, 50), 0.1)
+    depth[:, :, 20:30] = 0.0995
+    assert not outline_pixels(1.0 / depth).any(), "half a percent"
+    depth[:, :, 20:30] = 0.09
+    found = outline_pixels(1.0 / depth)[0].nonzero()
+    assert set(found[:, 1].tolist()) == {20, 29}, "of the nearer surface only"
+    assert found[:, 0].min() == BORDER and found[:, 0].max() == 39 - BORDER
+
+
+def test_a_straight_outline_is_between_its_pixels() -> None:
+    inverse_depth = torch.zeros(1, 40, 50)
+    inverse_depth[:, :, :20] = 10.0
+    pixel = outline_pixels(inverse_depth).flatten().nonzero()[:, 0]
+    position, normal = outline_position(inverse_depth, pixel)
+    assert torch.allclose(position[0], torch.tensor(19.5), atol=0.05)
+    assert torch.allclose(position[1], (pixel // 50).float(), atol=1e-4)
+    assert torch.allclose(normal, torch.tensor([[1.0], [0.0]]), atol=1e-4)
+
+
+def test_an_empty_view_has_no_outline(scene_and_state: tuple[Scene, SceneState]) -> None:
+    scene, state = scene_and_state
+    away = replace(state, T_world_base=state.T_world_base + torch.tensor([[[0, 0, 0, 9.0]] * 3 + [[0, 0, 0, 0]]]))
+    parameters = ParameterVector(scene, away, FreeParameters(), 0.15)
+    found = outline(Renderer(scene), parameters, torch.zeros(len(parameters)))
+    assert found.position.shape == (2, 0) and found.motion.shape == (len(parameters), 0)
