@@ -148,6 +148,7 @@ class FrameOptimizer:
         self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
         self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._restart = Restart(self.settings, objective, self._solver)
+        self._reached: tuple[int, torch.Tensor, Evaluation] | None = None
         self._ended: str | None = None
         self.stop_reason: str | None = None
 
@@ -164,19 +165,23 @@ class FrameOptimizer:
             return None
         began = time.perf_counter()
         if self._ended is not None:
-            return self._draw_to_edges(began)
+            return self._last_iterate(began)
         index, offsets, solver = len(self.history), self._offsets, self._solver
         stage = solver.stage
         epoch = self._round, self._restart.done, self._objective.epoch(stage)
         moves = self.settings.solver != "none"
         evaluation = self._objective(offsets, stage, gradient=moves)
+        if self._reached is None or stage != self._reached[0] or evaluation.value < self._reached[2].value:
+            self._reached = stage, offsets, evaluation
         self._offsets = solver(offsets, evaluation)
         iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
-            self._known = evaluation, stage
         self._offsets = self._restart(stage, self._offsets, self.best.loss)
+        if self.settings.draws_to_edges and stage < solver.stage == self._objective.stages - 1:
+            # The last look is told where the edges are.
+            self._offsets = self._drawn_to_edges()
         self.stop_reason = solver.finished
         if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
@@ -184,24 +189,27 @@ class FrameOptimizer:
             self._ended, self.stop_reason = self.stop_reason, None
         return iterate
 
-    def _draw_to_edges(self, began: float) -> Iterate:
-        """The last iterate: the best one with its outlines on the edges of the image."""
-        assert isinstance(self._objective, SurfaceObjective)
-        seen = self._objective.seen()
-        refinement = EdgeRefinement(self._scene, self._images, self._parameters, self.settings, self._ignored(), seen)
-        last = self._objective.stages - 1
-        known, stage = self._known
-        if stage != last:
-            known = self._objective(self._best_offsets, last, gradient=True)
-        assert known.curvature is not None
-        offsets = self._best_offsets = refinement(self._best_offsets, known.gradient, known.curvature).offsets
-        evaluation = self._objective(offsets, last, gradient=False)
+    def _last_iterate(self, began: float) -> Iterate:
+        """What was reached, with its outlines on edges."""
+        assert self._reached is not None
+        known = self._reached[2]
+        offsets = self._best_offsets = self._drawn_to_edges()
+        evaluation = self._objective(offsets, self._objective.stages - 1, gradient=False)
         # What edges say has no deviation of its own.
         evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)
         iterate = self._iterate(len(self.history), offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         self.best, self.stop_reason = iterate, self._ended
         return iterate
+
+    def _drawn_to_edges(self) -> torch.Tensor:
+        """What was reached in the present stage, with outlines on edges of the image."""
+        assert isinstance(self._objective, SurfaceObjective) and self._reached is not None
+        _, offsets, known = self._reached
+        assert known.curvature is not None
+        seen, ignore = self._objective.seen(), self._ignored()
+        draw = EdgeRefinement(self._scene, self._images, self._parameters, self.settings, ignore, seen)
+        return draw(offsets, known.gradient, known.curvature).offsets
 
     def base_frame_gain(self) -> float | None:
         """Share of what the images still hold against the best iterate that free base frames would explain [1].

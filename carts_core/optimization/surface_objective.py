@@ -49,18 +49,13 @@ _OUTLINE = 0.5
 """Expected error that all outlines seen in an image have in common, too far out or in [px of the working image]. It
 says how near an arm is, so it matters most to the joints that move it along the line of sight."""
 
-_OVERSHOOT = 1.5
-"""How much further than it came from one look to the next the network is told the arms are, from the third look on [1].
-What it sees leans towards what it believes, so each look leaves a share of the error (about three quarters where blood
-lies over the arms, next to nothing elsewhere); overshooting undoes that, as over-relaxation does."""
-
 
 class SurfaceObjective:
     """Half the sum of robust squared residuals over all pixels, in units of the noise, and a prior.
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
-    look serves the coarse stages, the second one the last but one, each later one the last; with two looks, the second
-    serves both. From the third look on it is told more than what came of the one before, see `_OVERSHOOT`.
+    look serves the coarse stages, the second one the last of these again (it may see what the first one missed) and the
+    last but one, each later one the last; with two looks, the second serves the last two.
 
     Args:
         scene: with the cameras that take part.
@@ -92,7 +87,8 @@ class SurfaceObjective:
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
         self._plan = [(0, blur) for blur in coarse]
         if settings.looks > _FINE:
-            self._plan += [(1, fine[0]), *((look, fine[-1]) for look in range(2, settings.looks))]
+            self._plan += [(1, blur) for blur in (*coarse[-1:], fine[0])]
+            self._plan += [(look, fine[-1]) for look in range(2, settings.looks)]
         else:
             self._plan += [(settings.looks - 1, blur) for blur in fine]
         self.stages = len(self._plan)
@@ -104,7 +100,7 @@ class SurfaceObjective:
         self._weight = pixel_weights(scene, ignore or {}, self._size).to(device)
         self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
-        self._look, self._belief = -1, torch.empty(0)
+        self._look = -1
 
     def epoch(self, stage: int) -> int:
         """Losses compare within an epoch only: a look at the image, or a stage if nobody watches."""
@@ -204,10 +200,7 @@ class SurfaceObjective:
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:
         """Have the network say what the image shows, knowing the present estimate: near the arms, or in all of it."""
-        belief = offsets
-        if look > 1 and self._look == look - 1:
-            belief = self.parameters.clamp(offsets + _OVERSHOOT * (offsets - self._belief))
-        believed = self._whole.surface(self.parameters.state(belief)).maps
+        believed = self._whole.surface(self.parameters.state(offsets)).maps
         later = min(look, 1)
         margin = max(self._size) if whole else round(_MARGIN[later] * self._zoom)
         reach = round(_ATTENTION[later] * self._zoom)
@@ -216,7 +209,7 @@ class SurfaceObjective:
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
         weight = window.of(self._weight) * near[:, None]
-        self._look, self._belief = look, belief
+        self._look = look
         self._window, self._coverage = window, observed[:, COVERAGE].sum(1)
         self._seen = observed, weight
         self._seen_area = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
