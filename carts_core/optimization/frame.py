@@ -140,7 +140,7 @@ class FrameOptimizer:
         self.proposed: dict[str, Bool[np.ndarray, "h w"]] = {}
         """Camera name -> pixels that were left out on a proposal; see `OptimizerSettings.propose_ignore`."""
         self._round = 0
-        self._epoch: tuple[int, bool, int] | None = None
+        self._epoch: tuple[int, int, int] | None = None
         self._begin(self._first)
 
     def _begin(self, objective: Objective) -> None:
@@ -168,7 +168,7 @@ class FrameOptimizer:
             return self._last_iterate(began)
         index, offsets, solver = len(self.history), self._offsets, self._solver
         stage = solver.stage
-        epoch = self._round, self._restart.done, self._objective.epoch(stage)
+        epoch = self._round, self._restart.number, self._objective.epoch(stage)
         moves = self.settings.solver != "none"
         evaluation = self._objective(offsets, stage, gradient=moves)
         if self._reached is None or stage != self._reached[0] or evaluation.value < self._reached[2].value:

@@ -29,9 +29,9 @@ class GaussNewton:
         self._iterations = 0
         self._begin_stage()
 
-    def restart(self) -> None:
-        """Begin again with the first stage; iterations go on counting."""
-        self.stage, self.finished, self._damping = 0, None, _FIRST_DAMPING
+    def restart(self, stage: int = 0) -> None:
+        """Begin again with a stage; iterations go on counting."""
+        self.stage, self.finished, self._damping = stage, None, _FIRST_DAMPING
         self._begin_stage()
 
     def _begin_stage(self) -> None:

@@ -158,7 +158,18 @@ class ParameterVector:
     @property
     def groups(self) -> list[range]:
         """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
-        return [range(block.start, block.start + block.size) for block in self._blocks]
+        return [self._columns(block) for block in self._blocks]
+
+    @property
+    def sliding(self) -> list[int]:
+        """Unknowns that are prismatic joints."""
+        scales = self.scales.tolist()
+        joints = [index for block in self._blocks if block.kind == "joints" for index in self._columns(block)]
+        return [index for index in joints if scales[index] != 1.0]
+
+    @staticmethod
+    def _columns(block: _Block) -> range:
+        return range(block.start, block.start + block.size)
 
     @property
     def scales(self) -> Float[Tensor, " n"]:

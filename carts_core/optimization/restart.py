@@ -1,4 +1,4 @@
-"""A second first look, where the first one says that the start was bad."""
+"""Where a look says that it began at a bad place: another one, from elsewhere."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,18 +8,26 @@ from .gauss_newton import GaussNewton
 from .settings import OptimizerSettings
 from .surface_objective import SurfaceObjective
 
+_DOUBTFUL = 0.03
+"""Loss from which the end of a later look is in doubt [1]."""
+
 
 class Restart:
-    """Starts a descent again from better offsets, once at most, after a first look that ended badly or lost an arm.
+    """Goes on from better offsets: after a first look that ended badly or lost an arm, and before the last look where
+    those before it ended doubtfully and an arm fits better further along its shaft. Each once at most.
 
     For Gauss-Newton on the surface objective; any other descent goes on as it was.
+
+    Attributes:
+        number: of restarts so far.
     """
 
     def __init__(self, settings: OptimizerSettings, objective: Objective, solver: Solver) -> None:
+        self.number = 0
         self._settings = settings
         self._objective = objective if isinstance(objective, SurfaceObjective) else None
         self._solver = solver if isinstance(solver, GaussNewton) else None
-        self.done = settings.candidates == 0
+        self._searched = self._slid = settings.candidates == 0
 
     def __call__(self, stage: int, offsets: Float[Tensor, " n"], loss: float) -> Float[Tensor, " n"]:
         """The offsets to go on from.
@@ -30,12 +38,23 @@ class Restart:
             loss: lowest of the stage.
         """
         objective, solver = self._objective, self._solver
-        if self.done or objective is None or solver is None or solver.finished is not None:
+        if objective is None or solver is None or solver.finished is not None:
             return offsets
-        if objective.look(stage) > 0 or objective.look(solver.stage) == 0:
+        look = objective.look(stage)
+        if look == objective.look(solver.stage):
             return offsets
-        if loss < self._settings.bad_loss and not objective.lost(offsets):
-            return offsets
-        self.done = True
-        solver.restart()
-        return objective.better_start(offsets, self._settings.candidates)
+        if look == 0 and not self._searched and (loss >= self._settings.bad_loss or objective.lost(offsets)):
+            self._searched = True
+            return self._from(0, objective.better_start(offsets, self._settings.candidates), solver)
+        if look > 0 and solver.stage == objective.stages - 1 and not self._slid and loss >= _DOUBTFUL:
+            self._slid = True
+            slid = objective.slid(offsets)
+            if slid is not offsets:
+                second = next(index for index in range(objective.stages) if objective.look(index) == 1)
+                return self._from(second, slid, solver)
+        return offsets
+
+    def _from(self, stage: int, offsets: Tensor, solver: GaussNewton) -> Tensor:
+        self.number += 1
+        solver.restart(stage)
+        return offsets

@@ -42,6 +42,9 @@ _LEFT = 0.3
 _SPREAD = 1.5
 """Deviation of random starts, in expected errors."""
 
+_SLIDE = 5e-3
+"""How far arms are slid along their shafts where the end of a look is in doubt [m]."""
+
 _FINE = 2
 """Number of blurs that the first look leaves to the others."""
 
@@ -193,6 +196,29 @@ class SurfaceObjective:
                 if cost < best_cost:
                     best, best_cost = self.parameters.clamp(trial), cost
         return best
+
+    @torch.no_grad()
+    def slid(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """Offsets with an arm slid along its shaft, if the image agrees with that better; the given ones if not.
+
+        Told that a shaft ends too early, the network may see it end there; told the truth, it agrees more. So each is
+        compared with what is seen by a network that is told it.
+        """
+        best, lowest = offsets, self._own_cost(offsets)
+        for index in self.parameters.sliding:
+            for distance in (-_SLIDE, _SLIDE):
+                trial = offsets.clone()
+                trial[index] += distance / float(self.parameters.scales[index])
+                trial = self.parameters.clamp(trial)
+                cost = self._own_cost(trial)
+                if cost < lowest:
+                    best, lowest = trial, cost
+        self._look = -1
+        return best
+
+    def _own_cost(self, offsets: Tensor) -> float:
+        self._look_at(offsets, 1)
+        return self._coarse_cost(offsets)
 
     def _coarse_cost(self, offsets: Tensor) -> float:
         cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
