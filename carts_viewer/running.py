@@ -32,7 +32,7 @@ class Optimizer(Protocol):
 
     @property
     def best(self) -> Iterate | None:
-        """The best iterate so far: of the present look at the image, the one of the lowest loss."""
+        """The best iterate so far: of the present look, the one of the lowest loss; at the end, the last."""
 
     @property
     def stop_reason(self) -> str | None:
@@ -230,7 +230,7 @@ class ActiveRun:
         return self._optimizer.step()
 
     def best(self) -> Iterate | None:
-        """The best iterate so far: of the present look at the image, the one of the lowest loss."""
+        """The best iterate so far: of the present look, the one of the lowest loss; at the end, the last."""
         return self._optimizer.best
 
     def base_frame_gain(self) -> float | None:

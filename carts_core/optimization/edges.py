@@ -6,6 +6,7 @@ the trackers after it. Whether that edge is the right one nobody says, so a robu
 pulling, and what the network saw goes on counting.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -41,6 +42,9 @@ _BLUR = 1.0
 
 _SHARE = (0.3, 1.0, 1.0)
 """How much a pixel of the outline counts, per part. Along a straight shaft the errors of many pixels are the same."""
+
+_LONGEST_STEP = 0.05
+"""Largest change of an unknown in one step [rad]; edges are near, so a longer one is a mistake."""
 
 _STILL = 0.03
 """Outlines that move by no more than this have arrived [px]."""
@@ -88,7 +92,10 @@ class EdgeRefinement:
         self._gradient = torch.cat([right, down], 1)
         near = functional.interpolate(seen[:, None], size[::-1], mode="bilinear").clamp(0.0, 1.0)
         near = functional.max_pool2d(near, 2 * _NEAR + 1, stride=1, padding=_NEAR)
-        self._weight = near * pixel_weights(scene, ignore, size).to(device)
+        # An outline beside an occluder would find the occluder's edge.
+        reach = math.ceil(_REACH)
+        hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
+        self._weight = near * (1.0 - functional.max_pool2d(hidden, 2 * reach + 1, stride=1, padding=reach))
         self._renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
@@ -111,15 +118,22 @@ class EdgeRefinement:
         for _ in range(self._settings.edge_steps):
             outline = self._renderer.outline(self._parameters.state(offsets), tangents)
             slope, stiffness = self.equations(outline)
-            total = gradient + curvature @ (offsets - origin) + slope
             before = offsets
-            change = torch.linalg.solve((curvature + stiffness).double(), -total.double())
-            offsets = self._parameters.clamp(before + change.to(before))
+            total = gradient + curvature @ (before - origin) + slope
+            offsets = self._parameters.clamp(before + self._step(before, total, curvature + stiffness))
             step = offsets - before
             moved = step @ outline.motion
             if not len(moved) or float(moved.abs().max()) < _STILL:
                 break
         return Drawn(offsets, slope + stiffness @ step, stiffness)
+
+    def _step(self, offsets: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
+        """Where the linear model is lowest; what is at a limit and would go beyond it stays there."""
+        lower, upper = self._parameters.lower, self._parameters.upper
+        free = ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))
+        step = torch.zeros_like(offsets)
+        step[free] = torch.linalg.solve(curvature[free][:, free].double(), -gradient[free].double()).to(step)
+        return step * min(1.0, _LONGEST_STEP / float(step.abs().max().clamp(min=1e-12)))
 
     def equations(self, outline: Outline) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
         """Gradient and curvature of half the weighted squared distances of outlines to edges."""

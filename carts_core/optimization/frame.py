@@ -148,7 +148,8 @@ class FrameOptimizer:
         self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
         self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._restart = Restart(self.settings, objective, self._solver)
-        self._reached: tuple[int, torch.Tensor, Evaluation] | None = None
+        self._reached: tuple[tuple[int, int], torch.Tensor, Evaluation] | None = None
+        self._begun_at = len(self.history)
         self._ended: str | None = None
         self.stop_reason: str | None = None
 
@@ -171,23 +172,31 @@ class FrameOptimizer:
         epoch = self._round, self._restart.number, self._objective.epoch(stage)
         moves = self.settings.solver != "none"
         evaluation = self._objective(offsets, stage, gradient=moves)
-        if self._reached is None or stage != self._reached[0] or evaluation.value < self._reached[2].value:
-            self._reached = stage, offsets, evaluation
+        era = self._restart.number, stage
+        if self._reached is None or era != self._reached[0] or evaluation.value < self._reached[2].value:
+            self._reached = era, offsets, evaluation
         self._offsets = solver(offsets, evaluation)
         iterate = self._iterate(index, offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
         self._offsets = self._restart(stage, self._offsets, self.best.loss)
-        if self.settings.draws_to_edges and stage < solver.stage == self._objective.stages - 1:
+        if self.settings.draws_to_edges and solver.finished is None and self._last_look_after(stage):
             # The last look is told where the edges are.
             self._offsets = self._drawn_to_edges()
         self.stop_reason = solver.finished
         if self.stop_reason is not None and moves and self.settings.propose_ignore and self._round == 0:
             self._look_past_occluders()
-        if self.settings.draws_to_edges and len(self.history) < self.settings.iterations:
+        if self.settings.draws_to_edges and len(self.history) - self._begun_at < self.settings.iterations:
             self._ended, self.stop_reason = self.stop_reason, None
         return iterate
+
+    def _last_look_after(self, stage: int) -> bool:
+        """Whether the solver has moved on from this stage to the last one, and that has a look of its own."""
+        objective, ahead = self._objective, self._solver.stage
+        if not isinstance(objective, SurfaceObjective) or not stage < ahead == objective.stages - 1:
+            return False
+        return objective.look(stage) != objective.look(ahead)
 
     def _last_iterate(self, began: float) -> Iterate:
         """What was reached, with its outlines on edges."""

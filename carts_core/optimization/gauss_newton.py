@@ -29,7 +29,7 @@ class GaussNewton:
         self._iterations = 0
         self._begin_stage()
 
-    def restart(self, stage: int = 0) -> None:
+    def restart(self, stage: int) -> None:
         """Begin again with a stage; iterations go on counting."""
         self.stage, self.finished, self._damping = stage, None, _FIRST_DAMPING
         self._begin_stage()

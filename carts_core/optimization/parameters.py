@@ -60,6 +60,7 @@ class ParameterVector:
         self.start = start
         self.prior: Prior | None = None
         self._lever = lever
+        self._joint_types = [arm.robot.joint_types for arm in scene.arms]
         self.names: list[str] = []
         self._blocks: list[_Block] = []
         self._joint_scales: dict[int, Tensor] = {}
@@ -163,9 +164,12 @@ class ParameterVector:
     @property
     def sliding(self) -> list[int]:
         """Unknowns that are prismatic joints."""
-        scales = self.scales.tolist()
-        joints = [index for block in self._blocks if block.kind == "joints" for index in self._columns(block)]
-        return [index for index in joints if scales[index] != 1.0]
+        return [
+            block.start + place
+            for block in self._blocks
+            for place, column in enumerate(block.columns)
+            if self._joint_types[block.index][column] == "prismatic"
+        ]
 
     @staticmethod
     def _columns(block: _Block) -> range:

@@ -51,7 +51,7 @@ class OptimizerSettings:
     """`gauss_newton`: largest number of steps in a stage [1]."""
     candidates: int = 64
     """`gauss_newton`: random starts per arm that are tried, seen in the whole image, where the first look ended badly
-    or lost an arm [1]; 0 never tries."""
+    or lost an arm [1]; 0 never tries, and no arm is slid along its shaft after a later look that ended doubtfully."""
     bad_loss: float = 0.045
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
     noise: float = 1.33
@@ -66,8 +66,8 @@ class OptimizerSettings:
     normals_weight: float = 0.05
     """`surface`: weight of normals beside that [1]."""
     edge_steps: int = 8
-    """`gauss_newton`: largest number of steps that draw outlines to edges of the image, as a last iterate; 0 for none.
-    """
+    """`gauss_newton`: largest number of steps that draw outlines to edges of the image, before the last look and, if
+    `iterations` are not used up, as a last iterate; 0 for none."""
     edge_weight: float = 0.3
     """`gauss_newton`: weight of a squared distance from an edge, per pixel of the outline [1/px^2]."""
     prior_deg: float = 3.0
@@ -154,7 +154,7 @@ class OptimizerSettings:
 
     @property
     def draws_to_edges(self) -> bool:
-        """Whether outlines are drawn to edges at the end."""
+        """Whether outlines are drawn to edges."""
         return self.solver == "gauss_newton" and self.edge_steps > 0 and self.edge_weight > 0
 
     def with_loss(self, loss: Loss) -> "OptimizerSettings":

@@ -213,7 +213,7 @@ class SurfaceObjective:
                 cost = self._own_cost(trial)
                 if cost < lowest:
                     best, lowest = trial, cost
-        self._look = -1
+        self._look_at(best, 1)
         return best
 
     def _own_cost(self, offsets: Tensor) -> float:
