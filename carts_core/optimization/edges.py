@@ -91,11 +91,10 @@ class EdgeRefinement:
         down, right = torch.gradient(smoothed(stacked, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
         near = functional.interpolate(seen[:, None], size[::-1], mode="bilinear").clamp(0.0, 1.0)
-        near = functional.max_pool2d(near, 2 * _NEAR + 1, stride=1, padding=_NEAR)
+        near = _widened(near, _NEAR)
         # An outline beside an occluder would find the occluder's edge.
-        reach = math.ceil(_REACH)
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
-        self._weight = near * (1.0 - functional.max_pool2d(hidden, 2 * reach + 1, stride=1, padding=reach))
+        self._weight = near * (1.0 - _widened(hidden, math.ceil(_REACH)))
         self._renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
@@ -166,3 +165,9 @@ class EdgeRefinement:
             normal = outline.normal[:, here]
             strength[:, here] = (right * normal[0] + down * normal[1]).square().sum(0)
         return strength
+
+
+def _widened(maps: Float[Tensor, "n 1 h w"], reach: int) -> Float[Tensor, "n 1 h w"]:
+    """The largest value within a square; column by column and row by row, which is much faster."""
+    columns = functional.max_pool2d(maps, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
+    return functional.max_pool2d(columns, (1, 2 * reach + 1), stride=1, padding=(0, reach))
