@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from ..losses import attention
 from ..rendering import Outline, Renderer
 from ..scene import Scene
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
@@ -70,7 +71,7 @@ class EdgeRefinement:
         parameters: the unknowns.
         settings: how many steps, and how much edges count.
         ignore: camera name -> pixels that show an occluder.
-        seen: coverage of arms as the network saw it, of the whole image at any size; edges elsewhere are not theirs.
+        device: where to compute.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -83,18 +84,16 @@ class EdgeRefinement:
         parameters: ParameterVector,
         settings: OptimizerSettings,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]],
-        seen: Float[Tensor, "cameras rows columns"],
+        device: torch.device,
     ) -> None:
-        self._parameters, self._settings, device = parameters, settings, seen.device
+        self._parameters, self._settings = parameters, settings
         size = working_size(scene, round(settings.working_width * _ZOOM), 1)
         stacked = stacked_images(scene, images, size, "image").to(device)
         down, right = torch.gradient(smoothed(stacked, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
-        near = functional.interpolate(seen[:, None], size[::-1], mode="bilinear").clamp(0.0, 1.0)
-        near = _widened(near, _NEAR)
         # An outline beside an occluder would find the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
-        self._weight = near * (1.0 - _widened(hidden, math.ceil(_REACH)))
+        self._shown = 1.0 - attention(hidden, math.ceil(_REACH))
         self._renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
@@ -103,20 +102,27 @@ class EdgeRefinement:
 
     @torch.no_grad()
     def __call__(
-        self, offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"]
+        self,
+        offsets: Float[Tensor, " n"],
+        gradient: Float[Tensor, " n"],
+        curvature: Float[Tensor, "n n"],
+        seen: Float[Tensor, "cameras rows columns"],
     ) -> Drawn:
         """Draw the outlines to edges, as far as what else is known agrees.
 
         Args:
             offsets: where to begin.
             gradient, curvature: of the objective there; they stand for all that is known but for edges.
+            seen: coverage of arms as the network saw it, of the whole image at any size; other edges do not count.
         """
+        near = functional.interpolate(seen[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)
+        counts = attention(near, _NEAR) * self._shown
         origin, step = offsets, torch.zeros_like(offsets)
         slope, stiffness = torch.zeros_like(gradient), torch.zeros_like(curvature)
         tangents = self._renderer.tangents(*self._parameters.neighbours(origin), 2 * STEP)
         for _ in range(self._settings.edge_steps):
             outline = self._renderer.outline(self._parameters.state(offsets), tangents)
-            slope, stiffness = self.equations(outline)
+            slope, stiffness = self._equations(outline, counts)
             before = offsets
             total = gradient + curvature @ (before - origin) + slope
             offsets = self._parameters.clamp(before + self._step(before, total, curvature + stiffness))
@@ -134,25 +140,25 @@ class EdgeRefinement:
         step[free] = torch.linalg.solve(curvature[free][:, free].double(), -gradient[free].double()).to(step)
         return step * min(1.0, _LONGEST_STEP / float(step.abs().max().clamp(min=1e-12)))
 
-    def equations(self, outline: Outline) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
-        """Gradient and curvature of half the weighted squared distances of outlines to edges."""
+    def _equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> tuple[Tensor, Tensor]:
+        """Gradient [n] and curvature [n, n] of half the weighted squared distances of outlines to edges."""
         distance, weight = self._nearest(outline)
+        column, row = outline.position.round().long()
+        weight = weight * counts[outline.camera, 0, row, column] * self._share[outline.parts]
         believed = weight / (1.0 + (distance / _ROBUST).square()).square()
         weighted = self._settings.edge_weight * believed * outline.motion
         return -weighted @ distance, weighted @ outline.motion.T
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Distance to the edge along the outward normal [px], and how much each counts, in [0, 1]."""
+        """Distance to the edge along the outward normal [px], and 1 where there is one, 0 elsewhere."""
         strength = self._strength(outline) * self._expected[:, None]
         best, last = strength.argmax(0), len(self._samples) - 1
         middle = best.clamp(1, last - 1)
         before, peak, after = (strength.gather(0, (middle + d)[None])[0] for d in (-1, 0, 1))
         finer = 0.5 * (after - before) / (2.0 * peak - before - after).clamp(min=1e-12)
-        column, row = outline.position.round().long()
-        weight = self._weight[outline.camera, 0, row, column] * self._share[outline.parts]
         # The strongest one at either end is the flank of an edge further away.
         found = (best > 0) & (best < last)
-        return self._samples[middle] + _SAMPLING * finer.clamp(-0.5, 0.5), weight * found
+        return self._samples[middle] + _SAMPLING * finer.clamp(-0.5, 0.5), found.to(strength)
 
     def _strength(self, outline: Outline) -> Float[Tensor, "samples K"]:
         """Squared change of colour along the normal."""
@@ -165,9 +171,3 @@ class EdgeRefinement:
             normal = outline.normal[:, here]
             strength[:, here] = (right * normal[0] + down * normal[1]).square().sum(0)
         return strength
-
-
-def _widened(maps: Float[Tensor, "n 1 h w"], reach: int) -> Float[Tensor, "n 1 h w"]:
-    """The largest value within a square; column by column and row by row, which is much faster."""
-    columns = functional.max_pool2d(maps, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
-    return functional.max_pool2d(columns, (1, 2 * reach + 1), stride=1, padding=(0, reach))

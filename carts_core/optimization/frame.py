@@ -149,6 +149,7 @@ class FrameOptimizer:
         self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._restart = Restart(self.settings, objective, self._solver)
         self._reached: tuple[tuple[int, int], torch.Tensor, Evaluation] | None = None
+        self._edges: EdgeRefinement | None = None
         self._begun_at = len(self.history)
         self._ended: str | None = None
         self.stop_reason: str | None = None
@@ -180,7 +181,7 @@ class FrameOptimizer:
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
             self.best, self._best_offsets, self._epoch = iterate, offsets, epoch
-        self._offsets = self._restart(stage, self._offsets, self.best.loss)
+        self._offsets = self._restart(stage, self._offsets, self._reached[2].loss)
         if self.settings.draws_to_edges and solver.finished is None and self._last_look_after(stage):
             # The last look is told where the edges are.
             self._offsets = self._drawn_to_edges()
@@ -216,9 +217,16 @@ class FrameOptimizer:
         assert isinstance(self._objective, SurfaceObjective) and self._reached is not None
         _, offsets, known = self._reached
         assert known.curvature is not None
-        seen, ignore = self._objective.seen(), self._ignored()
-        draw = EdgeRefinement(self._scene, self._images, self._parameters, self.settings, ignore, seen)
-        return draw(offsets, known.gradient, known.curvature).offsets
+        if self._edges is None:
+            self._edges = EdgeRefinement(
+                self._scene,
+                self._images,
+                self._parameters,
+                self.settings,
+                self._ignored(),
+                self._extractor.device,
+            )
+        return self._edges(offsets, known.gradient, known.curvature, self._objective.seen()).offsets
 
     def base_frame_gain(self) -> float | None:
         """Share of what the images still hold against the best iterate that free base frames would explain [1].

@@ -159,7 +159,7 @@ class ParameterVector:
     @property
     def groups(self) -> list[range]:
         """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
-        return [self._columns(block) for block in self._blocks]
+        return [range(block.start, block.start + block.size) for block in self._blocks]
 
     @property
     def sliding(self) -> list[int]:
@@ -170,10 +170,6 @@ class ParameterVector:
             for place, column in enumerate(block.columns)
             if self._joint_types[block.index][column] == "prismatic"
         ]
-
-    @staticmethod
-    def _columns(block: _Block) -> range:
-        return range(block.start, block.start + block.size)
 
     @property
     def scales(self) -> Float[Tensor, " n"]:

@@ -77,13 +77,13 @@ class Eye:
         """What is seen, and what edges near it say."""
         assert parameters.prior is not None
         refinement = EdgeRefinement(
-            self._scene, frame.images, parameters, self._fine, self._ignore(frame.index), coverage
+            self._scene, frame.images, parameters, self._fine, self._ignore(frame.index), self._extractor.device
         )
         seen, offsets = end.information, torch.from_numpy(end.correction).to(parameters.lower)
         slope = torch.from_numpy(seen.precision @ end.correction - seen.vector).to(offsets)
         gradient = parameters.prior.gradient(offsets) + slope
         curvature = parameters.prior.precision + torch.from_numpy(seen.precision).to(offsets)
-        drawn = refinement(offsets, gradient, curvature)
+        drawn = refinement(offsets, gradient, curvature, coverage)
         correction, precision = _double(drawn.offsets), _double(drawn.curvature)
         vector = precision @ correction - _double(drawn.gradient)
         information = Information(seen.precision + precision, seen.vector + vector)

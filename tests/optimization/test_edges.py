@@ -36,9 +36,9 @@ def draw(sequence: Sequence, image: np.ndarray | None = None, **given) -> tuple[
     parameters = ParameterVector(sequence.scene, start, FreeParameters(), 0.15)
     settings = OptimizerSettings(**given.pop("settings", {"edge_steps": 20}))
     seen = given.pop("seen", torch.ones(1, 360, 480))
-    refinement = EdgeRefinement(sequence.scene, images, parameters, settings, given.pop("ignore", {}), seen)
+    refinement = EdgeRefinement(sequence.scene, images, parameters, settings, given.pop("ignore", {}), seen.device)
     curvature = torch.diag(parameters.prior_precision(3.0))
-    return refinement(torch.zeros(len(parameters)), torch.zeros(len(parameters)), curvature), parameters
+    return refinement(torch.zeros(len(parameters)), torch.zeros(len(parameters)), curvature, seen), parameters
 
 
 def test_outlines_come_to_lie_on_the_edges_of_the_image(sequence: Sequence) -> None:
