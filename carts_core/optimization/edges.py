@@ -22,6 +22,7 @@ from ..scene import Scene
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
 from .parameters import STEP, ParameterVector
 from .settings import OptimizerSettings
+from .veil import unveiled
 
 _ZOOM = 2.0
 """How many times larger than the working image that is in which edges are looked for, up to the camera's image [1]."""
@@ -89,7 +90,8 @@ class EdgeRefinement:
         self._parameters, self._settings = parameters, settings
         size = working_size(scene, round(settings.working_width * _ZOOM), 1)
         stacked = stacked_images(scene, images, size, "image").to(device)
-        down, right = torch.gradient(smoothed(stacked, _BLUR), dim=(-2, -1))
+        clear = unveiled(stacked, settings.unveil)
+        down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
         # An outline beside an occluder would find the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)

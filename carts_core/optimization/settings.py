@@ -54,6 +54,9 @@ class OptimizerSettings:
     or lost an arm [1]; 0 never tries, and no arm is slid along its shaft after a later look that ended doubtfully."""
     bad_loss: float = 0.045
     """`gauss_newton`: loss from which a first look counts as ended badly [1]."""
+    unveil: float = 0.8
+    """`surface`: share of smoke and haze that is taken off images before the network looks, and before edges are sought
+    [1]; 0 leaves images as they are."""
     noise: float = 1.33
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
@@ -116,6 +119,7 @@ class OptimizerSettings:
         _require(1 <= self.zoom <= 4, "zoom", self.zoom, "1 to 4")
         blurs_fall = all(0 <= fine <= coarse <= 40 for coarse, fine in pairwise((40.0, *self.blurs)))
         _require(1 <= len(self.blurs) and blurs_fall, "blurs", self.blurs, "one or more, falling, 0 to 40 px")
+        _require(0 <= self.unveil <= 1, "unveil", self.unveil, "0 to 1")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
         _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")

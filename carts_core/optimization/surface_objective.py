@@ -23,6 +23,7 @@ from .inputs import pixel_weights, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
+from .veil import unveiled
 from .window import Window
 
 _MARGIN = (27, 16)
@@ -99,7 +100,8 @@ class SurfaceObjective:
         self._size = working_size(scene, width, extractor.stride)
         self._zoom = self._size[0] / working_size(scene, settings.working_width, extractor.stride)[0]
         device = extractor.device
-        self._images = stacked_images(scene, images, self._size, "image").to(device)
+        stacked = stacked_images(scene, images, self._size, "image").to(device)
+        self._images = unveiled(stacked, settings.unveil)
         self._weight = pixel_weights(scene, ignore or {}, self._size).to(device)
         self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)

@@ -1,0 +1,49 @@
+"""Smoke and haze taken off images."""
+
+from pathlib import Path
+
+import torch
+
+from carts_core.data import Sequence
+from carts_core.optimization.veil import unveiled
+
+
+def image_of(sequence: Sequence, domain: str) -> torch.Tensor:
+    image = sequence.frame(3, domain).images[sequence.scene.cameras[0].name]
+    return torch.from_numpy(image).movedim(-1, 0)[None].float() / 255.0
+
+
+def contrast(image: torch.Tensor) -> float:
+    return float((image - image.mean((-2, -1), keepdim=True)).std())
+
+
+def test_a_smoky_frame_comes_closer_to_the_clear_one(sample_sequence_path: Path) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    clear, smoky = image_of(sequence, "regular"), image_of(sequence, "smoke")
+    result, reference = unveiled(smoky, 0.8), unveiled(clear, 0.8)
+    left, before = contrast(result - reference) / contrast(reference), contrast(smoky - clear) / contrast(clear)
+    assert left < before
+    assert contrast(smoky) < 0.8 * contrast(clear)
+    assert contrast(result) > 0.9 * contrast(clear)
+
+
+def test_a_veil_over_colours_that_are_full_of_contrast_is_taken_off() -> None:
+    generator = torch.Generator().manual_seed(0)
+    patches = torch.rand(2, 3, 60, 80, generator=generator)
+    clear = patches.repeat_interleave(8, -2).repeat_interleave(8, -1)
+    veil = torch.linspace(0.0, 0.6, clear.shape[-1])
+    whole = unveiled(clear * (1.0 - veil) + 0.75 * veil, 1.0)
+    torch.testing.assert_close(whole, clear, atol=0.1, rtol=0.0)
+
+
+def test_without_a_veil_or_a_share_images_stay_as_they_are() -> None:
+    images = torch.rand(1, 3, 60, 80, generator=torch.Generator().manual_seed(0))
+    assert unveiled(images, 0.0) is images
+    images[:, 2] = 0.0
+    torch.testing.assert_close(unveiled(images, 1.0), images)
+
+
+def test_noise_is_not_amplified_without_bounds() -> None:
+    white = torch.full((1, 3, 60, 80), 0.74)
+    white[:, :, 30, 40] += 0.01
+    assert float(unveiled(white, 1.0).amax() - unveiled(white, 1.0).amin()) <= 0.01 / 0.25 + 1e-5
