@@ -200,10 +200,13 @@ class FrameOptimizer:
         return objective.look(stage) != objective.look(ahead)
 
     def _last_iterate(self, began: float) -> Iterate:
-        """What was reached, with its outlines on edges."""
-        assert self._reached is not None
+        """What was reached, with its outlines on edges, or the start if that explains the image as well."""
+        assert isinstance(self._objective, SurfaceObjective) and self._reached is not None
         known = self._reached[2]
-        offsets = self._best_offsets = self._drawn_to_edges()
+        offsets = self._drawn_to_edges()
+        if self.settings.keep_start > 0 and self._objective.start_will_do(offsets):
+            offsets, self._ended = torch.zeros_like(offsets), "start kept"
+        self._best_offsets = offsets
         evaluation = self._objective(offsets, self._objective.stages - 1, gradient=False)
         # What edges say has no deviation of its own.
         evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)

@@ -6,6 +6,7 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -49,9 +50,27 @@ _SLIDE = 5e-3
 _FINE = 2
 """Number of blurs that the first look leaves to the others."""
 
+_NEAR_START = 0.9
+"""Overlap of the silhouettes of the start and of an estimate (Dice) above which the start may be as good [1]."""
+
 _OUTLINE = 0.5
 """Expected error that all outlines seen in an image have in common, too far out or in [px of the working image]. It
 says how near an arm is, so it matters most to the joints that move it along the line of sight."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """What the network saw in a look at the image."""
+
+    look: int
+    window: Window
+    coverage: Float[Tensor, "cameras h w"]
+    """Of all arms, in the window."""
+    seen: tuple[Float[Tensor, "cameras 6 h w"], Float[Tensor, "cameras 1 h w"]]
+    """The surface map and what each pixel counts, in the window."""
+    area: float
+    """Of what is seen of arms and counts [px of the working image]."""
+    stages: list[Stage]
 
 
 class SurfaceObjective:
@@ -105,7 +124,7 @@ class SurfaceObjective:
         self._weight = pixel_weights(scene, ignore or {}, self._size).to(device)
         self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
-        self._look = -1
+        self._view: _View | None = None
 
     def epoch(self, stage: int) -> int:
         """Losses compare within an epoch only: a look at the image, or a stage if nobody watches."""
@@ -119,27 +138,33 @@ class SurfaceObjective:
         """Evaluate at the given offsets; each stage of a look blurs less than the one before."""
         with torch.no_grad():
             look = self.look(stage)
-            if look != self._look:
+            if self._view is None or look != self._view.look:
                 self._look_at(offsets, look)
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
-            return self._evaluate(offsets, self._stages[stage - first], gradient)
+            return self._evaluate(offsets, self._viewed.stages[stage - first], gradient)
+
+    @property
+    def _viewed(self) -> _View:
+        assert self._view is not None
+        return self._view
 
     def lost(self, offsets: Float[Tensor, " n"]) -> bool:
         """Whether an arm that should be in sight is not where the offsets have it: nothing there is seen as an arm."""
         start = self._whole.segment(self.parameters.state(torch.zeros_like(offsets)))
-        found = self._window.of(torch.from_numpy(self._whole.segment(self.parameters.state(offsets))))
-        found = found.to(self._coverage.device)
+        view = self._viewed
+        found = view.window.of(torch.from_numpy(self._whole.segment(self.parameters.state(offsets))))
+        found = found.to(view.coverage.device)
         for arm in range(len(self.scene.arms)):
             here = found == arm
             area, before = int(here.sum()), int((start == arm).sum())
-            if before and (area < _LEFT * before or float(self._coverage[here].mean()) < _SUPPORT):
+            if before and (area < _LEFT * before or float(view.coverage[here].mean()) < _SUPPORT):
                 return True
         return False
 
     def seen(self) -> Float[Tensor, "cameras h w"]:
         """Where the last look saw arms: their coverage, in the whole compared image."""
-        width, height = self._size
-        return self._window.paste(self._coverage, self._coverage.new_zeros(len(self._coverage), height, width))
+        (width, height), view = self._size, self._viewed
+        return view.window.paste(view.coverage, view.coverage.new_zeros(len(view.coverage), height, width))
 
     @torch.no_grad()
     def promised(self, offsets: Float[Tensor, " n"], wider: ParameterVector) -> float:
@@ -157,7 +182,8 @@ class SurfaceObjective:
         own = [wider.names.index(name) for name in self.parameters.names]
         point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(own, device=offsets.device), offsets)
         blur = settings.blurs[: max(len(settings.blurs) - _FINE, 1)][-1]
-        stage = Stage(self.scene, self._size, self._zoom, self._window, *self._seen, blur, settings)
+        view = self._viewed
+        stage = Stage(self.scene, self._size, self._zoom, view.window, *view.seen, blur, settings)
         compared = stage.compare(wider.state(point), wider.neighbours(point))
         assert compared.gradient is not None and compared.curvature is not None
         prior = wider.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
@@ -188,13 +214,13 @@ class SurfaceObjective:
         spread = _SPREAD * self._prior.marginal.rsqrt().cpu()
         best = offsets
         self._look_at(torch.zeros_like(offsets), 0, whole=True)
-        best_cost = self._coarse_cost(best)
+        best_cost = self._cost(best, 0)
         for group in self.parameters.groups:
             for index in range(candidates + 1):
                 drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
                 trial = best.clone()
                 trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
-                cost = self._coarse_cost(self.parameters.clamp(trial))
+                cost = self._cost(self.parameters.clamp(trial), 0)
                 if cost < best_cost:
                     best, best_cost = self.parameters.clamp(trial), cost
         return best
@@ -218,12 +244,31 @@ class SurfaceObjective:
         self._look_at(best, 1)
         return best
 
+    @torch.no_grad()
+    def start_will_do(self, offsets: Float[Tensor, " n"]) -> bool:
+        """Whether these offsets explain the image hardly better than the start, to a network that is told the start.
+
+        Where silhouettes differ much it does, and nothing is looked at. If the start will do, its look is the last one.
+        """
+        start, view = torch.zeros_like(offsets), self._viewed
+        one, other = (self._whole.segment(self.parameters.state(point)) >= 0 for point in (start, offsets))
+        if 2 * int((one & other).sum()) <= _NEAR_START * (int(one.sum()) + int(other.sum())):
+            return False
+        self._look_at(start, self.settings.looks - 1)
+        stage = self._viewed.stages[-1]
+        before, after = (stage.compare(self.parameters.state(point), None).cost for point in (start, offsets))
+        kept = before < (1.0 + self.settings.keep_start) * after
+        if not kept:
+            self._view = view
+        return kept
+
     def _own_cost(self, offsets: Tensor) -> float:
         self._look_at(offsets, 1)
-        return self._coarse_cost(offsets)
+        return self._cost(offsets, 0)
 
-    def _coarse_cost(self, offsets: Tensor) -> float:
-        cost = self._stages[0].compare(self.parameters.state(offsets), None).cost
+    def _cost(self, offsets: Tensor, stage: int) -> float:
+        """The objective in a stage of the present look."""
+        cost = self._viewed.stages[stage].compare(self.parameters.state(offsets), None).cost
         return cost / self.settings.noise**2 + self._prior.value(offsets)
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:
@@ -237,21 +282,21 @@ class SurfaceObjective:
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
         weight = window.of(self._weight) * near[:, None]
-        self._look = look
-        self._window, self._coverage = window, observed[:, COVERAGE].sum(1)
-        self._seen = observed, weight
-        self._seen_area = float((self._coverage * weight[:, 0]).sum()) / self._zoom**2
-        self._stages = [
-            Stage(self.scene, self._size, self._zoom, window, *self._seen, blur, self.settings)
+        seen = observed, weight
+        stages = [
+            Stage(self.scene, self._size, self._zoom, window, *seen, blur, self.settings)
             for number, blur in self._plan
             if number == look
         ]
+        coverage = observed[:, COVERAGE].sum(1)
+        area = float((coverage * weight[:, 0]).sum()) / self._zoom**2
+        self._view = _View(look, window, coverage, seen, area, stages)
 
     def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)
         neighbours = self.parameters.neighbours(offsets) if gradient else None
         compared = stage.compare(state, neighbours)
-        shown = self._stages[-1] if self._live else stage
+        shown = self._viewed.stages[-1] if self._live else stage
         final = compared if stage is shown else shown.compare(state, None)
         prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None
@@ -268,7 +313,7 @@ class SurfaceObjective:
                     _OUTLINE * compared.outline,
                 )
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
-        area = 0.5 * max(float(coverage.sum()) * shown.area + self._seen_area, 1.0)
+        area = 0.5 * max(float(coverage.sum()) * shown.area + self._viewed.area, 1.0)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(

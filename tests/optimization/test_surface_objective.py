@@ -48,6 +48,23 @@ def test_gauss_newton_finds_the_truth_that_the_network_sees(sequence: Sequence, 
     assert abs(found - truth)[2] < 0.0006
 
 
+@pytest.mark.parametrize(("degrees", "keep_start", "kept"), [(0.0, 0.2, True), (0.0, 0.0, False), (0.3, 0.2, False)])
+def test_a_start_that_explains_the_image_as_well_is_kept(
+    sequence: Sequence, sight: FeatureExtractor, degrees: float, keep_start: float, kept: bool
+) -> None:
+    frame = sequence.frame(0)
+    truth = (frame.truth or {})["PSM1"]
+    start = truth + np.deg2rad(degrees) * np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    settings = OptimizerSettings(keep_start=keep_start)
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start={"PSM1": start}, settings=settings)
+    *_, last = list(optimizer)
+    assert optimizer.best is last
+    assert (optimizer.stop_reason == "start kept") == kept
+    assert np.allclose(last.joint_positions()["PSM1"], start, atol=1e-6) == kept
+    assert last.uncertainty is not None
+    assert optimizer.base_frame_gain() is not None, "what the last look saw is still known"
+
+
 def test_nobody_watching_changes_no_step(sequence: Sequence, sight: FeatureExtractor) -> None:
     frame = sequence.frame(0)
     start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
