@@ -19,7 +19,7 @@ _REASONS = {
     "iterations": "Done, best iterate kept",
     "not optimized": "Evaluated only, as the solver says",
     "converged": "Converged",
-    "start kept": "The start explains the image as well and was kept",
+    "start kept": "Start kept: it explains the image as well",
     "cancelled": "Cancelled",
 }
 

@@ -145,6 +145,8 @@ class FrameOptimizer:
 
     def _begin(self, objective: Objective) -> None:
         self._objective = objective
+        if isinstance(objective, SurfaceObjective):
+            objective.forget()
         self._offsets = torch.zeros(len(self._parameters), device=self._parameters.lower.device)
         self._solver = make_solver(self.settings, self._parameters, objective.stages)
         self._restart = Restart(self.settings, objective, self._solver)
@@ -202,18 +204,25 @@ class FrameOptimizer:
     def _last_iterate(self, began: float) -> Iterate:
         """What was reached, with its outlines on edges, or the start if that explains the image as well."""
         assert isinstance(self._objective, SurfaceObjective) and self._reached is not None
-        known = self._reached[2]
-        offsets = self._drawn_to_edges()
-        if self.settings.keep_start > 0 and self._objective.start_will_do(offsets):
+        offsets, last = self._drawn_to_edges(), self._objective.stages - 1
+        if self._may_keep_start() and self._objective.back_at_start(offsets):
             offsets, self._ended = torch.zeros_like(offsets), "start kept"
+            evaluation = self._objective(offsets, last, gradient=True)
+        else:
+            known = self._reached[2]
+            evaluation = self._objective(offsets, last, gradient=False)
+            # What edges say has no deviation of its own.
+            evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)
         self._best_offsets = offsets
-        evaluation = self._objective(offsets, self._objective.stages - 1, gradient=False)
-        # What edges say has no deviation of its own.
-        evaluation = replace(evaluation, gradient=known.gradient, uncertainty=known.uncertainty)
         iterate = self._iterate(len(self.history), offsets, evaluation, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
         self.best, self.stop_reason = iterate, self._ended
         return iterate
+
+    def _may_keep_start(self) -> bool:
+        """A calibration that is free is thought to be wrong, so its start has nothing to say."""
+        free = self._free
+        return self.settings.keep_start > 0 and not (free.base_frames or free.extrinsics or free.intrinsics)
 
     def _drawn_to_edges(self) -> torch.Tensor:
         """What was reached in the present stage, with outlines on edges of the image."""

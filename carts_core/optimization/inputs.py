@@ -82,7 +82,7 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
     kernel = cv2.getGaussianKernel(2 * kernel_radius(deviation) + 1, deviation, cv2.CV_32F)
-    planes = flat.permute(1, 2, 0).contiguous().numpy()
+    planes = flat.permute(1, 2, 0).clone(memory_format=torch.contiguous_format).numpy()
     for first in range(0, planes.shape[2], _CHANNELS):
         part = np.ascontiguousarray(planes[:, :, first : first + _CHANNELS])
         result = cv2.sepFilter2D(part, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)

@@ -35,7 +35,7 @@ class Restart:
         Args:
             stage: that was just evaluated; the solver has moved on.
             offsets: where the solver wants to go on.
-            loss: at the best offsets of the stage.
+            loss: that the stage has reached.
         """
         objective, solver = self._objective, self._solver
         if objective is None or solver is None or solver.finished is not None:

@@ -73,9 +73,10 @@ class OptimizerSettings:
     `iterations` are not used up, as a last iterate; 0 for none."""
     edge_weight: float = 0.3
     """`gauss_newton`: weight of a squared distance from an edge, per pixel of the outline [1/px^2]."""
-    keep_start: float = 0.2
-    """`gauss_newton`: the start stays as it was if in the end its loss is larger than the best one by less than this
-    share [1]; 0 always moves."""
+    keep_start: float = 5.0
+    """`gauss_newton`: in the last iterate, where edges are drawn, the start stays if the image prefers the estimate by
+    less than this difference of the objective, and by less than a quarter [1]; 0 always moves. Only where joints alone
+    are free and each frame is alone."""
     prior_deg: float = 3.0
     """`surface`: expected error of a joint position at the start [deg]; `lever` turns it into metres."""
     frame_prior_deg: float = 0.5
@@ -129,7 +130,7 @@ class OptimizerSettings:
         _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         _require(0 <= self.edge_steps <= 1000, "edge_steps", self.edge_steps, "0 to 1000")
         _require(0 <= self.edge_weight <= 100, "edge_weight", self.edge_weight, "0 to 100")
-        _require(0 <= self.keep_start <= 1, "keep_start", self.keep_start, "0 to 1")
+        _require(0 <= self.keep_start <= 1e6, "keep_start", self.keep_start, "0 to 1e6")
         _require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
         _require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
         _require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")

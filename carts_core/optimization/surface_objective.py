@@ -53,6 +53,9 @@ _FINE = 2
 _NEAR_START = 0.9
 """Overlap of the silhouettes of the start and of an estimate (Dice) above which the start may be as good [1]."""
 
+_AS_WELL = 1.25
+"""How many times larger the start's difference from what is seen may be than the estimate's, if it is as good [1]."""
+
 _OUTLINE = 0.5
 """Expected error that all outlines seen in an image have in common, too far out or in [px of the working image]. It
 says how near an arm is, so it matters most to the joints that move it along the line of sight."""
@@ -214,13 +217,13 @@ class SurfaceObjective:
         spread = _SPREAD * self._prior.marginal.rsqrt().cpu()
         best = offsets
         self._look_at(torch.zeros_like(offsets), 0, whole=True)
-        best_cost = self._cost(best, 0)
+        best_cost = self._coarse_cost(best)
         for group in self.parameters.groups:
             for index in range(candidates + 1):
                 drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
                 trial = best.clone()
                 trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
-                cost = self._cost(self.parameters.clamp(trial), 0)
+                cost = self._coarse_cost(self.parameters.clamp(trial))
                 if cost < best_cost:
                     best, best_cost = self.parameters.clamp(trial), cost
         return best
@@ -245,10 +248,11 @@ class SurfaceObjective:
         return best
 
     @torch.no_grad()
-    def start_will_do(self, offsets: Float[Tensor, " n"]) -> bool:
-        """Whether these offsets explain the image hardly better than the start, to a network that is told the start.
+    def back_at_start(self, offsets: Float[Tensor, " n"]) -> bool:
+        """Have the network look knowing the start, and say whether the start then explains the image as well.
 
-        Where silhouettes differ much it does, and nothing is looked at. If the start will do, its look is the last one.
+        It does not where silhouettes differ much; nothing is looked at then. Where it does, that look becomes the
+        present one; where not, the present one stays.
         """
         start, view = torch.zeros_like(offsets), self._viewed
         one, other = (self._whole.segment(self.parameters.state(point)) >= 0 for point in (start, offsets))
@@ -257,18 +261,23 @@ class SurfaceObjective:
         self._look_at(start, self.settings.looks - 1)
         stage = self._viewed.stages[-1]
         before, after = (stage.compare(self.parameters.state(point), None).cost for point in (start, offsets))
-        kept = before < (1.0 + self.settings.keep_start) * after
+        gain = (before - after) / self.settings.noise**2 + self._prior.value(start) - self._prior.value(offsets)
+        kept = gain < self.settings.keep_start and before < _AS_WELL * after
         if not kept:
             self._view = view
         return kept
 
+    def forget(self) -> None:
+        """Look again when asked next."""
+        self._view = None
+
     def _own_cost(self, offsets: Tensor) -> float:
         self._look_at(offsets, 1)
-        return self._cost(offsets, 0)
+        return self._coarse_cost(offsets)
 
-    def _cost(self, offsets: Tensor, stage: int) -> float:
-        """The objective in a stage of the present look."""
-        cost = self._viewed.stages[stage].compare(self.parameters.state(offsets), None).cost
+    def _coarse_cost(self, offsets: Tensor) -> float:
+        """The objective in the first stage of the present look."""
+        cost = self._viewed.stages[0].compare(self.parameters.state(offsets), None).cost
         return cost / self.settings.noise**2 + self._prior.value(offsets)
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:

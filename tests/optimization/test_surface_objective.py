@@ -48,7 +48,7 @@ def test_gauss_newton_finds_the_truth_that_the_network_sees(sequence: Sequence, 
     assert abs(found - truth)[2] < 0.0006
 
 
-@pytest.mark.parametrize(("degrees", "keep_start", "kept"), [(0.0, 0.2, True), (0.0, 0.0, False), (0.3, 0.2, False)])
+@pytest.mark.parametrize(("degrees", "keep_start", "kept"), [(0.0, 5.0, True), (0.0, 0.0, False), (0.5, 5.0, False)])
 def test_a_start_that_explains_the_image_as_well_is_kept(
     sequence: Sequence, sight: FeatureExtractor, degrees: float, keep_start: float, kept: bool
 ) -> None:
@@ -63,6 +63,42 @@ def test_a_start_that_explains_the_image_as_well_is_kept(
     assert np.allclose(last.joint_positions()["PSM1"], start, atol=1e-6) == kept
     assert last.uncertainty is not None
     assert optimizer.base_frame_gain() is not None, "what the last look saw is still known"
+
+
+def test_keeping_the_start_or_not_with_the_shipped_network() -> None:
+    """It sees something else when it is told something else, which must not show in an estimate that is not dropped."""
+    sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
+    scene = sequence.scene.with_cameras(["left"])
+    frame = sequence.frame(4, cameras=["left"])
+    truth = frame.truth or {}
+
+    def run(start: dict[str, np.ndarray], **settings) -> FrameOptimizer:
+        chosen = OptimizerSettings(**settings)
+        optimizer = FrameOptimizer(scene, frame, {}, extractor, start=start, settings=chosen, live=False)
+        list(optimizer)
+        return optimizer
+
+    kept = run(truth)
+    assert kept.stop_reason == "start kept" and kept.best is not None
+    assert all(np.allclose(kept.best.joint_positions()[arm], truth[arm], atol=1e-6) for arm in truth)
+    moved, first = {**truth}, next(iter(truth))
+    moved[first] = truth[first] + np.deg2rad([1.0, 1.0, 0, 0, 0, 0, 0])
+    doubted, believed = run(moved), run(moved, keep_start=0.0)
+    assert doubted.stop_reason == believed.stop_reason != "start kept", "one arm off is reason enough"
+    assert doubted.best is not None and believed.best is not None
+    assert doubted.best.loss == believed.best.loss
+    assert doubted.base_frame_gain() == believed.base_frame_gain()
+    history = [progress.loss for progress in doubted.history]
+    doubted.reset()
+    assert [iterate.loss for iterate in doubted] == history, "and a reset looks again"
+
+
+def test_a_calibration_that_is_free_is_not_kept(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    free = FreeParameters(base_frames=True)
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=frame.truth, free=free)
+    list(optimizer)
+    assert optimizer.stop_reason != "start kept"
 
 
 def test_nobody_watching_changes_no_step(sequence: Sequence, sight: FeatureExtractor) -> None:
