@@ -24,7 +24,10 @@ def ordinary_user_folder() -> Iterator[Path]:
         if os.geteuid() != 0:
             yield folder
             return
-        os.chown(folder, 65534, -1)
+        try:
+            os.chown(folder, 65534, -1)
+        except OSError:
+            pytest.skip("a container without other users, whose superuser may write anywhere")
         os.seteuid(65534)
         try:
             yield folder
