@@ -105,6 +105,8 @@ def test_the_last_iterate_is_the_one_on_edges(
     assert drawn.best is not None and drawn.best.index == len(drawn.history) - 1
     assert plain.best is not None and plain.best.index < len(plain.history)
     np.testing.assert_allclose(drawn.best.joint_std()[ARM], plain.best.joint_std()[ARM], rtol=0.2)
+    monkeypatch.setattr(FrameOptimizer, "_last_look_after", lambda *_: False)  # else other steps lead to the end
+    assert len(run().history) == len(plain.history) + 1
     short = run(iterations=3)
     assert short.stop_reason == "iterations" and len(short.history) == 3, "no step more than was asked for"
 
