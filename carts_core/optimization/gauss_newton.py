@@ -18,7 +18,8 @@ _LONGEST_STEP = 0.15
 class GaussNewton:
     """Solves for the step that the linear model says is best, and believes it as far as it has proved right.
 
-    A stage ends when the model promises no more than `tolerance` of the objective, or after `stage_iterations`.
+    A stage ends when the model promises no more than `tolerance` of the objective (`coarse_tolerance` where another one
+    follows), or after `stage_iterations`.
     """
 
     def __init__(self, settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> None:
@@ -51,9 +52,11 @@ class GaussNewton:
             self._rejections += 1
         offsets, evaluation = self._accepted
         step, promised = self._step(evaluation)
-        converged = promised < self._settings.tolerance * evaluation.value or self._rejections >= _REJECTIONS
-        if converged or self._evaluations >= self._settings.stage_iterations:
-            if self.stage == self._stages - 1:
+        settings, last = self._settings, self.stage == self._stages - 1
+        enough = (settings.tolerance if last else settings.coarse_tolerance) * evaluation.value
+        converged = promised < enough or self._rejections >= _REJECTIONS
+        if converged or self._evaluations >= settings.stage_iterations:
+            if last:
                 self.finished = "converged" if converged else "iterations"
             else:
                 self.stage += 1

@@ -13,8 +13,9 @@ _DOUBTFUL = 0.03
 
 
 class Restart:
-    """Goes on from better offsets: after a first look that ended badly or lost an arm, and before the last look where
-    those before it ended doubtfully and an arm fits better further along its shaft. Each once at most.
+    """Goes on from better offsets: after a first look (a glance is none) that ended badly or lost an arm, and before
+    the last look where those before it ended doubtfully and an arm fits better further along its shaft. Each once at
+    most.
 
     For Gauss-Newton on the surface objective; any other descent goes on as it was.
 
@@ -40,17 +41,17 @@ class Restart:
         objective, solver = self._objective, self._solver
         if objective is None or solver is None or solver.finished is not None:
             return offsets
-        look = objective.look(stage)
+        look, first = objective.look(stage), objective.first_look
         if look == objective.look(solver.stage):
             return offsets
-        if look == 0 and not self._searched and (loss >= self._settings.bad_loss or objective.lost(offsets)):
+        if look == first and not self._searched and (loss >= self._settings.bad_loss or objective.lost(offsets)):
             self._searched = True
             return self._from(0, objective.better_start(offsets, self._settings.candidates), solver)
-        if look > 0 and solver.stage == objective.stages - 1 and not self._slid and loss >= _DOUBTFUL:
+        if look > first and solver.stage == objective.stages - 1 and not self._slid and loss >= _DOUBTFUL:
             self._slid = True
             slid = objective.slid(offsets)
             if slid is not offsets:
-                second = next(index for index in range(objective.stages) if objective.look(index) == 1)
+                second = next(index for index in range(objective.stages) if objective.look(index) > first)
                 return self._from(second, slid, solver)
         return offsets
 

@@ -45,6 +45,9 @@ class OptimizerSettings:
     """`surface`: deviation of the blur of each stage, from coarse to fine [px of the working image]."""
     looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
+    glance: bool = True
+    """`surface`: before the first look, the network takes one at the smaller working image for the coarsest stages, so
+    that a good estimate is there within two or three steps."""
     zoom: float = 1.5
     """`surface`: how many times larger than the working image the compared images are, up to the camera's image [1]."""
     stage_iterations: int = 6
@@ -61,6 +64,9 @@ class OptimizerSettings:
     """`surface`: deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
     robust: float = 0.5
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
+    coarse_robust: float = 2.0
+    """`surface`: the same in stages before the last three of `blurs`, where the image is seen near the arms only; first
+    steps are longer for it [1]."""
     propose_ignore: bool = False
     """`surface`: solve a frame again, from its start and in as many steps, without areas at the arms that contradicted
     the first solution. Only where each frame is alone. It does not always help: see docs/benchmark.md."""
@@ -77,7 +83,7 @@ class OptimizerSettings:
     """`gauss_newton`: in the last iterate, where edges are drawn, the start stays if the image prefers the estimate by
     less than this difference of the objective, and by less than a quarter [1]; 0 always moves. Only where joints alone
     are free and each frame is alone."""
-    prior_deg: float = 3.0
+    prior_deg: float = 2.5
     """`surface`: expected error of a joint position at the start [deg]; `lever` turns it into metres."""
     frame_prior_deg: float = 0.5
     """`surface`: the same of base frames and camera extrinsics [deg]."""
@@ -105,8 +111,10 @@ class OptimizerSettings:
     working_width: int = 320
     """Width of the images that are compared [px]."""
     tolerance: float = 1e-2
-    """`gauss_newton`: a stage ends when no more than this share of the objective is to be gained [1]. Other solvers
-    stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
+    """`gauss_newton`: the last stage ends when no more than this share of the objective is to be gained [1]. Other
+    solvers stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
+    coarse_tolerance: float = 0.04
+    """`gauss_newton`: the same for stages that others follow [1]."""
     patience: int = 10
     """See `tolerance` [1]."""
 
@@ -126,6 +134,7 @@ class OptimizerSettings:
         _require(0 <= self.unveil <= 1, "unveil", self.unveil, "0 to 1")
         _require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
         _require(1e-3 <= self.robust <= 100, "robust", self.robust, "0.001 to 100")
+        _require(1e-3 <= self.coarse_robust <= 100, "coarse_robust", self.coarse_robust, "0.001 to 100")
         _require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
         _require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         _require(0 <= self.edge_steps <= 1000, "edge_steps", self.edge_steps, "0 to 1000")
@@ -154,6 +163,7 @@ class OptimizerSettings:
         _require(self.blur <= self.wide_blur <= 20, "wide_blur", self.wide_blur, "blur to 20 px")
         _require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         _require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
+        _require(0 <= self.coarse_tolerance < 1, "coarse_tolerance", self.coarse_tolerance, "0 to 1")
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
 
     @property

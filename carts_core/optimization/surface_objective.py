@@ -6,7 +6,7 @@ per pixel keeps what cannot be explained (an occluder, a false detection) from p
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -50,6 +50,9 @@ _SLIDE = 5e-3
 _FINE = 2
 """Number of blurs that the first look leaves to the others."""
 
+_GLANCE_ZOOM = 1.0
+"""Largest `OptimizerSettings.zoom` of a glance [1]."""
+
 _NEAR_START = 0.9
 """Overlap of the silhouettes of the start and of an estimate (Dice) above which the start may be as good [1]."""
 
@@ -62,10 +65,26 @@ says how near an arm is, so it matters most to the joints that move it along the
 
 
 @dataclass(frozen=True)
+class _Scale:
+    """The images in a size in which they are compared."""
+
+    zoom: float
+    """How many times larger than the working image [1]."""
+    size: tuple[int, int]
+    """Width and height [px]."""
+    images: Float[Tensor, "cameras 3 h w"]
+    weight: Float[Tensor, "cameras 1 h w"]
+    """0 where an occluder is known to be, 1 elsewhere."""
+    whole: Renderer
+    """Of the whole image."""
+
+
+@dataclass(frozen=True)
 class _View:
     """What the network saw in a look at the image."""
 
     look: int
+    scale: _Scale
     window: Window
     coverage: Float[Tensor, "cameras h w"]
     """Of all arms, in the window."""
@@ -74,6 +93,8 @@ class _View:
     area: float
     """Of what is seen of arms and counts [px of the working image]."""
     stages: list[Stage]
+    shown: Stage | None
+    """What iterates are seen in; None for the stage that they are compared in."""
 
 
 class SurfaceObjective:
@@ -81,7 +102,9 @@ class SurfaceObjective:
 
     The network looks at the image `looks` times: first knowing the start, and again knowing what came of it. The first
     look serves the coarse stages, the second one the last of these again (it may see what the first one missed) and the
-    last but one, each later one the last; with two looks, the second serves the last two.
+    last but one, each later one the last; with two looks, the second serves the last two. A glance, which is a look at
+    a smaller image, comes before all these and takes the coarsest stages over: all but the last of the coarse ones. The
+    first look is told the same as the glance, not what came of that: smoke may have fooled it.
 
     Args:
         scene: with the cameras that take part.
@@ -92,6 +115,10 @@ class SurfaceObjective:
         ignore: camera name -> pixels that show an occluder.
         live: whether coarse stages are also rendered at the finest blur of their look, for someone who watches: losses
             compare through a look then, and maps are sharp. It takes a third more time and changes no step.
+
+    Attributes:
+        stages: number of stages.
+        first_look: number of the first look that is no glance.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -111,21 +138,20 @@ class SurfaceObjective:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
         self._live = live
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
-        self._plan = [(0, blur) for blur in coarse]
+        self._coarsest = coarse[:-1]
+        first = int(settings.glance and len(self._coarsest) > 0)
+        self._plan = [(0, blur) for blur in self._coarsest] + [(first, blur) for blur in coarse[-1:]]
         if settings.looks > _FINE:
-            self._plan += [(1, blur) for blur in (*coarse[-1:], fine[0])]
-            self._plan += [(look, fine[-1]) for look in range(2, settings.looks)]
+            self._plan += [(first + 1, blur) for blur in (*coarse[-1:], fine[0])]
+            self._plan += [(first + look, fine[-1]) for look in range(2, settings.looks)]
         else:
-            self._plan += [(settings.looks - 1, blur) for blur in fine]
+            self._plan += [(first + settings.looks - 1, blur) for blur in fine]
+        self.first_look = first
+        self._begun_at: Tensor | None = None
         self.stages = len(self._plan)
-        width = round(settings.working_width * settings.zoom)
-        self._size = working_size(scene, width, extractor.stride)
-        self._zoom = self._size[0] / working_size(scene, settings.working_width, extractor.stride)[0]
-        device = extractor.device
-        stacked = stacked_images(scene, images, self._size, "image").to(device)
-        self._images = unveiled(stacked, settings.unveil)
-        self._weight = pixel_weights(scene, ignore or {}, self._size).to(device)
-        self._whole = Renderer(scene, width=self._size[0], height=self._size[1], device=device)
+        self._given = images, ignore or {}
+        self._scales: dict[float, _Scale] = {}
+        self._scale(0)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._view: _View | None = None
 
@@ -142,9 +168,29 @@ class SurfaceObjective:
         with torch.no_grad():
             look = self.look(stage)
             if self._view is None or look != self._view.look:
-                self._look_at(offsets, look)
+                if look < self.first_look:
+                    self._begun_at = offsets
+                begun_at = self._begun_at if look == self.first_look else None
+                self._look_at(offsets if begun_at is None else begun_at, look)
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._viewed.stages[stage - first], gradient)
+
+    def _scale(self, look: int) -> _Scale:
+        """The images as a look sees them."""
+        settings, scene, device = self.settings, self.scene, self._extractor.device
+        zoom = settings.zoom if look >= self.first_look else min(settings.zoom, _GLANCE_ZOOM)
+        if zoom not in self._scales:
+            images, ignore = self._given
+            unit, _ = working_size(scene, settings.working_width, self._extractor.stride)
+            size = working_size(scene, round(settings.working_width * zoom), self._extractor.stride)
+            self._scales[zoom] = _Scale(
+                zoom=size[0] / unit,
+                size=size,
+                images=unveiled(stacked_images(scene, images, size, "image").to(device), settings.unveil),
+                weight=pixel_weights(scene, ignore, size).to(device),
+                whole=Renderer(scene, width=size[0], height=size[1], device=device),
+            )
+        return self._scales[zoom]
 
     @property
     def _viewed(self) -> _View:
@@ -153,9 +199,10 @@ class SurfaceObjective:
 
     def lost(self, offsets: Float[Tensor, " n"]) -> bool:
         """Whether an arm that should be in sight is not where the offsets have it: nothing there is seen as an arm."""
-        start = self._whole.segment(self.parameters.state(torch.zeros_like(offsets)))
         view = self._viewed
-        found = view.window.of(torch.from_numpy(self._whole.segment(self.parameters.state(offsets))))
+        whole = view.scale.whole
+        start = whole.segment(self.parameters.state(torch.zeros_like(offsets)))
+        found = view.window.of(torch.from_numpy(whole.segment(self.parameters.state(offsets))))
         found = found.to(view.coverage.device)
         for arm in range(len(self.scene.arms)):
             here = found == arm
@@ -166,7 +213,8 @@ class SurfaceObjective:
 
     def seen(self) -> Float[Tensor, "cameras h w"]:
         """Where the last look saw arms: their coverage, in the whole compared image."""
-        (width, height), view = self._size, self._viewed
+        view = self._viewed
+        width, height = view.scale.size
         return view.window.paste(view.coverage, view.coverage.new_zeros(len(view.coverage), height, width))
 
     @torch.no_grad()
@@ -186,7 +234,7 @@ class SurfaceObjective:
         point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(own, device=offsets.device), offsets)
         blur = settings.blurs[: max(len(settings.blurs) - _FINE, 1)][-1]
         view = self._viewed
-        stage = Stage(self.scene, self._size, self._zoom, view.window, *view.seen, blur, settings)
+        stage = Stage(self.scene, view.scale.size, view.scale.zoom, view.window, *view.seen, blur, settings)
         compared = stage.compare(wider.state(point), wider.neighbours(point))
         assert compared.gradient is not None and compared.curvature is not None
         prior = wider.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
@@ -216,6 +264,7 @@ class SurfaceObjective:
         generator = torch.Generator().manual_seed(seed)
         spread = _SPREAD * self._prior.marginal.rsqrt().cpu()
         best = offsets
+        self._begun_at = None
         self._look_at(torch.zeros_like(offsets), 0, whole=True)
         best_cost = self._coarse_cost(best)
         for group in self.parameters.groups:
@@ -244,7 +293,7 @@ class SurfaceObjective:
                 cost = self._own_cost(trial)
                 if cost < lowest:
                     best, lowest = trial, cost
-        self._look_at(best, 1)
+        self._look_at(best, self.first_look + 1)
         return best
 
     @torch.no_grad()
@@ -255,10 +304,11 @@ class SurfaceObjective:
         present one; where not, the present one stays.
         """
         start, view = torch.zeros_like(offsets), self._viewed
-        one, other = (self._whole.segment(self.parameters.state(point)) >= 0 for point in (start, offsets))
+        whole = view.scale.whole
+        one, other = (whole.segment(self.parameters.state(point)) >= 0 for point in (start, offsets))
         if 2 * int((one & other).sum()) <= _NEAR_START * (int(one.sum()) + int(other.sum())):
             return False
-        self._look_at(start, self.settings.looks - 1)
+        self._look_at(start, self.look(self.stages - 1))
         stage = self._viewed.stages[-1]
         before, after = (stage.compare(self.parameters.state(point), None).cost for point in (start, offsets))
         gain = (before - after) / self.settings.noise**2 + self._prior.value(start) - self._prior.value(offsets)
@@ -268,11 +318,11 @@ class SurfaceObjective:
         return kept
 
     def forget(self) -> None:
-        """Look again when asked next."""
-        self._view = None
+        """Begin anew when asked next."""
+        self._view, self._begun_at = None, None
 
     def _own_cost(self, offsets: Tensor) -> float:
-        self._look_at(offsets, 1)
+        self._look_at(offsets, self.first_look + 1)
         return self._coarse_cost(offsets)
 
     def _coarse_cost(self, offsets: Tensor) -> float:
@@ -282,30 +332,39 @@ class SurfaceObjective:
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:
         """Have the network say what the image shows, knowing the present estimate: near the arms, or in all of it."""
-        believed = self._whole.surface(self.parameters.state(offsets)).maps
-        later = min(look, 1)
-        margin = max(self._size) if whole else round(_MARGIN[later] * self._zoom)
-        reach = round(_ATTENTION[later] * self._zoom)
-        window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, self._size)
-        observed = self._extractor.surface(window.of(self._images), window.of(believed))
+        scale, later = self._scale(look), int(look > self.first_look)
+        believed = scale.whole.surface(self.parameters.state(offsets)).maps
+        margin = max(scale.size) if whole else round(_MARGIN[later] * scale.zoom)
+        reach = round(_ATTENTION[later] * scale.zoom)
+        window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, scale.size)
+        observed = self._extractor.surface(window.of(scale.images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
-        weight = window.of(self._weight) * near[:, None]
+        weight = window.of(scale.weight) * near[:, None]
         seen = observed, weight
+        blurs = [blur for number, blur in self._plan if number == look]
         stages = [
-            Stage(self.scene, self._size, self._zoom, window, *seen, blur, self.settings)
-            for number, blur in self._plan
-            if number == look
+            Stage(self.scene, scale.size, scale.zoom, window, *seen, blur, self._of(blur, whole)) for blur in blurs
         ]
+        shown = stages[-1] if self._live else None
+        if shown is not None and look < self.first_look:
+            # A glance's own stages are too coarse to be shown.
+            finer = self._plan[len(blurs)][1]
+            shown = Stage(self.scene, scale.size, scale.zoom, window, *seen, finer, self.settings)
         coverage = observed[:, COVERAGE].sum(1)
-        area = float((coverage * weight[:, 0]).sum()) / self._zoom**2
-        self._view = _View(look, window, coverage, seen, area, stages)
+        area = float((coverage * weight[:, 0]).sum()) / scale.zoom**2
+        self._view = _View(look, scale, window, coverage, seen, area, stages, shown)
+
+    def _of(self, blur: float, whole: bool) -> OptimizerSettings:
+        """Settings of a stage. What an image shows far from the arms is often none of them, so it is not believed."""
+        settings = self.settings
+        return replace(settings, robust=settings.coarse_robust) if blur in self._coarsest and not whole else settings
 
     def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)
         neighbours = self.parameters.neighbours(offsets) if gradient else None
         compared = stage.compare(state, neighbours)
-        shown = self._viewed.stages[-1] if self._live else stage
+        shown = self._viewed.shown or stage
         final = compared if stage is shown else shown.compare(state, None)
         prior = self._prior.value(offsets)
         slope, curvature, known = torch.zeros_like(offsets), None, None

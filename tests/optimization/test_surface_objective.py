@@ -116,6 +116,65 @@ def test_nobody_watching_changes_no_step(sequence: Sequence, sight: FeatureExtra
     assert np.array_equal(ends[0].silhouette, ends[1].silhouette)
 
 
+def looks(sequence: Sequence, sight: PerfectSight, monkeypatch: pytest.MonkeyPatch, **settings) -> list[torch.Tensor]:
+    """Coverage of the arms that the network was told, look by look, of a frame 4 degrees off."""
+    frame, told = sequence.frame(0), []
+    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([2.0, -2.0, 0.0, 4.0, 4.0, -4.0, 0.0])}
+
+    def surface(images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+        (left, top), (width, height) = sight.where, sight.size
+        whole = torch.zeros(height, width)
+        whole[top : top + believed.shape[2], left : left + believed.shape[3]] = believed[0, COVERAGE].sum(0)
+        told.append(whole)
+        return PerfectSight.surface(sight, images, believed)
+
+    monkeypatch.setattr(sight, "surface", surface)
+    chosen = OptimizerSettings(working_width=160, keep_start=0.0, **settings)
+    list(FrameOptimizer(sequence.scene, frame, {}, sight, start=start, settings=chosen))  # pyright: ignore
+    return told
+
+
+def test_a_glance_at_a_smaller_image_comes_first(
+    sequence: Sequence, sight: PerfectSight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = looks(sequence, sight, monkeypatch)
+    assert [tuple(one.shape) for one in told] == [(128, 160), *3 * [(176, 240)]]
+    glance = functional.interpolate(told[0][None, None], told[1].shape, mode="bilinear")[0, 0]
+    moved = float((told[2] - told[1]).abs().mean())
+    assert float((glance - told[1]).abs().mean()) < 0.2 * moved, "the first look is told the start, as the glance was"
+    told = looks(sequence, sight, monkeypatch, glance=False)
+    assert [tuple(one.shape) for one in told] == 3 * [(176, 240)]
+
+
+def test_stages_that_others_follow_end_earlier(sequence: Sequence, sight: FeatureExtractor) -> None:
+    frame = sequence.frame(0)
+    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
+    steps = []
+    for tolerance in (1e-5, 0.5):
+        settings = OptimizerSettings(coarse_tolerance=tolerance)
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=start, settings=settings)
+        steps.append(len(list(optimizer)))
+    assert steps[1] <= steps[0] - 4
+
+
+def test_first_steps_are_longer_where_the_coarsest_stage_believes_more(
+    sequence: Sequence, sight: FeatureExtractor
+) -> None:
+    """Where arm and image overlap little, most pixels differ by all they can, and a robust weight takes these away."""
+    frame, renderer = sequence.frame(0), Renderer(sequence.scene)
+    truth = (frame.truth or {})["PSM1"]
+    start = {"PSM1": truth + np.deg2rad([2.5, -2.5, 0.0, 2.5, 2.5, -2.5, 0.0])}
+    mask = renderer.segment(sequence.scene.state({"PSM1": truth}))[0] >= 0
+    overlaps = []
+    for robust in (0.5, 2.0):
+        settings = OptimizerSettings(coarse_robust=robust)
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=start, settings=settings)
+        second = [optimizer.step() for _ in range(3)][-1]
+        assert second is not None
+        overlaps.append(dice(renderer.segment(second.state)[0] >= 0, mask))
+    assert overlaps[1] > overlaps[0] + 0.1
+
+
 def test_an_arm_that_the_first_look_misses_is_searched_in_the_whole_image(
     sequence: Sequence, sight: FeatureExtractor
 ) -> None:
@@ -170,7 +229,7 @@ def test_images_are_enlarged_up_to_the_cameras_and_weigh_the_same(sequence: Sequ
 def test_what_is_not_in_the_image_stays_and_is_said_to_be_unknown(sequence: Sequence, sight: FeatureExtractor) -> None:
     frame = sequence.frame(0)
     truth = (frame.truth or {})["PSM1"]
-    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, settings=OptimizerSettings())
+    optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, settings=OptimizerSettings(prior_deg=3.0))
     list(optimizer)
     best = optimizer.best
     assert best is not None and best.uncertainty is not None
@@ -199,7 +258,8 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
     truth = frame.truth["PSM1"]
 
     def errors() -> np.ndarray:
-        settings = OptimizerSettings(edge_steps=0)  # the edges of the image itself are where they belong
+        # The edges of the image itself are where they belong.
+        settings = OptimizerSettings(edge_steps=0, prior_deg=3.0)
         optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=frame.truth, settings=settings)  # pyright: ignore[reportArgumentType]
         list(optimizer)
         assert optimizer.best is not None
@@ -208,7 +268,7 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
 
     assert errors().max() < 2
     monkeypatch.setattr("carts_core.optimization.surface_objective._OUTLINE", 0.0)
-    assert errors().max() > 4, "pixels that are taken to err one by one promise too much"
+    assert errors().max() > 3, "pixels that are taken to err one by one promise too much"
 
 
 def test_a_base_frame_that_joints_cannot_stand_in_for_is_suspected(sequence: Sequence, sight: FeatureExtractor) -> None:
