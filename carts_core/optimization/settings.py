@@ -46,8 +46,8 @@ class OptimizerSettings:
     looks: int = 3
     """`surface`: how often the network looks at the image; each time it knows better where the arms are."""
     glance: bool = True
-    """`surface`: before the first look, the network takes one at the smaller working image for the coarsest stages, so
-    that a good estimate is there within two or three steps."""
+    """`surface`: before the first look, the network takes one at an image of three quarters of `working_width` for the
+    coarsest stages, so that a good estimate is there soon."""
     zoom: float = 1.5
     """`surface`: how many times larger than the working image the compared images are, up to the camera's image [1]."""
     stage_iterations: int = 6
@@ -113,7 +113,7 @@ class OptimizerSettings:
     tolerance: float = 1e-2
     """`gauss_newton`: the last stage ends when no more than this share of the objective is to be gained [1]. Other
     solvers stop when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
-    coarse_tolerance: float = 0.04
+    coarse_tolerance: float = 0.06
     """`gauss_newton`: the same for stages that others follow [1]."""
     patience: int = 10
     """See `tolerance` [1]."""

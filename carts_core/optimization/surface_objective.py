@@ -50,7 +50,7 @@ _SLIDE = 5e-3
 _FINE = 2
 """Number of blurs that the first look leaves to the others."""
 
-_GLANCE_ZOOM = 1.0
+_GLANCE_ZOOM = 0.75
 """Largest `OptimizerSettings.zoom` of a glance [1]."""
 
 _NEAR_START = 0.9
