@@ -117,7 +117,7 @@ def test_nobody_watching_changes_no_step(sequence: Sequence, sight: FeatureExtra
 
 
 def looks(sequence: Sequence, sight: PerfectSight, monkeypatch: pytest.MonkeyPatch, **settings) -> list[torch.Tensor]:
-    """Coverage of the arms that the network was told, look by look, of a frame 4 degrees off."""
+    """Coverage of the arms that the network was told, look by look, of a frame 2 to 4 degrees off."""
     frame, told = sequence.frame(0), []
     start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([2.0, -2.0, 0.0, 4.0, 4.0, -4.0, 0.0])}
 
@@ -259,7 +259,9 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
 
     def errors() -> np.ndarray:
         # The edges of the image itself are where they belong.
-        settings = OptimizerSettings(edge_steps=0, prior_deg=3.0, coarse_tolerance=1e-3)
+        settings = OptimizerSettings(
+            edge_steps=0, prior_deg=3.0, glance=False, coarse_tolerance=1e-2, coarse_robust=0.5
+        )
         optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, start=frame.truth, settings=settings)  # pyright: ignore[reportArgumentType]
         list(optimizer)
         assert optimizer.best is not None
@@ -268,7 +270,7 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
 
     assert errors().max() < 2
     monkeypatch.setattr("carts_core.optimization.surface_objective._OUTLINE", 0.0)
-    assert errors().max() > 3, "pixels that are taken to err one by one promise too much"
+    assert errors().max() > 4, "pixels that are taken to err one by one promise too much"
 
 
 def test_a_base_frame_that_joints_cannot_stand_in_for_is_suspected(sequence: Sequence, sight: FeatureExtractor) -> None:
