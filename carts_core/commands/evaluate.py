@@ -12,7 +12,7 @@ from rich.progress import track
 from rich.table import Table
 
 from ..data import Sequence
-from ..evaluation import FrameScore, evaluate, evaluate_sequence, mean_score, to_json
+from ..evaluation import FrameScore, camera_groups, evaluate, evaluate_sequence, mean_score, to_json
 from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
@@ -34,7 +34,7 @@ class Evaluate:
     mode: Mode = "frame"
     """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
     together: bool = False
-    """Let all chosen cameras look at a frame in one optimization (stereo), instead of each alone; frame mode only."""
+    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     perturb_deg: float = 0.0
     """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
     seed: int = 0
@@ -55,8 +55,7 @@ class Evaluate:
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
-        alone = partial(evaluate, together=self.together)
-        run = alone if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
+        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
         found = run(
             sequence,
             extractor,
@@ -67,11 +66,12 @@ class Evaluate:
             free=self.free,
             perturb_deg=self.perturb_deg,
             seed=self.seed,
+            together=self.together,
         )
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
         console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
-        for group in [cameras] if self.together else [[camera] for camera in cameras]:
+        for group in camera_groups(cameras, self.together):
             gains = [score.base_frame_gain for score in scores if score.camera in group]
             hint = base_frame_hint(", ".join(group), gains)
             if hint is not None:

@@ -9,25 +9,33 @@ from ..scene import SceneState
 
 
 class FrameFolder:
-    """Masks (`masks/FRAME.png`) and kinematics (`kinematics.csv`) of one camera, never half written.
+    """Masks and kinematics (`kinematics.csv`), never half written.
+
+    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` where there are several cameras.
 
     Args:
-        sequence, camera: whose frames these are.
+        sequence, cameras: whose frames these are.
         folder: where to write.
         rows: what is in its table already.
     """
 
-    def __init__(self, sequence: Sequence, camera: str, folder: Path, rows: list[KinematicsRow]) -> None:
+    def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, rows: list[KinematicsRow]) -> None:
         self.rows, self._folder = rows, folder
         self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
-        self._renderer = Renderer(sequence.scene, cameras=[camera])
-        self._scene = sequence.scene.with_cameras([camera])
+        self._scene = sequence.scene.with_cameras(cameras)
+        folders = {camera: folder / "masks" / (camera if len(cameras) > 1 else "") for camera in cameras}
+        self._views = {folders[camera]: Renderer(self._scene, cameras=[camera]) for camera in cameras}
+
+    def complete(self) -> set[str]:
+        """Frames that are in the table and have all their masks."""
+        ids = (row.frame_id for row in self.rows)
+        return {name for name in ids if all((masks / f"{name}.png").is_file() for masks in self._views)}
 
     def write(self, found: list[tuple[KinematicsRow, SceneState]]) -> None:
         """Write masks and rows of frames, in place of earlier ones."""
         for row, state in found:
-            mask = self._renderer.segment(state.to("cpu"))[0] >= 0
-            write_bytes(self._folder / "masks" / f"{row.frame_id}.png", mask_png(mask))
+            for masks, renderer in self._views.items():
+                write_bytes(masks / f"{row.frame_id}.png", mask_png(renderer.segment(state.to("cpu"))[0] >= 0))
         new = {row.frame_id: row for row, _ in found}
         rows = {row.frame_id: row for row in self.rows} | new
         self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])

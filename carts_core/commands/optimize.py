@@ -14,7 +14,7 @@ from rich.progress import track
 
 from ..data import Sequence
 from ..errors import SettingsError
-from ..evaluation import Starts, start_positions
+from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv, write_bytes
 from ..features.extractor import FeatureExtractor
 from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
@@ -30,11 +30,13 @@ class Optimize:
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`."""
+    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras if they look together."""
     overwrite: bool = False
     """Start over, although the folder holds results of other settings."""
     mode: Mode = "frame"
     """Correct each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+    together: bool = False
+    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     keyframes: Path | None = None
     """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
     perturb_deg: float = 0.0
@@ -56,32 +58,32 @@ class Optimize:
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         frames = self.select.frame_indices(sequence)
         for domain in self.select.domain_names(sequence):
-            for camera in self.select.camera_names(sequence.scene):
-                folder = (self.output or Path("runs") / sequence.name) / domain / camera
-                self._run_camera(sequence, extractor, frames, domain, camera, folder, console)
+            for cameras in camera_groups(self.select.camera_names(sequence.scene), self.together):
+                folder = (self.output or Path("runs") / sequence.name) / domain / "+".join(cameras)
+                self._run_cameras(sequence, extractor, frames, domain, cameras, folder, console)
 
-    def _run_camera(
+    def _run_cameras(
         self,
         sequence: Sequence,
         extractor: FeatureExtractor,
         frames: list[int],
         domain: str,
-        camera: str,
+        cameras: tuple[str, ...],
         folder: Path,
         console: Console,
     ) -> None:
         rows = self._earlier_rows(sequence, extractor, folder)
-        done = {row.frame_id for row in rows if (folder / "masks" / f"{row.frame_id}.png").is_file()}
+        output = FrameFolder(sequence, cameras, folder, rows)
+        done = output.complete()
         todo = [index for index in frames if sequence.frame_ids[index] not in done]
         if len(todo) < len(frames):
             console.print(f"{folder}: {len(frames) - len(todo)} of {len(frames)} frames are there already")
         if self.mode == "sequence":
             # Every frame depends on all others, so one that is missing has all of them done again.
-            run, todo = self._together, frames if todo else []
+            run, todo = self._as_sequence, frames if todo else []
         else:
             run = self._alone
-        output = FrameFolder(sequence, camera, folder, rows)
-        run(sequence, extractor, todo, domain, camera, output, console)
+        run(sequence, extractor, todo, domain, cameras, output, console)
         console.print(f"wrote {len(output.rows)} masks and kinematics.csv to {folder}")
 
     def _alone(
@@ -90,15 +92,15 @@ class Optimize:
         extractor: FeatureExtractor,
         todo: list[int],
         domain: str,
-        camera: str,
+        cameras: tuple[str, ...],
         output: FrameFolder,
         console: Console,
     ) -> None:
         needed = todo and self.optimizer.needs_background
-        background = {camera: sequence.background(camera, domain)} if needed else {}
-        gains = []
-        for index in track(todo, f"{domain}, {camera}", console=console, disable=not todo):
-            frame = sequence.frame(index, domain, [camera])
+        background = {camera: sequence.background(camera, domain) for camera in cameras} if needed else {}
+        where, gains = f"{domain}, {', '.join(cameras)}", []
+        for index in track(todo, where, console=console, disable=not todo):
+            frame = sequence.frame(index, domain, cameras)
             optimizer = FrameOptimizer(
                 sequence.scene,
                 frame,
@@ -107,7 +109,7 @@ class Optimize:
                 start=start_positions(sequence, frame, self.perturb_deg, self.seed),
                 settings=self.optimizer,
                 free=self.free,
-                cameras=[camera],
+                cameras=cameras,
                 live=False,
             )
             for _ in optimizer:
@@ -117,23 +119,23 @@ class Optimize:
             row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
             output.write([(row, best.state)])
             gains.append(optimizer.base_frame_gain())
-        hint = base_frame_hint(f"{domain}, {camera}", gains)
+        hint = base_frame_hint(where, gains)
         if hint is not None:
             console.print(hint, style="yellow")
 
-    def _together(
+    def _as_sequence(
         self,
         sequence: Sequence,
         extractor: FeatureExtractor,
         todo: list[int],
         domain: str,
-        camera: str,
+        cameras: tuple[str, ...],
         output: FrameFolder,
         console: Console,
     ) -> None:
         if not todo:
             return
-        starts = Starts(sequence, domain, camera, self.perturb_deg, self.seed)
+        starts = Starts(sequence, domain, cameras, self.perturb_deg, self.seed)
         optimizer = SequenceOptimizer(
             sequence.scene,
             starts.frame,
@@ -143,10 +145,10 @@ class Optimize:
             model=self.model,
             free=self.free,
             keyframes=self._keyframes(sequence, todo),
-            cameras=[camera],
+            cameras=cameras,
         )
         try:
-            for _ in track(optimizer, f"{domain}, {camera}", total=len(todo), console=console):
+            for _ in track(optimizer, f"{domain}, {', '.join(cameras)}", total=len(todo), console=console):
                 pass
         finally:
             # Ctrl-C keeps what is there.

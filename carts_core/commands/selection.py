@@ -23,7 +23,7 @@ class Selection:
     frames: str = ALL
     """Positions of frames, counted from 0: `all`, numbers and ranges such as `0-9,15`, or `::3` for every third."""
     camera: tuple[str, ...] = (ALL,)
-    """Cameras, by name; each one is worked on alone."""
+    """Cameras, by name."""
     domain: tuple[str, ...] = ()
     """Domains, by name, or `all`; the sequence's first one if none is named."""
 

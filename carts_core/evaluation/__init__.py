@@ -6,6 +6,7 @@ from .calibration import frame_residuals as frame_residuals
 from .calibration import mean_dice as mean_dice
 from .calibration_report import write_calibration as write_calibration
 from .evaluate import FrameScore as FrameScore
+from .evaluate import camera_groups as camera_groups
 from .evaluate import evaluate as evaluate
 from .evaluate import mean_score as mean_score
 from .evaluate import start_positions as start_positions
@@ -22,6 +23,7 @@ __all__ = [
     "FrameScore",
     "Starts",
     "calibration_json",
+    "camera_groups",
     "dice",
     "evaluate",
     "evaluate_sequence",

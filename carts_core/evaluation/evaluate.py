@@ -65,9 +65,8 @@ def evaluate(
         seed: of the perturbation; the same frame gets the same one in every camera and domain.
         together: one optimization for all cameras; a frame has a score for each, which share its time.
     """
-    groups = [tuple(cameras)] if together else [(camera,) for camera in cameras]
     for domain in domains:
-        for group in groups:
+        for group in camera_groups(cameras, together):
             scene = sequence.scene.with_cameras(group)
             renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
             seen = group if settings.needs_background else ()
@@ -100,6 +99,11 @@ def evaluate(
                         optimizer.stop_reason,
                         gain,
                     )
+
+
+def camera_groups(cameras: Names[str], together: bool) -> list[tuple[str, ...]]:
+    """Cameras that take part in one optimization: all of them, or each alone."""
+    return [tuple(cameras)] if together else [(camera,) for camera in cameras]
 
 
 def start_positions(

@@ -8,7 +8,7 @@ from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
 from ..rendering import Renderer
-from .evaluate import FrameScore, frame_score, start_positions
+from .evaluate import FrameScore, camera_groups, frame_score, start_positions
 
 
 def evaluate_sequence(
@@ -23,58 +23,61 @@ def evaluate_sequence(
     free: FreeParameters,
     perturb_deg: float = 0.0,
     seed: int = 0,
+    together: bool = False,
 ) -> Iterator[FrameScore]:
-    """As `evaluate`, but the frames of a camera and domain are corrected together; see `SequenceOptimizer`.
+    """As `evaluate`, but the frames of a camera (or all) and domain inform each other; see `SequenceOptimizer`.
 
     A perturbation is the same in all frames, as an error of calibration is.
     """
+    groups = camera_groups(cameras, together)
     for domain in domains:
-        for camera in cameras:
-            renderer = Renderer(sequence.scene, cameras=[camera])
-            starts = Starts(sequence, domain, camera, perturb_deg, seed)
+        for group in groups:
+            scene = sequence.scene.with_cameras(group)
+            renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
+            starts = Starts(sequence, domain, group, perturb_deg, seed)
             optimizer = SequenceOptimizer(
-                sequence.scene,
+                scene,
                 starts.frame,
                 starts.times(frames),
                 extractor,
                 settings=settings,
                 model=model,
                 free=free,
-                cameras=[camera],
             )
             for _ in optimizer:
                 pass
             for index, estimate in sorted(optimizer.estimates.items()):
                 frame = starts.frame(index)
-                yield frame_score(
-                    sequence,
-                    frame,
-                    camera,
-                    renderer,
-                    frame.measured,
-                    estimate.state,
-                    estimate.joint_positions,
-                    estimate.joint_std,
-                    estimate.iterations,
-                    estimate.seconds,
-                    estimate.start,
-                )
+                for camera, renderer in renderers.items():
+                    yield frame_score(
+                        sequence,
+                        frame,
+                        camera,
+                        renderer,
+                        frame.measured,
+                        estimate.state,
+                        estimate.joint_positions,
+                        estimate.joint_std,
+                        estimate.iterations,
+                        estimate.seconds / len(group),
+                        estimate.start,
+                    )
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Frames of one camera and domain as sequence mode takes them: what is called measured is where it starts."""
+    """Frames of cameras in a domain as sequence mode takes them: what is called measured is where it starts."""
 
     sequence: Sequence
     domain: str
-    camera: str
+    cameras: tuple[str, ...]
     perturb_deg: float
     seed: int
     """Of the perturbation, which is the same in all frames."""
 
     def frame(self, index: int) -> Frame:
         """The frame at a position of the sequence."""
-        frame = self.sequence.frame(index, self.domain, [self.camera])
+        frame = self.sequence.frame(index, self.domain, self.cameras)
         return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, (self.seed,)))
 
     def times(self, frames: Names[int]) -> dict[int, float | None]:

@@ -73,6 +73,28 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     assert not list(folder.rglob("*.part"))
 
 
+@pytest.mark.parametrize("mode", ["frame", "sequence"])
+def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], mode: str
+) -> None:
+    stereo = str(tiny_sequence(frames=2, cameras=("left", "right"), width=160, height=128))
+    command = ["optimize", stereo, "--together", "--mode", mode, "--output", str(tmp_path), "--iterations", "2"]
+    main(command)
+    folder = tmp_path / "regular" / "left+right"
+    rows = list(csv.DictReader((folder / "kinematics.csv").open()))
+    assert [row["frame"] for row in rows] == ["001", "002"]
+    files = [folder / "masks" / camera / f"{row['frame']}.png" for camera in ("left", "right") for row in rows]
+    assert sorted((folder / "masks").rglob("*.png")) == files
+    one, other = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in (files[0], files[2]))
+    assert (one > 0).any() and (other > 0).any() and (one != other).any()
+
+    main(command)
+    assert "2 of 2 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    files[3].unlink()
+    main(command)
+    assert files[3].is_file(), "a frame without one of its masks is done again"
+
+
 def test_evaluate_corrects_frames_together_in_sequence_mode(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "out.json"
     main(["evaluate", sequence, "--mode", "sequence", "--perturb-deg", "1", "--json", str(file)])
