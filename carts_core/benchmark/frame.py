@@ -20,6 +20,7 @@ from ..rendering import Renderer
 from ..scene import Arm, Scene, SceneState
 from .machine import machine
 from .measurement import Measurement, Score
+from .methods import METHODS
 from .scope import Run
 
 TOLERANCE = 2.0
@@ -132,14 +133,17 @@ def _tip_depths(scene: Scene, arm: Arm, joint_positions: Mapping[str, np.ndarray
     return np.array([point[2] for point in points])
 
 
-def start_of(
-    scene: Scene, frame: Frame, error_deg: float | None, joints: Mapping[str, tuple[str, ...]]
-) -> dict[str, np.ndarray]:
-    """Joint positions that a run starts from; see `Run.error_deg`. All methods and domains get the same error."""
-    if error_deg is None:
+def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """Joint positions that a run starts from; see `Run.error_deg`.
+
+    All methods and domains get the same error, and all frames that are corrected together.
+    """
+    error = run.error_deg
+    if error is None:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
-    return perturb(scene, origin, error_deg, (_SEED, frame.index), joints)
+    seed = (_SEED, round(1e3 * error)) if METHODS[run.method].together else (_SEED, frame.index)
+    return perturb(scene, origin, error, seed, joints)
 
 
 def optimize(
@@ -168,7 +172,7 @@ def optimize(
         renderer: draws the masks of the camera that is scored, at its size.
         ignore: camera name -> pixels that show an occluder.
     """
-    start = start_of(scene, frame, run.error_deg, truth.measured_joints)
+    start = start_of(scene, frame, run, truth.measured_joints)
     began = time.perf_counter()
     optimizer = FrameOptimizer(
         scene, frame, background, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False

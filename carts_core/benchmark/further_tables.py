@@ -69,37 +69,39 @@ def calibration_table(data: Measurements) -> Table | None:
 
 def sequence_table(data: Measurements) -> Table | None:
     """Frames corrected together, beside the same frames alone."""
+    found = data.of(method="sequence")
     rows = []
-    for source in data.sources():
-        for domain in data.domains(source):
-            together = data.of(source=source, domain=domain, method="sequence")
-            if not together:
-                continue
-            warm = [m.final.seconds for m in together if m.stopped == "warm"]
-            alone = {m.run.frame: m for m in data.of(source=source, domain=domain, method="ours", error_deg=None)}
-            both = [m for m in together if m.run.frame in alone]
-            rows.append(
-                (
-                    Cell(source),
-                    Cell(DOMAIN_LABELS[domain]),
-                    Cell(str(len(together))),
-                    *(
-                        column.cell(scores)
-                        for column in (_DICE, _JOINTS)
-                        for scores in ([m.start for m in together if m.start], [m.final for m in together])
-                    ),
-                    Cell(f"{median(warm):.2f}" if warm else NOTHING, f"{len(warm)} frames"),
-                    Cell(str(len(both))),
-                    _DICE.cell(alone[m.run.frame].final for m in both),
-                    _DICE.cell(m.final for m in both),
-                )
+    for source, domain, error in dict.fromkeys((m.run.source, m.run.domain, m.run.error_deg) for m in found):
+        together = data.of(source=source, domain=domain, method="sequence", error_deg=error)
+        warm = [m.final.seconds for m in together if m.stopped == "warm"]
+        alone = {m.run.frame: m for m in data.of(source=source, domain=domain, method="ours", error_deg=error)}
+        both = [m for m in together if m.run.frame in alone]
+        rows.append(
+            (
+                Cell(source),
+                Cell(DOMAIN_LABELS[domain]),
+                Cell(begun(error)),
+                Cell(str(len(together))),
+                *(
+                    column.cell(scores)
+                    for column in (_DICE, _JOINTS)
+                    for scores in ([m.start for m in together if m.start], [m.final for m in together])
+                ),
+                _VISIBLE.cell(m.final for m in together),
+                Cell(f"{median(warm):.2f}" if warm else NOTHING, f"{len(warm)} frames"),
+                Cell(str(len(both))),
+                _DICE.cell(alone[m.run.frame].final for m in both),
+                _DICE.cell(m.final for m in both),
             )
+        )
     header = (
-        *("frames", "domain", "number", "Dice before", "Dice", "joint MAE before [deg]", "joint MAE [deg]"),
-        *("s per warm frame", "also alone", "Dice alone", "Dice together"),
+        *("frames", "domain", "error at the start", "number", "Dice before", "Dice"),
+        *("joint MAE before [deg]", "joint MAE [deg]", "visible joints [deg]", "s per warm frame"),
+        *("also alone", "Dice alone", "Dice together"),
     )
     caption = (
-        "The first frames of each sequence from the measured kinematics, one knowing what the others found. Seconds: "
+        "The first frames of each sequence, one knowing what the others found. An error at the start is the same in "
+        "all of them; alone, each frame has signs of its own. Seconds: "
         "median over frames that started at their neighbour's correction, reading the image included. At the right the "
         "frames that were corrected alone, too."
     )

@@ -24,8 +24,9 @@ def plan(scope: Scope, sources: Iterable[Source]) -> list[Run]:
                 runs += _runs_of_frame(scope, source, source.frames[turn])
     together = [name for name, method in METHODS.items() if method.together]
     return runs + [
-        Run(source.name, domain, frame, method)
+        Run(source.name, domain, frame, method, error)
         for source in sources
+        for error in (None, *(scope.consecutive_errors_deg if source.name == SYNTHETIC else ()))
         for domain in scope.consecutive_domains
         for method in together
         for frame in source.consecutive

@@ -55,6 +55,8 @@ class Scope:
     """Frames of the beginning of each sequence that are corrected together, at most."""
     consecutive_domains: tuple[str, ...]
     """Domains in which they are."""
+    consecutive_errors_deg: tuple[float, ...]
+    """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
     calibration_frames: int
     """Frames of a real sequence that are calibrated with, evenly spread."""
 
@@ -88,11 +90,12 @@ QUICK = Scope(
     hard_errors_deg=(2.0,),
     consecutive=6,
     consecutive_domains=("regular",),
+    consecutive_errors_deg=(2.0,),
     calibration_frames=8,
 )
 FULL = Scope(
     frames=8,
-    sequence_frames=12,
+    sequence_frames=24,
     samples=8,
     paper_iterations=100,
     error_domains=DOMAINS,
@@ -102,5 +105,6 @@ FULL = Scope(
     hard_errors_deg=(2.0,),
     consecutive=30,
     consecutive_domains=DOMAINS,
+    consecutive_errors_deg=(1.0, 2.0, 3.0),
     calibration_frames=20,
 )

@@ -65,7 +65,7 @@ def _seconds(data: Measurements) -> Target:
 
 
 def _warm_seconds(data: Measurements, *, gpu: bool) -> list[float]:
-    chosen = data.of(source=SYNTHETIC, method="sequence")
+    chosen = data.of(source=SYNTHETIC, method="sequence", error_deg=None)
     return [m.final.seconds for m in chosen if m.stopped == "warm" and on_gpu(m.machine) == gpu]
 
 

@@ -1,13 +1,15 @@
 """What takes many frames at once: one calibration of a recording, and frames that are corrected as a sequence."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
+from ..data import Frame
 from ..data.background import spread
 from ..features.extractor import FeatureExtractor
 from ..optimization import CalibrationOptimizer, SequenceOptimizer
 from ..rendering import Renderer
 from ..scene import Scene
-from .frame import Truth
+from .frame import Truth, start_of
 from .machine import machine
 from .measurement import Measurement
 from .scope import Run
@@ -33,12 +35,12 @@ def correct_together(
     truths: Mapping[int, Truth],
     renderer: Renderer,
 ) -> list[Measurement]:
-    """Correct frames as a sequence, from the measured joint positions on, and score them when all are done.
+    """Correct frames as a sequence, and score them when all are done.
 
     Seconds are those spent on a frame over all visits, reading its image included.
 
     Args:
-        runs: one per frame, of one domain.
+        runs: one per frame, of one domain and error at the start.
         recording: where the frames are from.
         extractor: the networks.
         truths: position of the frame -> what its estimate is compared with.
@@ -47,10 +49,15 @@ def correct_together(
     by_frame = {run.frame: run for run in runs}
     (domain,) = {run.domain for run in by_frame.values()}
     scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
+
+    def frame_at(index: int) -> Frame:
+        frame = recording.frame(index, domain, cameras)
+        return replace(frame, measured=start_of(scene, frame, by_frame[index], truths[index].measured_joints))
+
     stamps = recording.timestamps
     optimizer = SequenceOptimizer(
         scene,
-        lambda index: recording.frame(index, domain, cameras),
+        frame_at,
         {index: None if stamps is None else float(stamps[index]) for index in by_frame},
         extractor,
     )
@@ -58,7 +65,7 @@ def correct_together(
         pass
     found = []
     for index, estimate in sorted(optimizer.estimates.items()):
-        truth, state = truths[index], scene.state(recording.frame(index, domain, cameras).measured)
+        truth, state = truths[index], scene.state(frame_at(index).measured)
         before = truth.score(state, None, None, renderer, 0.0)
         after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
         found.append(Measurement(by_frame[index], after, (), (), estimate.start, machine(extractor.device), before))

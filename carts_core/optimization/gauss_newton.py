@@ -19,20 +19,21 @@ class GaussNewton:
     """Solves for the step that the linear model says is best, and believes it as far as it has proved right.
 
     A stage ends when the model promises no more than `tolerance` of the objective (`coarse_tolerance` where another one
-    follows), or after `stage_iterations`.
+    follows and it never had to begin again), or after `stage_iterations`.
     """
 
     def __init__(self, settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> None:
         self._settings, self._parameters, self._stages = settings, parameters, stages
         self.stage = 0
         self.finished: str | None = None
-        self._damping = _FIRST_DAMPING
+        self._damping, self._enough = _FIRST_DAMPING, settings.coarse_tolerance
         self._iterations = 0
         self._begin_stage()
 
     def restart(self, stage: int) -> None:
-        """Begin again with a stage; iterations go on counting."""
+        """Begin again with a stage, with more care than before; iterations go on counting."""
         self.stage, self.finished, self._damping = stage, None, _FIRST_DAMPING
+        self._enough = min(self._enough, self._settings.tolerance)
         self._begin_stage()
 
     def _begin_stage(self) -> None:
@@ -53,7 +54,7 @@ class GaussNewton:
         offsets, evaluation = self._accepted
         step, promised = self._step(evaluation)
         settings, last = self._settings, self.stage == self._stages - 1
-        enough = (settings.tolerance if last else settings.coarse_tolerance) * evaluation.value
+        enough = (settings.tolerance if last else self._enough) * evaluation.value
         converged = promised < enough or self._rejections >= _REJECTIONS
         if converged or self._evaluations >= settings.stage_iterations:
             if last:

@@ -66,7 +66,7 @@ class OptimizerSettings:
     """`surface`: difference of surface maps beyond which a pixel is not believed [1]."""
     coarse_robust: float = 2.0
     """`surface`: the same in stages before the last three of `blurs`, where the image is seen near the arms only; first
-    steps are longer for it [1]."""
+    steps are longer for it; never less than `robust` [1]."""
     propose_ignore: bool = False
     """`surface`: solve a frame again, from its start and in as many steps, without areas at the arms that contradicted
     the first solution. Only where each frame is alone. It does not always help: see docs/benchmark.md."""

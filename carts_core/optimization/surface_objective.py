@@ -41,7 +41,7 @@ _SUPPORT = 0.5
 _LEFT = 0.3
 """Share of the silhouette it started with that an arm has to keep, or it has gone elsewhere to be rid of it [1]."""
 
-_SPREAD = 1.5
+_SPREAD = 1.8
 """Deviation of random starts, in expected errors."""
 
 _SLIDE = 5e-3
@@ -258,7 +258,7 @@ class SurfaceObjective:
 
         Args:
             offsets: what has been found so far; it and the start are among the candidates.
-            candidates: number of random ones per arm, drawn from what the prior expects and half as much again.
+            candidates: number of random ones per arm, drawn from `_SPREAD` times what the prior expects.
             seed: of the random numbers.
         """
         generator = torch.Generator().manual_seed(seed)
@@ -358,7 +358,9 @@ class SurfaceObjective:
     def _of(self, blur: float, whole: bool) -> OptimizerSettings:
         """Settings of a stage. What an image shows far from the arms is often none of them, so it is not believed."""
         settings = self.settings
-        return replace(settings, robust=settings.coarse_robust) if blur in self._coarsest and not whole else settings
+        if whole or blur not in self._coarsest:
+            return settings
+        return replace(settings, robust=max(settings.robust, settings.coarse_robust))
 
     def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
         state = self.parameters.state(offsets)

@@ -24,6 +24,7 @@ TINY = Scope(
     hard_errors_deg=(2.0,),
     consecutive=2,
     consecutive_domains=("regular",),
+    consecutive_errors_deg=(2.0,),
     calibration_frames=2,
 )
 

@@ -1,7 +1,9 @@
 """What is read off one run."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from handmade import make_measurement
 from tiny import tiny_scene
 
 from carts_core.benchmark import Measurement, Run, Score
-from carts_core.benchmark.frame import tip_depth_error_mm
+from carts_core.benchmark.frame import start_of, tip_depth_error_mm
+from carts_core.data import Sequence
 from carts_core.robot import Robot
 
 
@@ -68,3 +71,17 @@ def test_the_depth_of_the_tips_is_compared_along_the_cameras_axis(shipped_psm: R
     assert tip_depth_error_mm(tiny.scene, longer, truth) == pytest.approx(
         1e3 * abs(moved @ viewing_direction), abs=1e-6
     )
+
+
+def test_frames_corrected_together_begin_with_one_error_and_frames_alone_each_with_its_own(
+    tiny_sequence: Callable[..., Path],
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=4))
+    errors = {}
+    for method in ("ours", "sequence"):
+        for index in range(4):
+            frame, run = sequence.frame(index), Run("synthetic", "regular", index, method, 2.0)
+            start, truth = start_of(sequence.scene, frame, run, sequence.measured_joints), frame.truth or {}
+            errors[method, index] = np.round(start["PSM1"] - truth["PSM1"], 9).tolist()
+    assert all(errors["sequence", index] == errors["sequence", 0] for index in range(4))
+    assert any(errors["ours", index] != errors["ours", 0] for index in range(4))

@@ -38,13 +38,22 @@ def test_the_worst_domain_decides_on_dice() -> None:
     good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0) for domain in DOMAINS[1:]]
     fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
     bad = make_measurement((0.6, 0.97), domain="regular", error_deg=2.0)
-    assert _target("synthetic, 2° off: mean Dice", fine, *good).met is True
-    part = _target("synthetic, 2° off: mean Dice", fine)
+    assert _target("synthetic, 2° off, each frame alone: mean Dice", fine, *good).met is True
+    part = _target("synthetic, 2° off, each frame alone: mean Dice", fine)
     assert part.met is None and part.reached == "0.981" and "domains measured: 1" in part.basis
-    missed = _target("synthetic, 2° off: mean Dice", bad)
+    missed = _target("synthetic, 2° off, each frame alone: mean Dice", bad)
     assert missed.met is False
-    missed = _target("synthetic, 2° off: mean Dice", bad, *good)
+    missed = _target("synthetic, 2° off, each frame alone: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
+
+
+def test_sequence_mode_has_verdicts_of_its_own() -> None:
+    good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0, method="sequence") for domain in DOMAINS]
+    assert _target("synthetic, 2° off, in sequence mode: mean Dice", *good).met is True
+    assert _target("synthetic, 2° off, each frame alone: mean Dice", *good).met is None
+    worse = make_measurement((0.6, 0.5), error_deg=2.0, method="sequence")
+    assert _target("frames made worse", worse).reached == "100.0 %"
+    assert _target("sequence mode, seconds", *good).reached == "not measured", "times are those as measured"
 
 
 def test_iterations_count_until_near_the_final_dice() -> None:
@@ -78,13 +87,13 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
 
 
 def test_visible_joints_have_no_verdict_as_long_as_nobody_says_which_they_are() -> None:
-    target = _target("synthetic, 1° off: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
+    target = _target("synthetic, 1° off, each frame alone: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
     assert target.met is None and "all measured joints: 0.50°" in target.basis
 
 
 def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_and_nowhere_else() -> None:
     covered = make_measurement((0.7, 0.6), domain="occlusion", error_deg=2.0)
-    assert _target("synthetic, 2° off: mean Dice", covered).met is None
+    assert _target("synthetic, 2° off, each frame alone: mean Dice", covered).met is None
     assert _target("seconds per frame", covered).reached == "not measured"
     assert _target("frames made worse", covered).reached == "100.0 %"
     plain = [make_measurement((0.9, dice), domain="occlusion", frame=i) for i, dice in enumerate((0.95, 0.97))]
