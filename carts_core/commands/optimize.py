@@ -84,7 +84,7 @@ class Optimize:
         else:
             run = self._alone
         run(sequence, extractor, todo, domain, cameras, output, console)
-        console.print(f"wrote {len(output.rows)} masks and kinematics.csv to {folder}")
+        console.print(f"wrote masks and kinematics.csv of {len(output.rows)} frames to {folder}")
 
     def _alone(
         self,
