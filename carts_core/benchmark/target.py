@@ -45,7 +45,9 @@ def make_target(
     if value is None:
         return Target(what, bound, "not measured", None, reference, basis)
     met = value >= least_or_most if at_least else value <= least_or_most
-    return Target(what, bound, text(value), met if complete or not met else None, reference, basis)
+    near = not met and text(value) == text(least_or_most)
+    reached = f"just {'below' if at_least else 'above'} {text(value)}" if near else text(value)
+    return Target(what, bound, reached, met if complete or not met else None, reference, basis)
 
 
 def counted(number: int, what: str) -> str:

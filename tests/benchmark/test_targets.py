@@ -47,6 +47,12 @@ def test_the_worst_domain_decides_on_dice() -> None:
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
 
 
+def test_a_target_missed_by_less_than_is_written_says_so() -> None:
+    barely = make_measurement((0.6, 0.9798), error_deg=2.0)
+    target = _target("synthetic, 2° off, each frame alone: mean Dice", barely)
+    assert target.met is False and target.reached == "just below 0.980"
+
+
 def test_sequence_mode_has_verdicts_of_its_own() -> None:
     good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0, method="sequence") for domain in DOMAINS]
     assert _target("synthetic, 2° off, in sequence mode: mean Dice", *good).met is True
