@@ -83,9 +83,11 @@ def sequence_table(data: Measurements) -> Table | None:
                 Cell(begun(error)),
                 Cell(str(len(together))),
                 *(
-                    column.cell(scores)
+                    Cell(
+                        column.cell(m.final for m in together).text,
+                        f"before: {column.cell(m.start for m in together if m.start).text}",
+                    )
                     for column in (_DICE, _JOINTS)
-                    for scores in ([m.start for m in together if m.start], [m.final for m in together])
                 ),
                 _VISIBLE.cell(m.final for m in together),
                 Cell(f"{median(warm):.2f}" if warm else NOTHING, f"{len(warm)} frames"),
@@ -95,9 +97,8 @@ def sequence_table(data: Measurements) -> Table | None:
             )
         )
     header = (
-        *("frames", "domain", "error at the start", "number", "Dice before", "Dice"),
-        *("joint MAE before [deg]", "joint MAE [deg]", "visible joints [deg]", "s per warm frame"),
-        *("also alone", "Dice alone", "Dice together"),
+        *("frames", "domain", "error at the start", "number", "Dice", "joint MAE [deg]", "visible joints [deg]"),
+        *("s per warm frame", "also alone", "Dice alone", "Dice together"),
     )
     caption = (
         "The first frames of each sequence, one knowing what the others found. An error at the start is the same in "
