@@ -32,6 +32,10 @@ def _first_and_last(value, slope, first, last):
 @numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
     """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z), seen from behind if two-sided."""
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
+    # An image's y points down, so corners that go round counterclockwise span a negative area.
+    if area == 0.0 or (area > 0.0 and not two_sided):
+        return
     height, width = face_ids.shape
     # Only pixel centres (x + 0.5, y + 0.5) inside the bounding box can be covered.
     first_x = max(int(np.ceil(max(min(u[a], u[b], u[c]) - 0.5, 0.0))), 0)
@@ -39,10 +43,6 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_
     first_y = max(int(np.ceil(max(min(v[a], v[b], v[c]) - 0.5, 0.0))), 0)
     last_y = min(int(np.floor(min(max(v[a], v[b], v[c]) - 0.5, height - 1.0))), height - 1)
     if first_x > last_x or first_y > last_y:
-        return
-    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
-    # An image's y points down, so corners that go round counterclockwise span a negative area.
-    if area == 0.0 or (area > 0.0 and not two_sided):
         return
     scale = 1.0 / area
     # Barycentric coordinates and 1/z are affine in the image.
@@ -99,7 +99,8 @@ def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width,
     for face in range(faces.shape[0]):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         surface = surfaces[face]
-        if surface < 0 or (inverse_z[a] > 0.0 and inverse_z[b] > 0.0 and inverse_z[c] > 0.0):
+        in_front = int(inverse_z[a] > 0.0) + int(inverse_z[b] > 0.0) + int(inverse_z[c] > 0.0)
+        if surface < 0 or not 0 < in_front < 3:
             continue
         corners = _clip(faces[face], inverse_z, vertices, fx, fy, cx, cy, u, v, inverse_near)
         for k in range(corners):
@@ -127,6 +128,8 @@ def _rasterize(vertices, faces, surfaces, closed, fx, fy, cx, cy, face_ids, inve
         two_sided = surfaces[face] < 0 or opened[surfaces[face]]
         if inverse_z[a] > 0.0 and inverse_z[b] > 0.0 and inverse_z[c] > 0.0:
             _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth)
+            continue
+        if inverse_z[a] <= 0.0 and inverse_z[b] <= 0.0 and inverse_z[c] <= 0.0:
             continue
         corners = _clip(faces[face], inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z)
         for last in range(2, corners):
