@@ -46,7 +46,7 @@ def _dice_after(data: Measurements, method: str, error: float, least: float) -> 
         f"synthetic, {error:g}° off, {_MODES[method]}: mean Dice in every domain",
         least,
         None if worst is None else means[worst],
-        _worst_of(means, worst),
+        f"{_worst_of(means, worst)}, mean over {counted(len(by_domain[worst]), 'frame')}" if worst else "no runs",
         at_least=True,
         text=lambda value: f"{value:.3f}",
         reference=f"paper, S-Reg: {paper}",

@@ -14,7 +14,7 @@ _UNDER_OCCLUDERS = ("ours", "ours_told", "ours_proposed")
 def plan(scope: Scope, sources: Iterable[Source]) -> list[Run]:
     """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
 
-    Frames that are corrected together come last.
+    Frames on which not all methods are evaluated come after that, and frames that are corrected together last.
     """
     sources = list(sources)
     runs: list[Run] = []
@@ -22,6 +22,9 @@ def plan(scope: Scope, sources: Iterable[Source]) -> list[Run]:
         for source in sources:
             if turn < len(source.frames):
                 runs += _runs_of_frame(scope, source, source.frames[turn])
+    for source in sources:
+        for frame in source.further:
+            runs += _runs_of_further_frame(scope, source, frame)
     together = [name for name, method in METHODS.items() if method.together]
     return runs + [
         Run(source.name, domain, frame, method, error)
@@ -53,3 +56,14 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
     if source.name == REAL:
         runs += [Run(source.name, "regular", frame, method) for method, entry in METHODS.items() if entry.calibrated]
     return runs
+
+
+def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
+    if source.name == REAL:
+        # One calibration serves the whole recording, and scoring it costs next to nothing.
+        return [Run(source.name, "regular", frame, "calibrated")]
+    return [
+        Run(source.name, domain, frame, "ours", error)
+        for error in scope.further_errors_deg
+        for domain in scope.error_domains
+    ]

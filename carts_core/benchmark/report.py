@@ -47,11 +47,12 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         CartsError: the folder cannot be written to.
     """
     data = Measurements(measurements)
+    compared = data.compared()
     verdicts = targets(data)
     sections: list[tuple[str, list[Table]]] = [
         ("Main table", main_tables(data)),
         ("Iterations", iteration_tables(data)),
-        ("Error at the start", error_tables(data)),
+        ("Error at the start", error_tables(compared)),
         ("Occlusion", _known(occlusion_table(data))),
         ("Several cameras", _known(camera_table(data))),
         ("Calibration", _known(calibration_table(data))),
@@ -59,7 +60,7 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         ("Speed and safety", _known(speed_table(data), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
     ]
-    figures = write_figures(data, folder / "figures")
+    figures = write_figures(compared, folder / "figures")
     rows = [_row(measurement) for measurement in measurements]
     document = {
         "format": "carts-benchmark/1",

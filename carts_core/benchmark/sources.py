@@ -59,7 +59,7 @@ class Source:
     camera: str
     """The camera that takes part, and in which is scored."""
     frames: list[int]
-    """Positions of the evaluated frames."""
+    """Positions of the frames on which all methods are evaluated."""
     fingerprint: str
     """Of images and kinematics."""
     open: Callable[[Progress], Recording]
@@ -67,6 +67,11 @@ class Source:
     """All cameras that see the regular domain."""
     consecutive: list[int] = field(default_factory=list)
     """Positions of frames that are corrected together."""
+
+    @property
+    def further(self) -> list[int]:
+        """Positions of the frames that are corrected together, but not evaluated by all methods."""
+        return [index for index in self.consecutive if index not in self.frames]
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..synthesis.config import DOMAINS
 from .measurement import Measurement, Score
+from .methods import MAIN
 
 ANY = object()
 """Matches every error at the start."""
@@ -53,6 +54,11 @@ class Measurements:
             and method in (None, measurement.run.method)
             and (error_deg is ANY or measurement.run.error_deg == error_deg)
         ]
+
+    def compared(self) -> "Measurements":
+        """Those on frames on which all methods are evaluated; of the others only some methods know."""
+        frames = {(m.run.source, m.run.frame) for m in self.all if m.run.method in MAIN and m.run.error_deg is None}
+        return Measurements(m for m in self.all if (m.run.source, m.run.frame) in frames)
 
     def domains(self, source: str) -> list[str]:
         """The domains that occur in a source, in the order in which they were measured."""

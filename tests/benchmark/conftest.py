@@ -20,6 +20,7 @@ TINY = Scope(
     error_domains=("regular",),
     errors_deg=(2.0,),
     paper_errors_deg=(2.0,),
+    further_errors_deg=(),
     real_errors_deg=(),
     hard_errors_deg=(2.0,),
     consecutive=2,

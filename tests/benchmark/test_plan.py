@@ -34,7 +34,9 @@ def test_frame_comes_after_frame_so_that_a_stopped_benchmark_has_some_of_everyth
     runs = plan(FULL, BOTH)
     alone = [run for run in runs if run.method != "sequence"]
     assert runs[: len(alone)] == alone
-    first = [run for run in alone if (run.source, run.frame) != ("synthetic", 2)]
+    by_all = [run for run in alone if (run.source, run.frame) in (("synthetic", 0), ("synthetic", 2), ("real", 5))]
+    assert runs[: len(by_all)] == by_all
+    first = [run for run in by_all if (run.source, run.frame) != ("synthetic", 2)]
     assert runs[: len(first)] == first
 
 
@@ -43,6 +45,17 @@ def test_the_full_scope_has_every_error_in_every_domain() -> None:
     for degrees in range(7):
         for domain in DOMAINS:
             assert Run("synthetic", domain, 0, "ours", float(degrees)) in runs
+
+
+def test_frames_on_which_not_all_methods_are_evaluated_come_late_and_know_the_default_solver_alone() -> None:
+    runs = plan(FULL, BOTH)
+    further = [run for run in runs if (run.source, run.frame) == ("synthetic", 1) and run.method != "sequence"]
+    assert set(further) == {Run("synthetic", domain, 1, "ours", e) for domain in DOMAINS for e in (1.0, 2.0, 3.0, 5.0)}
+    first = min(map(runs.index, further))
+    assert all(run.method in ("ours", "calibrated", "sequence") for run in runs[first:])
+    calibrated = [run.frame for run in runs if (run.source, run.method) == ("real", "calibrated")]
+    assert calibrated == [5, 0, 1] and Run("real", "regular", 0, "ours") not in runs
+    assert not [run for run in plan(QUICK, BOTH[:1]) if run.frame == 1 and run.method == "ours"]
 
 
 def test_several_cameras_and_calibration_are_planned_where_there_is_something_to_measure() -> None:

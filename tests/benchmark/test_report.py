@@ -10,6 +10,7 @@ from handmade import make_measurement
 
 from carts_core.benchmark import Facts, Measurement, Run, Score, write_report
 from carts_core.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
+from carts_core.benchmark.accuracy_targets import accuracy_targets
 from carts_core.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
 from carts_core.benchmark.speed_tables import pair_table
 from carts_core.benchmark.statistics import Measurements
@@ -121,6 +122,17 @@ def test_the_error_tables_have_a_column_per_error_and_no_row_without_numbers() -
     dice, mae = error_tables(Measurements(_measurements()))
     assert dice.columns[2:] == ("0°", "1°", "2°", "3°") and len(dice.rows) == 1
     assert mae.rows[0][2].text == "0.50"
+
+
+def test_errors_are_tabled_over_frames_that_all_methods_know_and_count_for_targets_on_the_others_too() -> None:
+    main = [make_measurement((0.5, 0.8), method=method) for method in ("paper", "ours")]
+    errors = [make_measurement((0.5, 0.9), method=method, error_deg=2.0) for method in ("paper", "ours")]
+    further = make_measurement((0.5, 0.7), frame=1, error_deg=2.0)
+    data = Measurements([*main, *errors, further])
+    (row,) = [row for row in error_tables(data.compared())[0].rows if row[0].text == "ours"]
+    assert row[2].text == "90.0"
+    (target,) = [t for t in accuracy_targets(data) if t.what.startswith("synthetic, 2° off, each frame alone: mean")]
+    assert target.reached == "0.800" and "2 frames" in target.basis
 
 
 def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_frames() -> None:
