@@ -92,7 +92,7 @@ def _real(data: Measurements, domain: str) -> float | None:
 def _real_dice(data: Measurements, what: str, method: str, least: float) -> Target:
     runs = data.of(source=REAL, domain="regular", method=method, error_deg=None)
     start = [m.final.dice for m in data.of(source=REAL, domain="regular", method="start", error_deg=None)]
-    without = f"without optimization: {mean(start):.3f}; " if start else ""
+    without = f"without optimization: {mean(start):.3f} ({counted(len(start), 'frame')}); " if start else ""
     return make_target(
         what,
         least,

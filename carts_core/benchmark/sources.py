@@ -106,7 +106,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
-    counted = f"{len(evaluated)} of {frames} frames, {scope.samples} paths per pixel"
+    counted = f"{len(evaluated)} of {frames} frames by all methods, {scope.samples} paths per pixel"
     return Source(
         SYNTHETIC,
         f"{what}, {counted}",
@@ -145,10 +145,10 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         progress("backdrop of the real frames", 0, 1)
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
-    description = f"{sequence.name}, camera {camera.name}, {len(frames)} of {len(masked)} frames with masks"
+    counted = f"{len(frames)} of {len(masked)} frames with masks by all methods"
     return Source(
         REAL,
-        description,
+        f"{sequence.name}, camera {camera.name}, {counted}",
         camera.name,
         frames,
         fingerprint.hexdigest()[:32],
