@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch import Tensor
 
 from carts_core.data import Frame, Sequence
 from carts_core.errors import SettingsError
@@ -105,6 +106,19 @@ def test_gauss_newton_needs_few_steps_and_stops_by_itself(sequence: Sequence, ex
     first, *_ = list(optimizer)
     assert optimizer.best is not None and optimizer.stop_reason == "converged"
     assert optimizer.best.loss < first.loss and len(optimizer.history) < 40
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_the_default_solver_raises_dice_on_every_device(sequence: Sequence, device: str) -> None:
+    optimizer = optimizer_of(sequence, FeatureExtractor.load(device=device), settings=OptimizerSettings())
+    first, *_, last = list(optimizer)
+    renderer, masks = Renderer(sequence.scene), sequence.frame(0).masks or {}
+    for index, camera in enumerate(("left", "right")):
+        before, after = (
+            dice(renderer.segment(iterate.state.map(Tensor.cpu))[index] >= 0, masks[camera])
+            for iterate in (first, last)
+        )
+        assert after > before
 
 
 def test_gauss_newton_refuses_a_loss_without_residuals() -> None:
