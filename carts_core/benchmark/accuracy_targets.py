@@ -46,7 +46,7 @@ def _dice_after(data: Measurements, method: str, error: float, least: float) -> 
         f"synthetic, {error:g}° off, {_MODES[method]}: mean Dice in every domain",
         least,
         None if worst is None else means[worst],
-        f"{_worst_of(means, worst)}, mean over {counted(len(by_domain[worst]), 'frame')}" if worst else "no runs",
+        _worst_of(means, worst) + (f", mean over {counted(len(by_domain[worst]), 'frame')}" if worst else ""),
         at_least=True,
         text=lambda value: f"{value:.3f}",
         reference=f"paper, S-Reg: {paper}",
@@ -121,7 +121,7 @@ def _real_robustness(data: Measurements) -> Target:
 
 
 def _made_worse(data: Measurements) -> Target:
-    runs = [m for method in _MODES for m in data.of(method=method)] + data.of(method="ours", domain=OCCLUSION)
+    runs = data.default_solver()
     worse = [m for m in runs if m.made_worse]
     covered = sum(m.run.domain == OCCLUSION for m in worse)
     from_truth = sum(m.run.source == SYNTHETIC and m.run.error_deg == 0.0 for m in worse)

@@ -57,7 +57,7 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         ("Several cameras", _known(camera_table(data))),
         ("Calibration", _known(calibration_table(data))),
         ("Sequence mode", _known(sequence_table(data))),
-        ("Speed and safety", _known(speed_table(data), pair_table(data), worse_table(data))),
+        ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
     ]
     figures = write_figures(compared, folder / "figures")

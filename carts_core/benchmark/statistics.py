@@ -8,6 +8,7 @@ import numpy as np
 from ..synthesis.config import DOMAINS
 from .measurement import Measurement, Score
 from .methods import MAIN
+from .occlusion import OCCLUSION
 
 ANY = object()
 """Matches every error at the start."""
@@ -59,6 +60,10 @@ class Measurements:
         """Those on frames on which all methods are evaluated; of the others only some methods know."""
         frames = {(m.run.source, m.run.frame) for m in self.all if m.run.method in MAIN and m.run.error_deg is None}
         return Measurements(m for m in self.all if (m.run.source, m.run.frame) in frames)
+
+    def default_solver(self) -> list[Measurement]:
+        """Its runs with one camera and nothing else to go by: each frame alone, occluders or not, and in sequences."""
+        return [*self.of(method="ours"), *self.of(method="ours", domain=OCCLUSION), *self.of(method="sequence")]
 
     def domains(self, source: str) -> list[str]:
         """The domains that occur in a source, in the order in which they were measured."""

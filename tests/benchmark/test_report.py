@@ -12,7 +12,7 @@ from carts_core.benchmark import Facts, Measurement, Run, Score, write_report
 from carts_core.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
 from carts_core.benchmark.accuracy_targets import accuracy_targets
 from carts_core.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
-from carts_core.benchmark.speed_tables import pair_table
+from carts_core.benchmark.speed_tables import pair_table, worse_table
 from carts_core.benchmark.statistics import Measurements
 from carts_core.synthesis import DOMAINS
 
@@ -167,3 +167,15 @@ def test_the_pair_table_says_how_much_faster_the_same_dice_is_reached() -> None:
     table = pair_table(Measurements(pairs))
     assert table is not None
     assert [cell.text for cell in table.rows[0]] == ["synthetic", "as measured", "1", "40.00", "4.00", "10.0", "0", "1"]
+
+
+def test_every_frame_made_worse_is_listed_with_the_mode_in_which_it_was() -> None:
+    runs = [make_measurement((0.9, 0.8), method=method) for method in ("ours", "sequence", "paper")]
+    table = worse_table(Measurements([*runs, make_measurement((0.9, 0.8), domain="occlusion", frame=3)]))
+    assert table is not None
+    listed = [(row[1].text, row[2].text, row[3].text) for row in table.rows]
+    assert listed == [
+        ("regular", "0", "CaRTS, ours"),
+        ("occlusion", "3", "CaRTS, ours"),
+        ("regular", "0", "ours, sequence mode"),
+    ]
