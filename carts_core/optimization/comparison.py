@@ -56,28 +56,43 @@ class Stage:
         self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
 
-    def compare(self, state: SceneState, neighbours: tuple[SceneState, SceneState] | None) -> "Comparison":
-        """Compare a state; with neighbours, also say how the cost changes."""
-        tangents = self.renderer.tangents(*neighbours, 2 * STEP) if neighbours else None
-        rendering = self.renderer.surface(state, tangents, 1 + kernel_radius(self._blur))
-        model = compared(smoothed(rendering.maps * self._weight, self._blur))
-        residual = self._observed - model
-        squared = (residual.square() * self._channels).sum(1, keepdim=True)
-        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
-        ratio = 1.0 / (1.0 + squared / self._robust**2)
+    def costs(self, states: SceneState) -> Float[Tensor, " batch"]:
+        """Of a batch of states, all rendered at once; see `Comparison.cost`."""
+        _, squared, ratio = self._difference(self.renderer.surface_maps(states))
+        return 0.5 * self.area * (squared * ratio).flatten(1).sum(1)
+
+    def compare(self, state: SceneState, *, gradient: bool) -> "Comparison":
+        """Compare a state; with a gradient, also say how the cost changes.
+
+        Args:
+            state: one state, or with a gradient a batch, as `ParameterVector.around` makes it.
+        """
+        margin = 1 + kernel_radius(self._blur)
+        rendering = self.renderer.surface(state, 2 * STEP if gradient else None, margin)
+        model, squared, ratio = self._difference(rendering.maps)
         comparison = Comparison(
             0.5 * self.area * float((squared * ratio).sum()),
             rendering,
             (1.0 - squared[:, 0]).clamp(min=-1.0),
             (ratio.square() * self._weight)[:, 0],
         )
-        if tangents is None:
+        if not gradient:
             return comparison
+        residual = self._observed - model
         weight = ratio.square() * self._channels * self._precision
         grown = torch.zeros_like(residual)
         grown[:, COVERAGE.start] = _growth(model[:, COVERAGE.start]) / math.sqrt(self.area)
-        equations = self._normal_equations(rendering.jacobian, residual, grown, weight, len(tangents.intrinsics))
+        # Half of the states around it are an unknown each.
+        unknowns = state.intrinsics.shape[0] // 2
+        equations = self._normal_equations(rendering.jacobian, residual, grown, weight, unknowns)
         return replace(comparison, **equations)
+
+    def _difference(self, maps: Float[Tensor, "*batch cameras 6 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Maps under the blur, the squared residual of each pixel, and what is left of that for being large [1]."""
+        model = compared(smoothed(maps * self._weight, self._blur))
+        squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
+        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
+        return model, squared, 1.0 / (1.0 + squared / self._robust**2)
 
     def _normal_equations(
         self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int

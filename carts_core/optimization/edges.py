@@ -121,7 +121,7 @@ class EdgeRefinement:
         counts = attention(near, _NEAR) * self._shown
         origin, step = offsets, torch.zeros_like(offsets)
         slope, stiffness = torch.zeros_like(gradient), torch.zeros_like(curvature)
-        tangents = self._renderer.tangents(*self._parameters.neighbours(origin), 2 * STEP)
+        tangents = self._renderer.tangents(self._parameters.around(origin), 2 * STEP)
         for _ in range(self._settings.edge_steps):
             outline = self._renderer.outline(self._parameters.state(offsets), tangents)
             slope, stiffness = self._equations(outline, counts)

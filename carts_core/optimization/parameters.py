@@ -230,10 +230,10 @@ class ParameterVector:
                 intrinsics = _update(intrinsics, block.index, lambda K, s=part: _scaled_intrinsics(K, s), matrix=False)
         return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics)
 
-    def neighbours(self, offsets: Float[Tensor, " n"]) -> tuple[SceneState, SceneState]:
-        """Batches of states `STEP` below and above, one unknown each."""
+    def around(self, offsets: Float[Tensor, " n"]) -> SceneState:
+        """A batch of 1 + 2 n states: that at the offsets, those `STEP` below it, one unknown each, and those above."""
         step = STEP * torch.eye(len(offsets), device=offsets.device)
-        return self.state(offsets - step), self.state(offsets + step)
+        return self.state(torch.cat([offsets[None], offsets - step, offsets + step]))
 
     def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
         rotation = roma.rotvec_to_rotmat(step[..., :3])

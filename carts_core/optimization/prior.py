@@ -16,9 +16,10 @@ class Prior:
     precision: Float[Tensor, "n n"]
     """Inverse of the covariance [1/rad^2]."""
 
-    def value(self, offsets: Float[Tensor, " n"]) -> float:
+    def value(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Half the squared distance from the mean, in standard deviations [1]."""
-        return 0.5 * float((offsets - self.mean) @ self.gradient(offsets))
+        away = offsets - self.mean
+        return 0.5 * (away @ self.precision * away).sum(-1)
 
     def gradient(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Of `value` [1/rad]."""

@@ -41,6 +41,9 @@ _SUPPORT = 0.5
 _LEFT = 0.3
 """Share of the silhouette it started with that an arm has to keep, or it has gone elsewhere to be rid of it [1]."""
 
+_AT_ONCE = 128
+"""Most starts that are rendered at once, which bounds the memory."""
+
 _SPREAD = 1.8
 """Deviation of random starts, in expected errors."""
 
@@ -235,7 +238,7 @@ class SurfaceObjective:
         blur = settings.blurs[: max(len(settings.blurs) - _FINE, 1)][-1]
         view = self._viewed
         stage = Stage(self.scene, view.scale.size, view.scale.zoom, view.window, *view.seen, blur, settings)
-        compared = stage.compare(wider.state(point), wider.neighbours(point))
+        compared = stage.compare(wider.around(point), gradient=True)
         assert compared.gradient is not None and compared.curvature is not None
         prior = wider.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         gradient, curvature = compared.gradient.double(), compared.curvature.double()
@@ -266,15 +269,14 @@ class SurfaceObjective:
         best = offsets
         self._begun_at = None
         self._look_at(torch.zeros_like(offsets), 0, whole=True)
-        best_cost = self._coarse_cost(best)
         for group in self.parameters.groups:
-            for index in range(candidates + 1):
-                drawn = torch.randn(len(group), generator=generator) * spread[list(group)]
-                trial = best.clone()
-                trial[list(group)] = (0.0 * drawn if index == 0 else drawn).to(offsets)
-                cost = self._coarse_cost(self.parameters.clamp(trial))
-                if cost < best_cost:
-                    best, best_cost = self.parameters.clamp(trial), cost
+            columns = list(group)
+            drawn = torch.stack([torch.randn(len(group), generator=generator) for _ in range(candidates + 1)])
+            trials = best.repeat(len(drawn) + 1, 1)
+            trials[1:, columns] = (drawn * spread[columns]).to(best)
+            trials[1, columns] = 0.0
+            trials = self.parameters.clamp(trials)
+            best = trials[self._coarse_costs(trials).argmin()]
         return best
 
     @torch.no_grad()
@@ -310,8 +312,9 @@ class SurfaceObjective:
             return False
         self._look_at(start, self.look(self.stages - 1))
         stage = self._viewed.stages[-1]
-        before, after = (stage.compare(self.parameters.state(point), None).cost for point in (start, offsets))
-        gain = (before - after) / self.settings.noise**2 + self._prior.value(start) - self._prior.value(offsets)
+        before, after = stage.costs(self.parameters.state(torch.stack([start, offsets]))).tolist()
+        prior = self._prior.value(start) - self._prior.value(offsets)
+        gain = (before - after) / self.settings.noise**2 + float(prior)
         kept = gain < self.settings.keep_start and before < _AS_WELL * after
         if not kept:
             self._view = view
@@ -323,17 +326,18 @@ class SurfaceObjective:
 
     def _own_cost(self, offsets: Tensor) -> float:
         self._look_at(offsets, self.first_look + 1)
-        return self._coarse_cost(offsets)
+        return float(self._coarse_costs(offsets[None]))
 
-    def _coarse_cost(self, offsets: Tensor) -> float:
+    def _coarse_costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
         """The objective in the first stage of the present look."""
-        cost = self._viewed.stages[0].compare(self.parameters.state(offsets), None).cost
-        return cost / self.settings.noise**2 + self._prior.value(offsets)
+        stage, state = self._viewed.stages[0], self.parameters.state
+        costs = torch.cat([stage.costs(state(part)) for part in offsets.split(_AT_ONCE)])
+        return costs / self.settings.noise**2 + self._prior.value(offsets)
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:
         """Have the network say what the image shows, knowing the present estimate: near the arms, or in all of it."""
         scale, later = self._scale(look), int(look > self.first_look)
-        believed = scale.whole.surface(self.parameters.state(offsets)).maps
+        believed = scale.whole.surface_maps(self.parameters.state(offsets))
         margin = max(scale.size) if whole else round(_MARGIN[later] * scale.zoom)
         reach = round(_ATTENTION[later] * scale.zoom)
         window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, scale.size)
@@ -363,12 +367,12 @@ class SurfaceObjective:
         return replace(settings, robust=max(settings.robust, settings.coarse_robust))
 
     def _evaluate(self, offsets: Tensor, stage: Stage, gradient: bool) -> Evaluation:
-        state = self.parameters.state(offsets)
-        neighbours = self.parameters.neighbours(offsets) if gradient else None
-        compared = stage.compare(state, neighbours)
+        parameters = self.parameters
+        state = parameters.around(offsets) if gradient else parameters.state(offsets)
+        compared = stage.compare(state, gradient=gradient)
         shown = self._viewed.shown or stage
-        final = compared if stage is shown else shown.compare(state, None)
-        prior = self._prior.value(offsets)
+        final = compared if stage is shown else shown.compare(parameters.state(offsets), gradient=False)
+        prior = float(self._prior.value(offsets))
         slope, curvature, known = torch.zeros_like(offsets), None, None
         if compared.gradient is not None and compared.curvature is not None and compared.outline is not None:
             slope = self._prior.gradient(offsets) + compared.gradient

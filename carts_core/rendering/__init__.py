@@ -1,11 +1,11 @@
 """Differentiable rendering: hard visibility, sparse shading, silhouette gradient."""
 
+from .jacobian import JacobianBlock as JacobianBlock
+from .jacobian import Tangents as Tangents
 from .outline import Outline as Outline
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
-from .surface import JacobianBlock as JacobianBlock
 from .surface import SurfaceRendering as SurfaceRendering
-from .surface import Tangents as Tangents
 from .visibility_numba import visibility_numba as visibility
 from .visibility_torch import visibility_torch as visibility_torch
 

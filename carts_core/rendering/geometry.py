@@ -107,7 +107,10 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
     return state.T_camera_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
 
 
-def vertices_in_camera(geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "links 4 4"]) -> Float[Tensor, "3 V"]:
-    """All vertices in the frame of one camera [m]."""
+def vertices_in_camera(
+    geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
+) -> Float[Tensor, "*batch 3 V"]:
+    """All vertices in the frame of a camera [m]."""
     parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
-    return torch.cat([T[:3, :3] @ part + T[:3, 3:] for T, part in zip(Ts_camera_link, parts, strict=True)], 1)
+    Ts = Ts_camera_link.unbind(-3)
+    return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from .jacobian import Tangents
 from .points import VisiblePoints
-from .surface import Tangents
 
 _BEHIND = 0.01
 """How much further away what is beside an outline is at least, as a share [1]. With less, folds of a surface count."""
@@ -100,8 +100,7 @@ def normal_motion(
         Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
         tangents: derivatives of both by the unknowns.
     """
-    groups = torch.tensor(points.groups, dtype=torch.long, device=normal.device).reshape(-1, 3)
-    view, link = groups[:, :2].repeat_interleave(groups[:, 2], dim=0).T
+    view, link = points.owners()
     T, K = Ts_camera_link[view, link], intrinsics[view].T
     point = points.point_link
     X, Y, Z = (T[:, :3, :3] @ point.T[..., None])[..., 0].T + T[:, :3, 3].T

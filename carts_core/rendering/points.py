@@ -31,6 +31,8 @@ class VisiblePoints:
 
     def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
         """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
+        if self.point_link.device.type != "cpu":
+            return self.transformed_at_once(Ts_camera_link)
         counts = [count for _, _, count in self.groups]
         points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
         moved, turned = [], []
@@ -41,6 +43,19 @@ class VisiblePoints:
         if not moved:
             return self.point_link, self.normal_link
         return torch.cat(moved, 1), torch.cat(turned, 1)
+
+    def transformed_at_once(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
+        """The same in few large operations, as a GPU likes it."""
+        view, link = self.owners()
+        R, t = Ts_camera_link[view, link, :3, :3], Ts_camera_link[view, link, :3, 3]
+        points, normals = torch.stack([self.point_link, self.normal_link]).mT.unsqueeze(-1)
+        return ((R @ points)[..., 0] + t).T, (R @ normals)[..., 0].T
+
+    def owners(self) -> tuple[Int[Tensor, " K"], Int[Tensor, " K"]]:
+        """View and link of each point."""
+        groups = torch.tensor(self.groups, dtype=torch.long, device=self.pixel.device).reshape(-1, 3)
+        view, link = groups[:, :2].repeat_interleave(groups[:, 2], dim=0).T
+        return view, link
 
     def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
         """fx, fy, cx, cy of each point's view."""
@@ -94,24 +109,16 @@ def visible_points_torch(
     pixel = (face_ids.flatten() >= 0).nonzero()[:, 0]
     face = face_ids.flatten()[pixel].long()
     view = pixel // (height * width)
-    key = (view * links + geometry.face_links[face]).short()
-    key, order = key.sort(stable=True)
+    key, order = (view * links + geometry.face_links[face]).int().sort(stable=True)
     pixel, face = pixel[order], face[order]
-    counts = torch.bincount(key, minlength=views * links).tolist()
-    groups = _groups(counts, links)
-    fx, fy, cx, cy = VisiblePoints(pixel, face, groups, pixel, pixel).intrinsics(intrinsics)
+    view, link = key.long() // links, key.long() % links
+    groups = _groups(torch.bincount(key, minlength=views * links).tolist(), links)
+    fx, fy, cx, cy = intrinsics[view].T
     inside = pixel % (height * width)
     depth = 1.0 / inverse_depth.flatten()[pixel]
     x, y = ((inside % width) + 0.5 - cx) / fx, ((inside // width) + 0.5 - cy) / fy
-    points = torch.stack([x * depth, y * depth, depth])
-    point_link = torch.cat(
-        [
-            Ts_camera_link[view, link, :3, :3].T @ (part - Ts_camera_link[view, link, :3, 3:])
-            for (view, link, _), part in zip(groups, points.split([count for *_, count in groups], 1), strict=True)
-        ]
-        or [points],
-        1,
-    )
+    from_link = torch.stack([x * depth, y * depth, depth], 1) - Ts_camera_link[view, link, :3, 3]
+    point_link = (Ts_camera_link[view, link, :3, :3].mT @ from_link[..., None])[..., 0].T
     maps = geometry.face_barycentric.index_select(1, face).view(2, 4, -1)
     # A pixel at the rim of its triangle may leave it by a rounding error.
     weight = ((maps[:, :3] * point_link).sum(1) + maps[:, 3]).clamp(0.0, 1.0)

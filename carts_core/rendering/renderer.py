@@ -9,12 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..scene import Scene, SceneState
+from ..surface import SURFACE_CHANNELS
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
+from .jacobian import Tangents, map_jacobian
 from .motion import carry_motion
 from .outline import Outline, normal_motion, outline_pixels, outline_position
 from .points import visible_points
 from .shading import phong
-from .surface import SurfaceRendering, Tangents, surface_maps
+from .surface import SurfaceRendering, spread, surface_values
 from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch
 
@@ -130,14 +132,45 @@ class Renderer:
         return labels.reshape(*Ts.shape[:-3], self.height, self.width)
 
     @torch.no_grad()
-    def surface(self, state: SceneState, tangents: Tangents | None = None, margin: int = 1) -> SurfaceRendering:
-        """Surface maps of one state (no batch), with their Jacobian if tangents are given; see `surface_maps`."""
+    def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
+        """Surface maps of all hypotheses, see `carts_core.surface`, and nothing else."""
         Ts, intrinsics = self._views(state)
+        views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
+        face_ids, inverse_depth = self._visibility(views_T, views_K)
+        points = visible_points(self.geometry, face_ids, inverse_depth, views_T, views_K)
+        position, normal = points.transformed(views_T)
+        values = surface_values(self.geometry.face_parts[points.face], normal * _side(position, normal))
+        maps = spread(values, points.pixel, face_ids.shape)
+        return maps.view(*Ts.shape[:-3], *maps.shape[1:])
+
+    @torch.no_grad()
+    def surface(self, state: SceneState, distance: float | None = None, margin: int = 1) -> SurfaceRendering:
+        """Surface maps of one state, shaded, and how they change.
+
+        Args:
+            state: one state (no batch); with `distance`, a batch as that of `tangents`.
+            distance: of the states on both sides; None leaves the Jacobian out.
+            margin: what the Jacobian's blocks hold around what is moved [px].
+        """
+        Ts, intrinsics = self._views(state)
+        tangents = None
+        if distance is not None:
+            tangents = _tangents(Ts, intrinsics, distance)
+            Ts, intrinsics = Ts[0], intrinsics[0]
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
         points = visible_points(self.geometry, face_ids, inverse_depth, Ts, intrinsics)
-        parts = self.geometry.face_parts[points.face]
+        position, normal = points.transformed(Ts)
         colors = self.geometry.face_colors.index_select(1, points.face)
-        return surface_maps(points, parts, colors, self.scene.light, Ts, intrinsics, inverse_depth, tangents, margin)
+        color = phong(colors, position, normal, self.scene.light)
+        side = _side(position, normal)
+        values = torch.cat([surface_values(self.geometry.face_parts[points.face], normal * side), color])
+        dense = spread(values, points.pixel, face_ids.shape)
+        maps, image = dense[:, :SURFACE_CHANNELS].contiguous(), dense[:, SURFACE_CHANNELS:]
+        if tangents is None:
+            return SurfaceRendering(maps, image, ())
+        facing = points.normal_link * side
+        jacobian = map_jacobian(points, position, facing, maps, inverse_depth, intrinsics, tangents, margin)
+        return SurfaceRendering(maps, image, jacobian)
 
     @torch.no_grad()
     def outline(self, state: SceneState, tangents: Tangents) -> Outline:
@@ -156,10 +189,14 @@ class Renderer:
         )
 
     @torch.no_grad()
-    def tangents(self, low: SceneState, high: SceneState, distance: float) -> Tangents:
-        """Derivatives from batches of states on both sides of one, an unknown each, that far from each other."""
-        (Ts_low, K_low), (Ts_high, K_high) = self._views(low), self._views(high)
-        return Tangents((Ts_high - Ts_low) / distance, (K_high - K_low) / distance)
+    def tangents(self, states: SceneState, distance: float) -> Tangents:
+        """Derivatives at a state from those on both sides of it.
+
+        Args:
+            states: a batch: the state, those below it, an unknown each, and those above it.
+            distance: between the two of an unknown.
+        """
+        return _tangents(*self._views(states), distance)
 
     def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
         """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
@@ -176,18 +213,27 @@ class Renderer:
     @torch.no_grad()
     def _visibility(self, views_T: Tensor, views_K: Tensor) -> tuple[Tensor, Tensor]:
         """Visible triangle and inverse depth [views, height, width]."""
-        ids, depths = [], []
-        for T_camera_link, intrinsics in zip(views_T, views_K, strict=True):
-            vertices = vertices_in_camera(self.geometry, T_camera_link)
-            if self.device.type == "cpu":
-                size = (self.width, self.height)
-                seen = rasterize(vertices.T.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
-                face_ids, inverse_depth = (torch.from_numpy(array) for array in seen)
-            else:
-                face_ids, depth = visibility_torch(vertices.T, self.geometry.faces, intrinsics, self.width, self.height)
-                inverse_depth = torch.where(face_ids >= 0, 1.0 / depth, 0.0)
-            ids.append(face_ids)
-            depths.append(inverse_depth)
-        if len(ids) == 1:  # the usual case, without a copy
-            return ids[0][None], depths[0][None]
-        return torch.stack(ids), torch.stack(depths)
+        vertices = vertices_in_camera(self.geometry, views_T).mT
+        size = (self.width, self.height)
+        if self.device.type != "cpu":
+            face_ids, depth = visibility_torch(vertices, self.geometry.faces, views_K, *size)
+            return face_ids, torch.where(face_ids >= 0, 1.0 / depth, 0.0)
+        seen = [
+            rasterize(points.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
+            for points, intrinsics in zip(vertices, views_K, strict=True)
+        ]
+        if len(seen) == 1:  # the usual case, without a copy
+            face_ids, inverse_depth = (array[None] for array in seen[0])
+        else:
+            face_ids, inverse_depth = (np.stack(arrays) for arrays in zip(*seen, strict=True))
+        return torch.from_numpy(face_ids), torch.from_numpy(inverse_depth)
+
+
+def _tangents(Ts: Float[Tensor, "states cameras links 4 4"], intrinsics: Tensor, distance: float) -> Tangents:
+    (Ts_low, Ts_high), (low, high) = Ts[1:].chunk(2), intrinsics[1:].chunk(2)
+    return Tangents((Ts_high - Ts_low) / distance, (high - low) / distance)
+
+
+def _side(position: Float[Tensor, "3 K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, " K"]:
+    """1 where a normal points to the camera, -1 where it points away."""
+    return torch.where((position * normal).sum(0) > 0, -1.0, 1.0)

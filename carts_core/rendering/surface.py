@@ -1,8 +1,4 @@
-"""Surface maps of a state, and how they change with it.
-
-The derivative is that of `motion.py`, but forward: for every unknown, the velocity of every visible point in the image
-carries the map along, and the turning of its link turns its normal.
-"""
+"""Surface maps of visible points, and the picture that a person sees of them."""
 
 from dataclasses import dataclass
 
@@ -10,38 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..scene import Light
 from ..surface import NORMALS, SURFACE_CHANNELS
-from .points import VisiblePoints
-from .shading import phong
-
-
-@dataclass(frozen=True)
-class Tangents:
-    """Derivatives of what a renderer places and projects with, one per unknown."""
-
-    Ts_camera_link: Float[Tensor, "unknowns cameras links 4 4"]
-    intrinsics: Float[Tensor, "unknowns cameras 4"]
-    """[px] of the rendered size."""
-
-
-@dataclass(frozen=True)
-class JacobianBlock:
-    """Derivatives by the unknowns that move the same arms, around what they move; zero elsewhere."""
-
-    unknowns: Int[Tensor, " g"]
-    """Which they are."""
-    left: int
-    top: int
-    """Where the values lie in the maps [px]."""
-    values: Float[Tensor, "g cameras 6 rows columns"]
-
-    def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
-        """The derivative of whole maps by all unknowns, [unknowns, cameras, 6, height, width]."""
-        whole = like.new_zeros(unknowns, *like.shape)
-        rows, columns = self.values.shape[-2:]
-        whole[self.unknowns, :, :, self.top : self.top + rows, self.left : self.left + columns] = self.values
-        return whole
+from .jacobian import JacobianBlock
 
 
 @dataclass(frozen=True)
@@ -56,152 +22,20 @@ class SurfaceRendering:
     """Derivative of the maps by the unknowns; empty if it was not asked for."""
 
 
-def surface_maps(
-    points: VisiblePoints,
-    parts: Int[Tensor, " K"],
-    colors: Float[Tensor, "3 K"],
-    light: Light,
-    Ts_camera_link: Float[Tensor, "cameras links 4 4"],
-    intrinsics: Float[Tensor, "cameras 4"],
-    inverse_depth: Float[Tensor, "cameras height width"],
-    tangents: Tangents | None = None,
-    margin: int = 1,
-) -> SurfaceRendering:
-    """Surface maps of visible points.
-
-    Args:
-        points: what each pixel sees.
-        parts: index into `carts_core.parts.PARTS` per point.
-        colors, light: what the image is shaded with.
-        Ts_camera_link, intrinsics: where links are, and the cameras.
-        inverse_depth: 1 / depth [1/m], 0 for background.
-        tangents: of the unknowns; without them there is no Jacobian.
-        margin: what the Jacobian's blocks hold around what is moved [px].
-    """
-    position, normal = points.transformed(Ts_camera_link)
-    side = torch.where((position * normal).sum(0) > 0, -1.0, 1.0)
-    values = position.new_zeros(SURFACE_CHANNELS, len(points.pixel))
+def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, "6 K"]:
+    """Surface map where points are seen, from their parts (index into `carts_core.parts.PARTS`) and their normals,
+    which point to the camera."""
+    values = normal.new_zeros(SURFACE_CHANNELS, len(parts))
     values[parts, torch.arange(len(parts), device=parts.device)] = 1.0
-    values[NORMALS] = normal * side
-    values = torch.cat([values, phong(colors, position, normal, light)])
-    dense = values.new_zeros(len(values), inverse_depth.numel())
-    dense[:, points.pixel] = values
-    dense = dense.view(len(values), *inverse_depth.shape).transpose(0, 1).contiguous()
-    maps, image = dense[:, :SURFACE_CHANNELS].contiguous(), dense[:, SURFACE_CHANNELS:]
-    if tangents is None:
-        return SurfaceRendering(maps, image, ())
-    blocks = []
-    for unknowns, runs in _families(points, tangents):
-        box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
-        velocity, turning = _motion(points, position, side, intrinsics, inverse_depth, tangents, unknowns, runs, box)
-        values = _carried(box.of(maps), velocity, box.of(inverse_depth))
-        values[:, :, NORMALS] += turning
-        blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
-    return SurfaceRendering(maps, image, tuple(blocks))
+    values[NORMALS] = normal
+    return values
 
 
-_Run = tuple[int, int, slice]
-"""View, link, and where its points are."""
-
-
-def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
-    """Unknowns that move common links, with all the visible links that they move."""
-    moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
-    moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
-    runs: list[_Run] = []
-    begin = 0
-    for view, link, count in points.groups:
-        runs.append((view, link, slice(begin, begin + count)))
-        begin += count
-    families: list[tuple[list[int], set[int]]] = []
-    for unknown, moved in enumerate(moves.cpu().numpy()):
-        mine = {index for index, (view, link, _) in enumerate(runs) if moved[view, link]}
-        if not mine:
-            continue
-        related = [family for family in families if family[1] & mine]
-        families = [family for family in families if not family[1] & mine]
-        unknowns = sorted([unknown, *(other for family in related for other in family[0])])
-        families.append((unknowns, mine.union(*(family[1] for family in related))))
-    return [(unknowns, [runs[index] for index in sorted(indices)]) for unknowns, indices in families]
-
-
-@dataclass(frozen=True)
-class _Box:
-    """A rectangle of all cameras' maps [px]."""
-
-    left: int
-    top: int
-    columns: int
-    rows: int
-
-    @staticmethod
-    def around(pixels: list[Tensor], inverse_depth: Float[Tensor, "cameras height width"], margin: int) -> "_Box":
-        """What holds these pixels of the flattened maps, with a margin."""
-        height, width = inverse_depth.shape[1:]
-        pixel = torch.cat(pixels)
-        column, row = pixel % width, pixel // width % height
-        left, top = max(int(column.min()) - margin, 0), max(int(row.min()) - margin, 0)
-        right, bottom = min(int(column.max()) + margin + 1, width), min(int(row.max()) + margin + 1, height)
-        return _Box(left, top, right - left, bottom - top)
-
-    def of(self, maps: Tensor) -> Tensor:
-        """This part of maps [..., height, width]."""
-        return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
-
-    def index(self, pixel: Int[Tensor, " K"], height: int, width: int) -> Int[Tensor, " K"]:
-        """Where pixels of the flattened maps are in the flattened box."""
-        column, row, camera = pixel % width, pixel // width % height, pixel // (width * height)
-        return (camera * self.rows + row - self.top) * self.columns + column - self.left
-
-
-def _motion(
-    points: VisiblePoints,
-    position: Float[Tensor, "3 K"],
-    side: Float[Tensor, " K"],
-    intrinsics: Float[Tensor, "cameras 4"],
-    inverse_depth: Float[Tensor, "cameras height width"],
-    tangents: Tangents,
-    unknowns: list[int],
-    runs: list[_Run],
-    box: _Box,
-) -> tuple[Float[Tensor, "g cameras 2 rows columns"], Float[Tensor, "g cameras 3 rows columns"]]:
-    """Velocity of what each pixel sees [px per unit of each unknown], and the change of its normal."""
-    cameras, height, width = inverse_depth.shape
-    flat = position.new_zeros(len(unknowns), 5, cameras * box.rows * box.columns)
-    for view, link, here in runs:
-        dT, dK = tangents.Ts_camera_link[unknowns, view, link], tangents.intrinsics[unknowns, view]
-        K = intrinsics[view]
-        dX = dT[:, :3, :3] @ points.point_link[:, here] + dT[:, :3, 3:]
-        X, Y, Z = position[:, here]
-        motion = torch.cat(
-            [
-                (K[0] * (dX[:, 0] - X / Z * dX[:, 2]) / Z + dK[:, 0:1] * (X / Z) + dK[:, 2:3])[:, None],
-                (K[1] * (dX[:, 1] - Y / Z * dX[:, 2]) / Z + dK[:, 1:2] * (Y / Z) + dK[:, 3:4])[:, None],
-                dT[:, :3, :3] @ (points.normal_link[:, here] * side[here]),
-            ],
-            1,
-        )
-        flat[:, :, box.index(points.pixel[here], height, width)] = motion
-    shaped = flat.view(len(unknowns), 5, cameras, box.rows, box.columns).transpose(1, 2)
-    return shaped[:, :, :2], shaped[:, :, 2:]
-
-
-def _carried(
-    maps: Float[Tensor, "cameras 6 height width"],
-    velocity: Float[Tensor, "g cameras 2 height width"],
-    inverse_depth: Float[Tensor, "cameras height width"],
-) -> Float[Tensor, "g cameras 6 height width"]:
-    """Change of the maps as adjacent pixels are carried by the nearer one's point; see `motion.py`."""
-    jacobian = maps.new_zeros(len(velocity), *maps.shape)
-    size = maps.shape[2:]
-    for axis, dim in ((0, 3), (1, 2)):
-        length = size[dim - 2] - 1
-        first, second = maps.narrow(dim, 0, length), maps.narrow(dim, 1, length)
-        half = 0.5 * (first - second)
-        first_nearer = inverse_depth.narrow(dim - 1, 0, length) >= inverse_depth.narrow(dim - 1, 1, length)
-        along = velocity[:, :, axis]
-        speed = torch.where(first_nearer, along.narrow(dim, 0, length), along.narrow(dim, 1, length))
-        moved = speed[:, :, None] * half
-        jacobian.narrow(dim + 1, 0, length).add_(moved)
-        jacobian.narrow(dim + 1, 1, length).add_(moved)
-    return jacobian
+def spread(
+    values: Float[Tensor, "channels K"], pixel: Int[Tensor, " K"], shape: torch.Size
+) -> Float[Tensor, "views channels height width"]:
+    """Values of pixels, as indices into flattened images of a shape [views, height, width], in their places; 0 between
+    them."""
+    dense = values.new_zeros(len(values), shape.numel())
+    dense[:, pixel] = values
+    return dense.view(-1, *shape).transpose(0, 1).contiguous()

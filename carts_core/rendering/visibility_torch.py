@@ -1,5 +1,7 @@
 """Which triangle does this pixel see? The same answer as the compiled kernel, in torch, for any device."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -40,20 +42,22 @@ def _crossing(p: Float[Tensor, "n 3"], q: Float[Tensor, "n 3"]) -> Float[Tensor,
 
 
 def visibility_torch(
-    vertices_camera: Float[Tensor, "V 3"],
+    vertices_camera: Float[Tensor, "*views V 3"],
     faces: Int[Tensor, "F 3"],
-    intrinsics: Float[Tensor, "4"],
+    intrinsics: Float[Tensor, "*views 4"],
     width: int,
     height: int,
-) -> tuple[Int[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """The nearest triangle at every pixel centre, and its depth [m]; see `visibility_numba`.
+) -> tuple[Int[Tensor, "*views height width"], Float[Tensor, "*views height width"]]:
+    """The nearest triangle at every pixel centre, and its depth [m], of all views at once; see `visibility_numba`.
 
     Every (triangle, pixel of its bounding box) pair is tested, and a scatter keeps the nearest by a key that packs
     depth and triangle into one integer.
     """
-    device = vertices_camera.device
-    fx, fy, cx, cy = intrinsics.double().unbind()
-    corners, source = _clip_near(vertices_camera.double()[faces.long()])
+    device, batch = vertices_camera.device, vertices_camera.shape[:-2]
+    count = len(faces)
+    corners, source = _clip_near(vertices_camera.double()[..., faces.long(), :].reshape(-1, 3, 3))
+    view = source // max(count, 1)
+    fx, fy, cx, cy = intrinsics.double().reshape(-1, 4)[view].T[:, :, None]
     inverse_z = 1.0 / corners[..., 2]
     u = fx * corners[..., 0] * inverse_z + cx
     v = fy * corners[..., 1] * inverse_z + cy
@@ -64,7 +68,8 @@ def visibility_torch(
     columns, rows = (last_x - first_x + 1).clamp(min=0), (last_y - first_y + 1).clamp(min=0)
     area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
     pixels = columns * rows * (area != 0)
-    keys = torch.full((height * width,), torch.iinfo(torch.int64).max, dtype=torch.int64, device=device)
+    shape = (*batch, height, width)
+    keys = torch.full((math.prod(shape),), torch.iinfo(torch.int64).max, dtype=torch.int64, device=device)
     for chunk in _chunks(pixels):
         owner = torch.repeat_interleave(chunk, pixels[chunk])
         start = torch.repeat_interleave(pixels[chunk].cumsum(0) - pixels[chunk], pixels[chunk])
@@ -78,12 +83,12 @@ def visibility_torch(
         z = inverse_z[owner, 0] * (1 - w_b - w_c) + inverse_z[owner, 1] * w_b + inverse_z[owner, 2] * w_c
         # The bits of a positive float32 sort like the number, so depth goes above the face in one int64.
         depth_bits = (1.0 / z[inside]).float().view(torch.int32).long()
-        key = (depth_bits << 32) | source[owner[inside]]
-        keys.scatter_reduce_(0, (y * width + x)[inside], key, "amin")
+        key = (depth_bits << 32) | (source % count)[owner[inside]]
+        keys.scatter_reduce_(0, ((view[owner] * height + y) * width + x)[inside], key, "amin")
     seen = keys != torch.iinfo(torch.int64).max
     face_ids = torch.where(seen, keys & 0xFFFFFFFF, BACKGROUND).int()
     depth = torch.where(seen, (keys >> 32).int().view(torch.float32), 0.0)
-    return face_ids.view(height, width), depth.view(height, width)
+    return face_ids.view(shape), depth.view(shape)
 
 
 def _chunks(pixels: Int[Tensor, " n"]) -> list[Int[Tensor, " k"]]:

@@ -27,7 +27,7 @@ def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
 
 
 def outline(renderer: Renderer, parameters: ParameterVector, offsets: torch.Tensor) -> Outline:
-    tangents = renderer.tangents(*parameters.neighbours(offsets), 2 * STEP)
+    tangents = renderer.tangents(parameters.around(offsets), 2 * STEP)
     return renderer.outline(parameters.state(offsets), tangents)
 
 

@@ -53,10 +53,16 @@ def test_points_lie_where_their_pixels_look(views: tuple[SceneGeometry, Tensor, 
     torch.testing.assert_close(row, (inside // WIDTH).float(), atol=1e-3, rtol=0)
 
 
+def test_all_links_move_at_once_as_one_by_one(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
+    Ts, points = views[3], visible_points(*views)
+    for one_by_one, at_once in zip(points.transformed(Ts), points.transformed_at_once(Ts), strict=True):
+        torch.testing.assert_close(one_by_one, at_once)
+
+
 def test_nothing_is_seen_where_nothing_is(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
     geometry, *rest = views
     face_ids, inverse_depth, Ts, intrinsics = (value[2:] for value in rest)
     for find in (visible_points, visible_points_torch):
         points = find(geometry, face_ids, inverse_depth, Ts, intrinsics)
         assert points.groups == () and points.point_link.shape == (3, 0)
-        assert points.transformed(Ts)[0].shape == (3, 0)
+        assert points.transformed(Ts)[0].shape == points.transformed_at_once(Ts)[0].shape == (3, 0)

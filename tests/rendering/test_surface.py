@@ -1,6 +1,7 @@
 """Surface maps and their Jacobian against finite differences of a supersampled rendering."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,14 +9,15 @@ import torch
 from torch.nn import functional
 
 from carts_core.camera import Camera
+from carts_core.data import Sequence
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.inputs import smoothed
-from carts_core.optimization.parameters import ParameterVector
+from carts_core.optimization.parameters import STEP, ParameterVector
 from carts_core.parts import PARTS, link_parts
-from carts_core.rendering import Renderer
+from carts_core.rendering import Renderer, jacobian
 from carts_core.robot import Robot
 from carts_core.scene import Arm, Scene
-from carts_core.surface import COVERAGE, NORMALS
+from carts_core.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 
 JOINTS = [0.1, -0.1, 0.13, 0.3, 0.6, -0.5, 0.7]
 WIDTH, HEIGHT = 96, 72
@@ -58,6 +60,36 @@ def test_a_window_is_a_part_of_the_whole(scene: Scene) -> None:
     assert torch.equal(part, whole[:, :, 8:48, 16:64])
 
 
+def test_many_states_at_once_look_as_each_alone(scene: Scene) -> None:
+    offsets = torch.linspace(-0.2, 0.2, 3)[:, None] * torch.ones(7)
+    parameters = ParameterVector(scene, scene.state({"PSM1": JOINTS}), FreeParameters(), 0.15)
+    renderer = Renderer(scene)
+    together = renderer.surface_maps(parameters.state(offsets))
+    assert together.shape == (3, 1, SURFACE_CHANNELS, HEIGHT, WIDTH)
+    for maps, each in zip(together, offsets, strict=True):
+        torch.testing.assert_close(maps, renderer.surface(parameters.state(each)).maps)
+    assert not torch.equal(together[0], together[1])
+
+
+@pytest.mark.parametrize("free", ["joints", "base_frames", "extrinsics", "intrinsics"])
+def test_the_compiled_jacobian_agrees_with_torch(
+    sample_sequence_path: Path, free: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    measured = sequence.scene.state(sequence.frame(0).measured)
+    chosen = replace(FreeParameters(joints=False), **{free: True})
+    parameters = ParameterVector(sequence.scene, measured, chosen, 0.15)
+    renderer, around = Renderer(sequence.scene, width=160, height=120), parameters.around(torch.zeros(len(parameters)))
+    compiled = renderer.surface(around, 2 * STEP, margin=4).jacobian
+    monkeypatch.setattr(jacobian, "compiled_jacobian", jacobian.plain_jacobian)
+    plain = renderer.surface(around, 2 * STEP, margin=4).jacobian
+    assert sum(len(block.unknowns) for block in compiled) == len(parameters)
+    for one, other in zip(compiled, plain, strict=True):
+        assert one.unknowns.equal(other.unknowns) and (one.left, one.top) == (other.left, other.top)
+        assert other.values.abs().max() > 1.0
+        torch.testing.assert_close(one.values, other.values, atol=1e-2, rtol=1e-4)
+
+
 @pytest.mark.parametrize("free", ["joints", "base_frames", "extrinsics", "intrinsics"])
 def test_the_jacobian_agrees_with_finite_differences(scene: Scene, free: str) -> None:
     parameters = ParameterVector(
@@ -66,9 +98,8 @@ def test_the_jacobian_agrees_with_finite_differences(scene: Scene, free: str) ->
     renderer, fine = Renderer(scene), Renderer(scene, width=8 * WIDTH, height=8 * HEIGHT)
     count, at = len(parameters), torch.zeros(len(parameters))
     eye = torch.eye(count)
-    tangents = renderer.tangents(parameters.state(-1e-3 * eye), parameters.state(1e-3 * eye), 2e-3)
-    rendering = renderer.surface(parameters.state(at), tangents)
-    jacobian = torch.stack([block.dense(count, rendering.maps) for block in rendering.jacobian]).sum(0)
+    rendering = renderer.surface(parameters.around(at), 2 * STEP)
+    analytic_maps = torch.stack([block.dense(count, rendering.maps) for block in rendering.jacobian]).sum(0)
     step = 0.002
     for index in range(count):
         ahead, behind = (
@@ -76,7 +107,7 @@ def test_the_jacobian_agrees_with_finite_differences(scene: Scene, free: str) ->
             for sign in (1.0, -1.0)
         )
         numeric = smoothed((ahead - behind) / (2 * step), BLUR)
-        analytic = smoothed(jacobian[index], BLUR)
+        analytic = smoothed(analytic_maps[index], BLUR)
         cosine = functional.cosine_similarity(analytic.flatten(), numeric.flatten(), dim=0)
         # One sample per pixel, as the optimizer renders, leaves some aliasing in.
         assert cosine > 0.75, parameters.names[index]

@@ -50,6 +50,17 @@ def test_the_torch_kernel_agrees_with_the_compiled_one(seed: int, near: float) -
     same_surface(ids, depth, *other)
 
 
+def test_the_torch_kernel_sees_many_views_as_each_alone() -> None:
+    vertices = torch.stack([torch.tensor(random_triangles(seed, near=-0.05)[0]) for seed in range(3)])
+    faces, intrinsics = torch.tensor(random_triangles(0)[1]), torch.tensor([INTRINSICS] * 3)
+    intrinsics[1] *= 1.1
+    together = visibility_torch(vertices, faces, intrinsics, WIDTH, HEIGHT)
+    for view in range(3):
+        alone = visibility_torch(vertices[view], faces, intrinsics[view], WIDTH, HEIGHT)
+        assert (alone[0] >= 0).any()
+        assert all(many[view].equal(one) for many, one in zip(together, alone, strict=True))
+
+
 @pytest.mark.gpu
 def test_the_torch_kernel_gives_the_same_on_a_gpu() -> None:
     vertices, faces = random_triangles(0)

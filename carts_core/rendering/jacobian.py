@@ -1,0 +1,220 @@
+"""How surface maps change with the unknowns.
+
+The derivative is that of `motion.py`, but forward: for every unknown, the velocity of every visible point in the image
+carries the map along, and the turning of its link turns its normal.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..surface import NORMALS
+from .jacobian_numba import fill_jacobian
+from .points import VisiblePoints
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Derivatives of what a renderer places and projects with, one per unknown."""
+
+    Ts_camera_link: Float[Tensor, "unknowns cameras links 4 4"]
+    intrinsics: Float[Tensor, "unknowns cameras 4"]
+    """[px] of the rendered size."""
+
+
+@dataclass(frozen=True)
+class JacobianBlock:
+    """Derivatives by the unknowns that move the same arms, around what they move; zero elsewhere."""
+
+    unknowns: Int[Tensor, " g"]
+    """Which they are."""
+    left: int
+    top: int
+    """Where the values lie in the maps [px]."""
+    values: Float[Tensor, "g cameras 6 rows columns"]
+
+    def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
+        """The derivative of whole maps by all unknowns, [unknowns, cameras, 6, height, width]."""
+        whole = like.new_zeros(unknowns, *like.shape)
+        rows, columns = self.values.shape[-2:]
+        whole[self.unknowns, :, :, self.top : self.top + rows, self.left : self.left + columns] = self.values
+        return whole
+
+
+def map_jacobian(
+    points: VisiblePoints,
+    position: Float[Tensor, "3 K"],
+    facing: Float[Tensor, "3 K"],
+    maps: Float[Tensor, "cameras 6 height width"],
+    inverse_depth: Float[Tensor, "cameras height width"],
+    intrinsics: Float[Tensor, "cameras 4"],
+    tangents: Tangents,
+    margin: int,
+) -> tuple[JacobianBlock, ...]:
+    """The derivative of surface maps by the unknowns.
+
+    Args:
+        points: what each pixel sees.
+        position: where that is in the camera's frame [m].
+        facing: its normal in its link's frame, towards the camera.
+        maps: the surface maps.
+        inverse_depth: 1 / depth [1/m], 0 for background.
+        intrinsics: of the cameras [px].
+        tangents: of the unknowns.
+        margin: what blocks hold around what is moved [px].
+    """
+    fill = compiled_jacobian if maps.device.type == "cpu" else plain_jacobian
+    blocks = []
+    for unknowns, runs in _families(points, tangents):
+        box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
+        values = fill(points, position, facing, maps, inverse_depth, intrinsics, tangents, unknowns, runs, box)
+        blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
+    return tuple(blocks)
+
+
+_Run = tuple[int, int, slice]
+"""View, link, and where its points are."""
+
+
+def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
+    """Unknowns that move common links, with all the visible links that they move."""
+    moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
+    moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
+    runs: list[_Run] = []
+    begin = 0
+    for view, link, count in points.groups:
+        runs.append((view, link, slice(begin, begin + count)))
+        begin += count
+    families: list[tuple[list[int], set[int]]] = []
+    for unknown, moved in enumerate(moves.cpu().numpy()):
+        mine = {index for index, (view, link, _) in enumerate(runs) if moved[view, link]}
+        if not mine:
+            continue
+        related = [family for family in families if family[1] & mine]
+        families = [family for family in families if not family[1] & mine]
+        unknowns = sorted([unknown, *(other for family in related for other in family[0])])
+        families.append((unknowns, mine.union(*(family[1] for family in related))))
+    return [(unknowns, [runs[index] for index in sorted(indices)]) for unknowns, indices in families]
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A rectangle of all cameras' maps [px]."""
+
+    left: int
+    top: int
+    columns: int
+    rows: int
+
+    @staticmethod
+    def around(pixels: list[Tensor], inverse_depth: Float[Tensor, "cameras height width"], margin: int) -> "_Box":
+        """What holds these pixels of the flattened maps, with a margin."""
+        height, width = inverse_depth.shape[1:]
+        pixel = torch.cat(pixels)
+        column, row = pixel % width, pixel // width % height
+        left, top = max(int(column.min()) - margin, 0), max(int(row.min()) - margin, 0)
+        right, bottom = min(int(column.max()) + margin + 1, width), min(int(row.max()) + margin + 1, height)
+        return _Box(left, top, right - left, bottom - top)
+
+    def of(self, maps: Tensor) -> Tensor:
+        """This part of maps [..., height, width]."""
+        return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
+
+    def index(self, pixel: Int[Tensor, " K"], height: int, width: int) -> Int[Tensor, " K"]:
+        """Where pixels of the flattened maps are in the flattened box."""
+        column, row, camera = pixel % width, pixel // width % height, pixel // (width * height)
+        return (camera * self.rows + row - self.top) * self.columns + column - self.left
+
+
+def compiled_jacobian(
+    points: VisiblePoints,
+    position: Float[Tensor, "3 K"],
+    facing: Float[Tensor, "3 K"],
+    maps: Float[Tensor, "cameras 6 height width"],
+    inverse_depth: Float[Tensor, "cameras height width"],
+    intrinsics: Float[Tensor, "cameras 4"],
+    tangents: Tangents,
+    unknowns: list[int],
+    runs: list[_Run],
+    box: _Box,
+) -> Float[Tensor, "g cameras 6 rows columns"]:
+    """The derivative of a box of surface maps by some unknowns, on a CPU."""
+    values = maps.new_zeros(len(unknowns), *maps.shape[:2], box.rows, box.columns)
+    fill_jacobian(
+        np.array(unknowns),
+        np.array([(view, link, here.start, here.stop) for view, link, here in runs]),
+        points.pixel.numpy(),
+        points.point_link.contiguous().numpy(),
+        position.contiguous().numpy(),
+        facing.contiguous().numpy(),
+        tangents.Ts_camera_link.contiguous().numpy(),
+        tangents.intrinsics.contiguous().numpy(),
+        intrinsics.contiguous().numpy(),
+        maps.numpy(),
+        inverse_depth.numpy(),
+        box.left,
+        box.top,
+        NORMALS.start,
+        values.numpy(),
+    )
+    return values
+
+
+def plain_jacobian(
+    points: VisiblePoints,
+    position: Float[Tensor, "3 K"],
+    facing: Float[Tensor, "3 K"],
+    maps: Float[Tensor, "cameras 6 height width"],
+    inverse_depth: Float[Tensor, "cameras height width"],
+    intrinsics: Float[Tensor, "cameras 4"],
+    tangents: Tangents,
+    unknowns: list[int],
+    runs: list[_Run],
+    box: _Box,
+) -> Float[Tensor, "g cameras 6 rows columns"]:
+    """The same without the compiled kernel, for any device."""
+    cameras, height, width = inverse_depth.shape
+    # Velocity [px per unit of each unknown] of what each pixel sees, and the change of its normal.
+    flat = position.new_zeros(len(unknowns), 5, cameras * box.rows * box.columns)
+    for view, link, here in runs:
+        dT, dK = tangents.Ts_camera_link[unknowns, view, link], tangents.intrinsics[unknowns, view]
+        K = intrinsics[view]
+        dX = dT[:, :3, :3] @ points.point_link[:, here] + dT[:, :3, 3:]
+        X, Y, Z = position[:, here]
+        motion = torch.cat(
+            [
+                (K[0] * (dX[:, 0] - X / Z * dX[:, 2]) / Z + dK[:, 0:1] * (X / Z) + dK[:, 2:3])[:, None],
+                (K[1] * (dX[:, 1] - Y / Z * dX[:, 2]) / Z + dK[:, 1:2] * (Y / Z) + dK[:, 3:4])[:, None],
+                dT[:, :3, :3] @ facing[:, here],
+            ],
+            1,
+        )
+        flat[:, :, box.index(points.pixel[here], height, width)] = motion
+    shaped = flat.view(len(unknowns), 5, cameras, box.rows, box.columns).transpose(1, 2)
+    values = _carried(box.of(maps), shaped[:, :, :2], box.of(inverse_depth))
+    values[:, :, NORMALS] += shaped[:, :, 2:]
+    return values
+
+
+def _carried(
+    maps: Float[Tensor, "cameras 6 height width"],
+    velocity: Float[Tensor, "g cameras 2 height width"],
+    inverse_depth: Float[Tensor, "cameras height width"],
+) -> Float[Tensor, "g cameras 6 height width"]:
+    """Change of the maps as adjacent pixels are carried by the nearer one's point; see `motion.py`."""
+    jacobian = maps.new_zeros(len(velocity), *maps.shape)
+    size = maps.shape[2:]
+    for axis, dim in ((0, 3), (1, 2)):
+        length = size[dim - 2] - 1
+        first, second = maps.narrow(dim, 0, length), maps.narrow(dim, 1, length)
+        half = 0.5 * (first - second)
+        first_nearer = inverse_depth.narrow(dim - 1, 0, length) >= inverse_depth.narrow(dim - 1, 1, length)
+        along = velocity[:, :, axis]
+        speed = torch.where(first_nearer, along.narrow(dim, 0, length), along.narrow(dim, 1, length))
+        moved = speed[:, :, None] * half
+        jacobian.narrow(dim + 1, 0, length).add_(moved)
+        jacobian.narrow(dim + 1, 1, length).add_(moved)
+    return jacobian
