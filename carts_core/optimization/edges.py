@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..losses import attention
-from ..rendering import Outline, Renderer
+from ..rendering import Outline, Renderer, Tangents
 from ..scene import Scene
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
 from .parameters import STEP, ParameterVector
@@ -47,6 +47,9 @@ _SHARE = (0.3, 1.0, 1.0)
 
 _LONGEST_STEP = 0.05
 """Largest change of an unknown in one step [rad]; edges are near, so a longer one is a mistake."""
+
+_RENDERED_ANEW = 1.0
+"""Outlines that have moved by more than this are rendered anew; up to there they move as they say they do [px]."""
 
 _STILL = 0.03
 """Outlines that move by no more than this have arrived [px]."""
@@ -122,17 +125,21 @@ class EdgeRefinement:
         origin, step = offsets, torch.zeros_like(offsets)
         slope, stiffness = torch.zeros_like(gradient), torch.zeros_like(curvature)
         tangents = self._renderer.tangents(self._parameters.around(origin), 2 * STEP)
+        outline, rendered_at = self._rendered(offsets, tangents), offsets
         for _ in range(self._settings.edge_steps):
-            outline = self._renderer.outline(self._parameters.state(offsets), tangents)
-            slope, stiffness = self._equations(outline, counts)
+            if outline.moved_by(offsets - rendered_at) > _RENDERED_ANEW:
+                outline, rendered_at = self._rendered(offsets, tangents), offsets
+            slope, stiffness = self._equations(outline.at(offsets - rendered_at), counts)
             before = offsets
             total = gradient + curvature @ (before - origin) + slope
             offsets = self._parameters.clamp(before + self._step(before, total, curvature + stiffness))
             step = offsets - before
-            moved = step @ outline.motion
-            if not len(moved) or float(moved.abs().max()) < _STILL:
+            if outline.moved_by(step) < _STILL:
                 break
         return Drawn(offsets, slope + stiffness @ step, stiffness)
+
+    def _rendered(self, offsets: Tensor, tangents: Tangents) -> Outline:
+        return self._renderer.outline(self._parameters.state(offsets), tangents)
 
     def _step(self, offsets: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
         """Where the linear model is lowest; what is at a limit and would go beyond it stays there."""

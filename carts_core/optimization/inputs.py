@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from kornia.filters import gaussian_blur2d
+from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
 from ..errors import SettingsError
@@ -72,8 +73,13 @@ def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[
     """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
     if deviation == 0:
         return images
-    size = 2 * kernel_radius(deviation) + 1
-    return gaussian_blur2d(images, (size, size), (deviation, deviation), border_type="replicate")
+    kernel = _kernel(deviation, images.device)
+    return filter2d_separable(images, kernel, kernel, border_type="replicate")
+
+
+@lru_cache(maxsize=32)
+def _kernel(deviation: float, device: torch.device) -> Float[Tensor, "1 n"]:
+    return get_gaussian_kernel1d(2 * kernel_radius(deviation) + 1, deviation, device=device)
 
 
 def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Tensor, "*batch h w"]:

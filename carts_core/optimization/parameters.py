@@ -111,10 +111,11 @@ class ParameterVector:
         )
         if not columns:
             return
+        start = self.start.joint_positions[index].cpu()
         for column in columns:
             scale = self._joint_scale(scene, index, column)
             low, high = arm.robot.joint_limits[column].tolist()
-            value = self.start.joint_positions[index][..., column]
+            value = start[..., column]
             # A start outside the limits (a wrong calibration of the encoder, say) may stay, but not go further out.
             lower.append((min(low, float(value.min())) - float(value.min())) / scale)
             upper.append((max(high, float(value.max())) - float(value.max())) / scale)

@@ -25,6 +25,7 @@ class SceneGeometry:
     """In link frames [m]."""
     vertex_counts: tuple[int, ...]
     """Number of vertices per link."""
+    vertex_links: Int[Tensor, " V"]
     faces: Int[Tensor, "F 3"]
     face_links: Int[Tensor, " F"]
     face_arms: Int[Tensor, " F"]
@@ -72,6 +73,7 @@ class SceneGeometry:
         return SceneGeometry(
             tensor(vertex.T),
             tuple(counts),
+            tensor(np.repeat(np.arange(len(counts)), counts), torch.int64),
             tensor(face, torch.int32),
             tensor(np.concatenate(face_links), torch.int64),
             tensor(np.concatenate(arms), torch.int64),
@@ -111,6 +113,10 @@ def vertices_in_camera(
     geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
 ) -> Float[Tensor, "*batch 3 V"]:
     """All vertices in the frame of a camera [m]."""
+    if Ts_camera_link.device.type != "cpu":
+        # One large operation, as a GPU likes it, instead of many small ones.
+        T = Ts_camera_link[..., geometry.vertex_links, :3, :]
+        return ((T[..., :3] @ geometry.vertices.T[..., None]) + T[..., 3:])[..., 0].mT
     parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
     Ts = Ts_camera_link.unbind(-3)
     return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)

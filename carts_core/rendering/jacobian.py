@@ -66,11 +66,14 @@ def map_jacobian(
         tangents: of the unknowns.
         margin: what blocks hold around what is moved [px].
     """
-    fill = compiled_jacobian if maps.device.type == "cpu" else plain_jacobian
+    seen = (points, position, facing, maps, inverse_depth, intrinsics, tangents)
     blocks = []
     for unknowns, runs in _families(points, tangents):
         box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
-        values = fill(points, position, facing, maps, inverse_depth, intrinsics, tangents, unknowns, runs, box)
+        if maps.device.type == "cpu":
+            values = compiled_jacobian(*seen, unknowns, runs, box)
+        else:
+            values = plain_jacobian(*seen, unknowns, box)
         blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
     return tuple(blocks)
 
@@ -114,19 +117,15 @@ class _Box:
         """What holds these pixels of the flattened maps, with a margin."""
         height, width = inverse_depth.shape[1:]
         pixel = torch.cat(pixels)
-        column, row = pixel % width, pixel // width % height
-        left, top = max(int(column.min()) - margin, 0), max(int(row.min()) - margin, 0)
-        right, bottom = min(int(column.max()) + margin + 1, width), min(int(row.max()) + margin + 1, height)
+        place = torch.stack([pixel % width, pixel // width % height])
+        (left, top), (right, bottom) = torch.stack(place.aminmax(dim=1)).tolist()
+        left, top = max(left - margin, 0), max(top - margin, 0)
+        right, bottom = min(right + margin + 1, width), min(bottom + margin + 1, height)
         return _Box(left, top, right - left, bottom - top)
 
     def of(self, maps: Tensor) -> Tensor:
         """This part of maps [..., height, width]."""
         return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
-
-    def index(self, pixel: Int[Tensor, " K"], height: int, width: int) -> Int[Tensor, " K"]:
-        """Where pixels of the flattened maps are in the flattened box."""
-        column, row, camera = pixel % width, pixel // width % height, pixel // (width * height)
-        return (camera * self.rows + row - self.top) * self.columns + column - self.left
 
 
 def compiled_jacobian(
@@ -172,30 +171,23 @@ def plain_jacobian(
     intrinsics: Float[Tensor, "cameras 4"],
     tangents: Tangents,
     unknowns: list[int],
-    runs: list[_Run],
     box: _Box,
 ) -> Float[Tensor, "g cameras 6 rows columns"]:
     """The same without the compiled kernel, for any device."""
-    cameras, height, width = inverse_depth.shape
-    # Velocity [px per unit of each unknown] of what each pixel sees, and the change of its normal.
-    flat = position.new_zeros(len(unknowns), 5, cameras * box.rows * box.columns)
-    for view, link, here in runs:
-        dT, dK = tangents.Ts_camera_link[unknowns, view, link], tangents.intrinsics[unknowns, view]
-        K = intrinsics[view]
-        dX = dT[:, :3, :3] @ points.point_link[:, here] + dT[:, :3, 3:]
-        X, Y, Z = position[:, here]
-        motion = torch.cat(
-            [
-                (K[0] * (dX[:, 0] - X / Z * dX[:, 2]) / Z + dK[:, 0:1] * (X / Z) + dK[:, 2:3])[:, None],
-                (K[1] * (dX[:, 1] - Y / Z * dX[:, 2]) / Z + dK[:, 1:2] * (Y / Z) + dK[:, 3:4])[:, None],
-                dT[:, :3, :3] @ facing[:, here],
-            ],
-            1,
-        )
-        flat[:, :, box.index(points.pixel[here], height, width)] = motion
-    shaped = flat.view(len(unknowns), 5, cameras, box.rows, box.columns).transpose(1, 2)
-    values = _carried(box.of(maps), shaped[:, :, :2], box.of(inverse_depth))
-    values[:, :, NORMALS] += shaped[:, :, 2:]
+    view, link = points.owners()
+    pose, K = tangents.Ts_camera_link[unknowns][:, view, link, :3], intrinsics[view].T
+    dK = tangents.intrinsics[unknowns][:, view].movedim(-1, 1)
+    point, one = points.point_link, torch.ones_like(points.point_link[:1])
+    both = torch.stack([torch.cat([point, one]), torch.cat([facing, torch.zeros_like(one)])])
+    dX, turning = (pose @ both.permute(2, 1, 0)).permute(3, 0, 2, 1)
+    depth = position[2]
+    ray = position[:2] / depth
+    velocity = K[:2] * (dX[:, :2] - ray * dX[:, 2:]) / depth + dK[:, :2] * ray + dK[:, 2:]
+    flat = position.new_zeros(len(unknowns), 5, inverse_depth.numel())
+    flat[:, :, points.pixel] = torch.cat([velocity, turning], 1)
+    motion = box.of(flat.view(len(unknowns), 5, *inverse_depth.shape)).transpose(1, 2)
+    values = _carried(box.of(maps), motion[:, :, :2], box.of(inverse_depth))
+    values[:, :, NORMALS] += motion[:, :, 2:]
     return values
 
 

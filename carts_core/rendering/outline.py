@@ -4,7 +4,7 @@ Where a smooth surface turns away from the camera, its outline moves with the su
 motion of the surface point that is seen there is all that is needed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
@@ -38,6 +38,15 @@ class Outline:
     """Index into `carts_core.parts.PARTS`."""
     motion: Float[Tensor, "unknowns K"]
     """Along the normal [px per unit of each unknown]."""
+
+    def at(self, step: Float[Tensor, " unknowns"]) -> "Outline":
+        """Where the outlines are after a small step of the unknowns."""
+        return replace(self, position=self.position + self.normal * (step @ self.motion))
+
+    def moved_by(self, step: Float[Tensor, " unknowns"]) -> float:
+        """How far a step of the unknowns moves what moves most along its normal [px]; 0 where there are none."""
+        motion = step @ self.motion
+        return float(motion.abs().max()) if len(motion) else 0.0
 
 
 def outline_pixels(inverse_depth: Float[Tensor, "cameras height width"]) -> Bool[Tensor, "cameras height width"]:

@@ -17,22 +17,19 @@ def _clip_near(corners: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "m 3 3"],
     in_front = corners[..., 2] >= NEAR
     count = in_front.sum(-1)
     whole = (count == 3).nonzero()[:, 0]
-    pieces, sources = [corners[whole]], [whole]
-    for kept in (1, 2):
-        index = (count == kept).nonzero()[:, 0]
-        # Turn each triangle until the corner that differs from the other two comes first.
-        single = in_front[index] if kept == 1 else ~in_front[index]
-        order = (single.int().argmax(-1)[:, None] + torch.arange(3, device=corners.device)) % 3
-        a, b, c = corners[index].gather(1, order[..., None].expand(-1, -1, 3)).unbind(1)
-        ab = _crossing(a, b)
-        ac = _crossing(a, c)
-        if kept == 1:
-            pieces.append(torch.stack([a, ab, ac], 1))
-            sources.append(index)
-        else:
-            pieces += [torch.stack([ab, b, c], 1), torch.stack([ab, c, ac], 1)]
-            sources += [index, index]
-    return torch.cat(pieces), torch.cat(sources)
+    cut = ((count == 1) | (count == 2)).nonzero()[:, 0]
+    if not len(cut):
+        return corners[whole], whole
+    one = (count[cut] == 1)[:, None]
+    # Turn each triangle until the corner that differs from the other two comes first.
+    order = ((in_front[cut] == one).int().argmax(-1)[:, None] + torch.arange(3, device=corners.device)) % 3
+    a, b, c = corners[cut].gather(1, order[..., None].expand(-1, -1, 3)).unbind(1)
+    ab, ac = _crossing(a, b), _crossing(a, c)
+    # With one corner in front a triangle is left, with two a quadrangle, which is two triangles.
+    first = torch.where(one[:, None], torch.stack([a, ab, ac], 1), torch.stack([ab, b, c], 1))
+    two = (~one[:, 0]).nonzero()[:, 0]
+    second = torch.stack([ab, c, ac], 1)[two]
+    return torch.cat([corners[whole], first, second]), torch.cat([whole, cut, cut[two]])
 
 
 def _crossing(p: Float[Tensor, "n 3"], q: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -53,38 +50,40 @@ def visibility_torch(
     Every (triangle, pixel of its bounding box) pair is tested, and a scatter keeps the nearest by a key that packs
     depth and triangle into one integer.
     """
-    device, batch = vertices_camera.device, vertices_camera.shape[:-2]
-    count = len(faces)
+    device, shape = vertices_camera.device, (*vertices_camera.shape[:-2], height, width)
     corners, source = _clip_near(vertices_camera.double()[..., faces.long(), :].reshape(-1, 3, 3))
-    view = source // max(count, 1)
-    fx, fy, cx, cy = intrinsics.double().reshape(-1, 4)[view].T[:, :, None]
+    view, face = source // max(len(faces), 1), source % max(len(faces), 1)
+    K = intrinsics.double().reshape(-1, 1, 4)[view]
     inverse_z = 1.0 / corners[..., 2]
-    u = fx * corners[..., 0] * inverse_z + cx
-    v = fy * corners[..., 1] * inverse_z + cy
-    first_x = (u.amin(-1) - 0.5).ceil().clamp(0, width).long()
-    last_x = (u.amax(-1) - 0.5).floor().clamp(-1, width - 1).long()
-    first_y = (v.amin(-1) - 0.5).ceil().clamp(0, height).long()
-    last_y = (v.amax(-1) - 0.5).floor().clamp(-1, height - 1).long()
-    columns, rows = (last_x - first_x + 1).clamp(min=0), (last_y - first_y + 1).clamp(min=0)
-    area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+    position = K[..., :2] * corners[..., :2] * inverse_z[..., None] + K[..., 2:]
+    # Only pixel centres (x + 0.5, y + 0.5) inside the bounding box can be covered.
+    size = torch.tensor([width, height], device=device)
+    first = torch.minimum((position.amin(1) - 0.5).ceil().clamp(min=0), size).long()
+    last = torch.minimum((position.amax(1) - 0.5).floor().clamp(min=-1), size - 1).long()
+    columns, rows = (last - first + 1).clamp(min=0).unbind(1)
+    # Barycentric coordinates and 1/z are affine in the image.
+    (bu, bv), (cu, cv) = ((position[:, corner] - position[:, 0]).T for corner in (1, 2))
+    area = bu * cv - cu * bv
+    to_first = (first + 0.5 - position[:, 0]).T
+    slopes = torch.stack([cv, -cu, -bv, bu]) / area
+    triangle = torch.cat([to_first, slopes, inverse_z[:, :1].T, (inverse_z[:, 1:] - inverse_z[:, :1]).T])
+    corner = (view * height + first[:, 1]) * width + first[:, 0]
     pixels = columns * rows * (area != 0)
-    shape = (*batch, height, width)
     keys = torch.full((math.prod(shape),), torch.iinfo(torch.int64).max, dtype=torch.int64, device=device)
     for chunk in _chunks(pixels):
-        owner = torch.repeat_interleave(chunk, pixels[chunk])
-        start = torch.repeat_interleave(pixels[chunk].cumsum(0) - pixels[chunk], pixels[chunk])
-        local = torch.arange(len(owner), device=device) - start
-        x, y = first_x[owner] + local % columns[owner], first_y[owner] + local // columns[owner]
-        a_u, a_v = u[owner, 0], v[owner, 0]
-        du, dv = x + 0.5 - a_u, y + 0.5 - a_v
-        w_b = (du * (v[owner, 2] - a_v) - dv * (u[owner, 2] - a_u)) / area[owner]
-        w_c = (dv * (u[owner, 1] - a_u) - du * (v[owner, 1] - a_v)) / area[owner]
-        inside = (w_b >= 0) & (w_c >= 0) & (w_b + w_c <= 1)
-        z = inverse_z[owner, 0] * (1 - w_b - w_c) + inverse_z[owner, 1] * w_b + inverse_z[owner, 2] * w_c
+        counts = pixels[chunk]
+        owner = torch.repeat_interleave(chunk, counts)
+        local = torch.arange(len(owner), device=device) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+        across = columns[owner]
+        x, y = local % across, local // across
+        u, v, b_u, b_v, c_u, c_v, z, z_b, z_c = triangle[:, owner]
+        u, v = u + x, v + y
+        w_b, w_c = b_u * u + b_v * v, c_u * u + c_v * v
+        inside = ((w_b >= 0) & (w_c >= 0) & (w_b + w_c <= 1)).nonzero()[:, 0]
         # The bits of a positive float32 sort like the number, so depth goes above the face in one int64.
-        depth_bits = (1.0 / z[inside]).float().view(torch.int32).long()
-        key = (depth_bits << 32) | (source % count)[owner[inside]]
-        keys.scatter_reduce_(0, ((view[owner] * height + y) * width + x)[inside], key, "amin")
+        depth = (1.0 / (z + w_b * z_b + w_c * z_c)[inside]).float()
+        key = (depth.view(torch.int32).long() << 32) | face[owner[inside]]
+        keys.scatter_reduce_(0, (corner[owner] + y * width + x)[inside], key, "amin")
     seen = keys != torch.iinfo(torch.int64).max
     face_ids = torch.where(seen, keys & 0xFFFFFFFF, BACKGROUND).int()
     depth = torch.where(seen, (keys >> 32).int().view(torch.float32), 0.0)
