@@ -74,7 +74,7 @@ class OptimizerSettings:
     """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05
     """`surface`: weight of normals beside that [1]."""
-    edge_steps: int = 8
+    edge_steps: int = 24
     """`gauss_newton`: largest number of steps that draw outlines to edges of the image, before the last look and, if
     `iterations` are not used up, as a last iterate; 0 for none."""
     edge_weight: float = 0.3
