@@ -13,11 +13,17 @@ from .renderer import Renderer
 
 
 def main() -> None:
-    """Render the shipped robot once, in a small picture."""
+    """Render the shipped robot once, in a small picture, and how it changes."""
     robot = Robot.load(shipped_robot(), progress=print)
-    camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), np.eye(4))
+    # From a little behind the base, along the instrument.
+    T_camera_world = np.eye(4)
+    T_camera_world[2, 3] = 0.05
+    camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), T_camera_world)
     scene = Scene((Arm("arm", robot, np.eye(4)),), (camera,))
-    Renderer(scene).surface(scene.state({"arm": np.zeros(len(robot.joint_names))}))
+    step = 1e-3
+    around = np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))
+    rendering = Renderer(scene).surface(scene.state({"arm": around}), 2 * step)
+    assert rendering.jacobian, "what is not seen compiles nothing"
 
 
 if __name__ == "__main__":
