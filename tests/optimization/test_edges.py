@@ -57,6 +57,19 @@ def test_outlines_come_to_lie_on_the_edges_of_the_image(sequence: Sequence) -> N
     assert (drawn.gradient + held).abs().max() < 0.1 * pulled
 
 
+def test_moving_outlines_as_they_say_is_as_good_as_rendering_them(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered, render = [], Renderer.outline
+    monkeypatch.setattr(Renderer, "outline", lambda *given: rendered.append(render(*given)) or rendered[-1])
+    moved, _ = draw(sequence)
+    few = len(rendered)
+    monkeypatch.setattr("carts_core.optimization.edges._RENDERED_ANEW", 0.0)
+    always, _ = draw(sequence)
+    assert few < 0.8 * (len(rendered) - few)
+    assert (moved.offsets - always.offsets)[:2].abs().max() < 0.05 * OFF.max()
+
+
 def test_where_there_is_no_edge_nothing_moves(sequence: Sequence) -> None:
     drawn, _ = draw(sequence, np.full((480, 640, 3), 128, np.uint8))
     assert drawn.offsets.abs().max() == 0

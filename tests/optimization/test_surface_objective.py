@@ -14,8 +14,10 @@ from carts_core.data import Sequence
 from carts_core.evaluation import dice, start_positions
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.optimization.comparison import Stage
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.surface_objective import SurfaceObjective
+from carts_core.optimization.window import Window
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 from carts_core.scene import Scene
@@ -190,6 +192,20 @@ def test_an_arm_that_the_first_look_misses_is_searched_in_the_whole_image(
         ends[candidates] = np.abs(optimizer.best.joint_positions()["PSM1"] - truth)[:2].max()
     assert ends[0] > np.deg2rad(5.0), "the first look alone does not see the arm"
     assert ends[64] < np.deg2rad(0.5)
+
+
+def test_many_states_are_compared_at_once_as_each_alone(sequence: Sequence) -> None:
+    frame, scene = sequence.frame(0), sequence.scene
+    parameters = ParameterVector(scene, scene.state(frame.measured), FreeParameters(), 0.15)
+    observed = Renderer(scene).surface_maps(scene.state(frame.truth or {}))
+    weight, window = torch.ones_like(observed[:, :1]), Window(0, 0, 320, 240)
+    stage = Stage(scene, (320, 240), 1.0, window, observed, weight, 4.0, OptimizerSettings())
+    offsets = torch.linspace(-0.1, 0.1, 5)[:, None] * torch.ones(len(parameters))
+    costs = stage.costs(parameters.state(offsets))
+    alone = [stage.compare(parameters.state(each), gradient=False).cost for each in offsets]
+    assert costs.tolist() == pytest.approx(alone, rel=1e-4)
+    assert stage.compare(parameters.around(offsets[1]), gradient=True).cost == pytest.approx(alone[1], rel=1e-4)
+    assert len({round(cost, 1) for cost in alone}) == len(alone)
 
 
 def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: FeatureExtractor) -> None:

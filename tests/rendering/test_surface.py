@@ -83,8 +83,7 @@ def test_the_compiled_jacobian_agrees_with_torch(
     compiled = renderer.surface(around, 2 * STEP, margin=4).jacobian
 
     def without_kernel(*arguments) -> torch.Tensor:
-        *seen, unknowns, _, box = arguments
-        return jacobian.plain_jacobian(*seen, unknowns, box)
+        return jacobian.plain_jacobian(*arguments[:-2], box=arguments[-1])
 
     monkeypatch.setattr(jacobian, "compiled_jacobian", without_kernel)
     plain = renderer.surface(around, 2 * STEP, margin=4).jacobian
