@@ -13,12 +13,15 @@ from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .inputs import kernel_radius, smoothed
-from .parameters import STEP
+from .parameters import APART
 from .settings import OptimizerSettings
 from .window import Window
 
 _FACTORS = (1, 2, 4, 8)
 """How many times smaller than the compared images those of a stage can be."""
+
+_STATES_AT_ONCE, _PIXELS_AT_ONCE = 128, 1 << 20
+"""Most states, and most pixels of all of them, that are rendered at once."""
 
 _SMALLEST_BLUR = 1.2
 """A stage is reduced as far as its blur stays at least this [px of the reduced image]."""
@@ -57,9 +60,15 @@ class Stage:
         self._channels[NORMALS] = settings.normals_weight
 
     def costs(self, states: SceneState) -> Float[Tensor, " batch"]:
-        """Of a batch of states, all rendered at once; see `Comparison.cost`."""
-        _, squared, ratio = self._difference(self.renderer.surface_maps(states))
-        return 0.5 * self.area * (squared * ratio).flatten(1).sum(1)
+        """Of a batch of states, as many at once as memory allows; see `Comparison.cost`."""
+        pixels = self.window.area * states.intrinsics.shape[-2]
+        at_once = max(min(_STATES_AT_ONCE, _PIXELS_AT_ONCE // pixels), 1)
+        found = []
+        for first in range(0, len(states.intrinsics), at_once):
+            part = states.map(lambda values, first=first: values[first : first + at_once])
+            _, squared, ratio = self._difference(self.renderer.surface_maps(part))
+            found.append(0.5 * self.area * (squared * ratio).flatten(1).sum(1))
+        return torch.cat(found)
 
     def compare(self, state: SceneState, *, gradient: bool) -> "Comparison":
         """Compare a state; with a gradient, also say how the cost changes.
@@ -68,7 +77,7 @@ class Stage:
             state: one state, or with a gradient a batch, as `ParameterVector.around` makes it.
         """
         margin = 1 + kernel_radius(self._blur)
-        rendering = self.renderer.surface(state, 2 * STEP if gradient else None, margin)
+        rendering = self.renderer.surface(state, APART if gradient else None, margin)
         model, squared, ratio = self._difference(rendering.maps)
         comparison = Comparison(
             0.5 * self.area * float((squared * ratio).sum()),

@@ -20,7 +20,7 @@ from ..losses import attention
 from ..rendering import Outline, Renderer, Tangents
 from ..scene import Scene
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
-from .parameters import STEP, ParameterVector
+from .parameters import APART, ParameterVector
 from .settings import OptimizerSettings
 from .veil import unveiled
 
@@ -124,7 +124,7 @@ class EdgeRefinement:
         counts = attention(near, _NEAR) * self._shown
         origin, step = offsets, torch.zeros_like(offsets)
         slope, stiffness = torch.zeros_like(gradient), torch.zeros_like(curvature)
-        tangents = self._renderer.tangents(self._parameters.around(origin), 2 * STEP)
+        tangents = self._renderer.tangents(self._parameters.around(origin), APART)
         outline, rendered_at = self._rendered(offsets, tangents), offsets
         for _ in range(self._settings.edge_steps):
             if outline.moved_by(offsets - rendered_at) > _RENDERED_ANEW:

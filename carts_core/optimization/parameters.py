@@ -19,6 +19,9 @@ from .settings import FreeParameters
 STEP = 1e-3
 """Distance of an unknown's two neighbouring states from its value [rad]."""
 
+APART = 2 * STEP
+"""Distance of these from each other [rad]."""
+
 _FOCAL_SCALE = 1.0
 """One unit of a focal unknown is a factor of e; a principal point moves by the focal length."""
 

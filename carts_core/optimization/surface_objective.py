@@ -41,9 +41,6 @@ _SUPPORT = 0.5
 _LEFT = 0.3
 """Share of the silhouette it started with that an arm has to keep, or it has gone elsewhere to be rid of it [1]."""
 
-_AT_ONCE = 128
-"""Most starts that are rendered at once, which bounds the memory."""
-
 _SPREAD = 1.8
 """Deviation of random starts, in expected errors."""
 
@@ -330,8 +327,7 @@ class SurfaceObjective:
 
     def _coarse_costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
         """The objective in the first stage of the present look."""
-        stage, state = self._viewed.stages[0], self.parameters.state
-        costs = torch.cat([stage.costs(state(part)) for part in offsets.split(_AT_ONCE)])
+        costs = self._viewed.stages[0].costs(self.parameters.state(offsets))
         return costs / self.settings.noise**2 + self._prior.value(offsets)
 
     def _look_at(self, offsets: Tensor, look: int, whole: bool = False) -> None:

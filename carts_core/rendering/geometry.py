@@ -114,9 +114,15 @@ def vertices_in_camera(
 ) -> Float[Tensor, "*batch 3 V"]:
     """All vertices in the frame of a camera [m]."""
     if Ts_camera_link.device.type != "cpu":
-        # One large operation, as a GPU likes it, instead of many small ones.
-        T = Ts_camera_link[..., geometry.vertex_links, :3, :]
-        return ((T[..., :3] @ geometry.vertices.T[..., None]) + T[..., 3:])[..., 0].mT
+        return vertices_in_camera_at_once(geometry, Ts_camera_link)
     parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
     Ts = Ts_camera_link.unbind(-3)
     return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)
+
+
+def vertices_in_camera_at_once(
+    geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
+) -> Float[Tensor, "*batch 3 V"]:
+    """The same in one large operation, as a GPU likes it."""
+    T = Ts_camera_link[..., geometry.vertex_links, :3, :]
+    return ((T[..., :3] @ geometry.vertices.T[..., None]) + T[..., 3:])[..., 0].mT

@@ -71,9 +71,9 @@ def map_jacobian(
     for unknowns, runs in _families(points, tangents):
         box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
         if maps.device.type == "cpu":
-            values = compiled_jacobian(*seen, unknowns, runs, box)
+            values = jacobian_compiled(*seen, unknowns, runs, box)
         else:
-            values = plain_jacobian(*seen, unknowns, box)
+            values = jacobian_torch(*seen, unknowns, box)
         blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
     return tuple(blocks)
 
@@ -128,7 +128,7 @@ class _Box:
         return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
 
 
-def compiled_jacobian(
+def jacobian_compiled(
     points: VisiblePoints,
     position: Float[Tensor, "3 K"],
     facing: Float[Tensor, "3 K"],
@@ -162,7 +162,7 @@ def compiled_jacobian(
     return values
 
 
-def plain_jacobian(
+def jacobian_torch(
     points: VisiblePoints,
     position: Float[Tensor, "3 K"],
     facing: Float[Tensor, "3 K"],

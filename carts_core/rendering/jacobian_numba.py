@@ -49,7 +49,7 @@ def fill_jacobian(unknowns, runs, pixel, point, position, normal, dTs, dKs, Ks, 
 
     Args:
         unknowns [g]: which of the tangents' they are.
-        runs [r, 4]: view, link, and first and last but one of the points of each link that is seen in a view.
+        runs [r, 4]: view, link, first point and one past the last one, of each link that is seen in a view.
         pixel [K], point, position, normal [3, K]: of visible points: index into the maps, where it is in its link's
             frame and in the camera's [m], and the normal in its link's frame, towards the camera.
         dTs [unknowns, views, links, 4, 4], dKs [unknowns, views, 4]: tangents.

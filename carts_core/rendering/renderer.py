@@ -152,6 +152,7 @@ class Renderer:
             distance: of the states on both sides; None leaves the Jacobian out.
             margin: what the Jacobian's blocks hold around what is moved [px].
         """
+        assert state.intrinsics.ndim == (2 if distance is None else 3), "one state, or those around it"
         Ts, intrinsics = self._views(state)
         tangents = None
         if distance is not None:

@@ -194,7 +194,10 @@ def test_an_arm_that_the_first_look_misses_is_searched_in_the_whole_image(
     assert ends[64] < np.deg2rad(0.5)
 
 
-def test_many_states_are_compared_at_once_as_each_alone(sequence: Sequence) -> None:
+def test_many_states_are_compared_at_once_as_each_alone(
+    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), width=320, height=240))
     frame, scene = sequence.frame(0), sequence.scene
     parameters = ParameterVector(scene, scene.state(frame.measured), FreeParameters(), 0.15)
     observed = Renderer(scene).surface_maps(scene.state(frame.truth or {}))
@@ -206,6 +209,8 @@ def test_many_states_are_compared_at_once_as_each_alone(sequence: Sequence) -> N
     assert costs.tolist() == pytest.approx(alone, rel=1e-4)
     assert stage.compare(parameters.around(offsets[1]), gradient=True).cost == pytest.approx(alone[1], rel=1e-4)
     assert len({round(cost, 1) for cost in alone}) == len(alone)
+    monkeypatch.setattr("carts_core.optimization.comparison._STATES_AT_ONCE", 2)
+    assert torch.equal(stage.costs(parameters.state(offsets)), costs), "in parts where they are too many"
 
 
 def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: FeatureExtractor) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from tiny import tiny_scene
 
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.parameters import STEP, ParameterVector
+from carts_core.optimization.parameters import APART, ParameterVector
 from carts_core.rendering import Outline, Renderer
 from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
 from carts_core.robot import Robot
@@ -27,7 +27,7 @@ def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
 
 
 def outline(renderer: Renderer, parameters: ParameterVector, offsets: torch.Tensor) -> Outline:
-    tangents = renderer.tangents(parameters.around(offsets), 2 * STEP)
+    tangents = renderer.tangents(parameters.around(offsets), APART)
     return renderer.outline(parameters.state(offsets), tangents)
 
 

@@ -8,7 +8,12 @@ import torch
 from torch import Tensor
 
 from carts_core.data import Sequence
-from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
+from carts_core.rendering.geometry import (
+    SceneGeometry,
+    link_transforms,
+    vertices_in_camera,
+    vertices_in_camera_at_once,
+)
 from carts_core.rendering.points import visible_points, visible_points_torch
 from carts_core.rendering.visibility_numba import rasterize
 
@@ -57,6 +62,13 @@ def test_all_links_move_at_once_as_one_by_one(views: tuple[SceneGeometry, Tensor
     Ts, points = views[3], visible_points(*views)
     for one_by_one, at_once in zip(points.transformed(Ts), points.transformed_at_once(Ts), strict=True):
         torch.testing.assert_close(one_by_one, at_once)
+
+
+def test_vertices_move_at_once_as_link_by_link(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
+    geometry, Ts = views[0], views[3]
+    link_by_link = torch.stack([vertices_in_camera(geometry, T) for T in Ts])
+    torch.testing.assert_close(vertices_in_camera(geometry, Ts), link_by_link)
+    torch.testing.assert_close(vertices_in_camera_at_once(geometry, Ts), link_by_link)
 
 
 def test_nothing_is_seen_where_nothing_is(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:

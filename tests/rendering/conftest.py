@@ -1,0 +1,25 @@
+"""A scene that several tests of this folder look at."""
+
+import numpy as np
+import pytest
+import torch
+
+from carts_core.camera import Camera
+from carts_core.robot import Robot
+from carts_core.scene import Arm, Scene, SceneState
+
+_JOINTS = [0.1, -0.1, 0.13, 0.3, 0.6, -0.5, 0.7]
+_WIDTH, _HEIGHT = 96, 72
+
+
+@pytest.fixture(scope="session")
+def close_up(shipped_psm: Robot) -> tuple[Scene, SceneState]:
+    """The tip of one arm, close up and from its side."""
+    T_base_tip = shipped_psm.forward_kinematics(torch.tensor(_JOINTS).double())[-1].numpy()
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    T_camera_world[:3, 3] = -T_camera_world[:3, :3] @ T_base_tip[:3, 3] + [0, 0, 0.045]
+    K = (1.1 * _WIDTH, 1.1 * _WIDTH, _WIDTH / 2, _HEIGHT / 2)
+    camera = Camera("left", _WIDTH, _HEIGHT, K, T_camera_world)
+    scene = Scene((Arm("PSM1", shipped_psm, np.eye(4)),), (camera,))
+    return scene, scene.state({"PSM1": _JOINTS})
