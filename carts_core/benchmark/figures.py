@@ -34,7 +34,8 @@ def write_figures(data: Measurements, folder: Path) -> dict[str, Path]:
         (
             "convergence",
             "Convergence on the synthetic frames, from the measured kinematics: best iterate so far, mean and "
-            "quartiles over frames of all domains. A run that has ended keeps its value.",
+            "quartiles over frames of all domains. A run that has ended keeps its value. Losses are of runs in which "
+            "they fell; ours compare through one look at the image only and are left out.",
             _convergence,
         ),
         ("errors", "Dice and joint error after optimization, by the error at the start (regular domain).", _errors),
@@ -96,24 +97,33 @@ def _convergence(data: Measurements) -> Figure | None:
         steps = max(m.iterations for m in measurements)
         dice = _padded(measurements, steps, lambda m: [score.dice for score in m.best_so_far()])
         _band(by_step, np.arange(steps + 1), dice, method)
-        if all(score.loss is not None for m in measurements for score in m.trace):
-            _band(loss, np.arange(steps + 1), _padded(measurements, steps, _loss_to_go), method)
+        falling = [m for m in measurements if _falls(m)]
+        if falling:
+            label = f"{SHORT_LABELS[method]}: {len(falling)} of {len(measurements)} runs"
+            _band(loss, np.arange(steps + 1), _padded(falling, steps, _loss_to_go), method, label)
         seconds = _padded(measurements, steps, lambda m: [score.seconds for score in m.trace])
         _band(by_time, np.median(seconds, axis=0), dice, method)
     by_step.set(title="Dice by iteration", xlabel="iteration", ylabel="Dice")
     by_time.set(title="Dice by time", xlabel="seconds (log)", ylabel="Dice", xscale="log")
     by_time.xaxis.set_major_formatter("{x:g}")
     by_time.xaxis.set_minor_formatter(NullFormatter())
-    loss.set(title="loss by iteration", xlabel="iteration", ylabel="share of the loss's fall still to come")
+    loss.set(
+        title="loss by iteration, where it fell", xlabel="iteration", ylabel="share of the loss's fall still to come"
+    )
     _finish(figure.axes)
     return figure
+
+
+def _falls(measurement: Measurement) -> bool:
+    """Whether the losses of a run compare and one is below the first."""
+    best = measurement.best_so_far()
+    return all(score.loss is not None for score in measurement.trace) and best[-1].loss != best[0].loss
 
 
 def _loss_to_go(measurement: Measurement) -> list[float]:
     """The methods' losses are not in one unit, so each is scaled to fall from 1 to 0."""
     losses = [score.loss or 0.0 for score in measurement.best_so_far()]
-    fall = losses[0] - losses[-1]
-    return [(loss - losses[-1]) / fall if fall else 0.0 for loss in losses]
+    return [(loss - losses[-1]) / (losses[0] - losses[-1]) for loss in losses]
 
 
 def _padded(measurements: list[Measurement], steps: int, values: Callable[[Measurement], list[float]]) -> np.ndarray:
@@ -122,8 +132,8 @@ def _padded(measurements: list[Measurement], steps: int, values: Callable[[Measu
     return np.array([row + [row[-1]] * (steps + 1 - len(row)) for row in rows])
 
 
-def _band(axes: Axes, x: np.ndarray, values: np.ndarray, method: str) -> None:
-    axes.plot(x, values.mean(0), color=COLORS[method], label=SHORT_LABELS[method])
+def _band(axes: Axes, x: np.ndarray, values: np.ndarray, method: str, label: str | None = None) -> None:
+    axes.plot(x, values.mean(0), color=COLORS[method], label=label or SHORT_LABELS[method])
     axes.fill_between(x, *np.quantile(values, (0.25, 0.75), axis=0), color=COLORS[method], alpha=0.15, lw=0)
 
 
