@@ -38,8 +38,8 @@ $facts
 <a href="#method">How it is measured</a></nav>
 <section id="targets"><h2>Targets</h2>
 <p>Of the default solver. Target, figure and verdict are computed from the runs of this report; the line below each says
-from how many. One that lacks a domain or a device it asks for is open. From 2 or 3 runs, as of the quick form, a verdict
-may be chance.</p>
+from how many. One that lacks a domain or a device it asks for is open. From 2 or 3 runs, as in the quick form, a
+verdict may be chance.</p>
 <div class="wide">$targets</div></section>
 <section id="figures"><h2>Figures</h2>$figures</section>
 $sections
