@@ -86,6 +86,7 @@ def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     files = [folder / "masks" / camera / f"{row['frame']}.png" for camera in ("left", "right") for row in rows]
     assert sorted((folder / "masks").rglob("*.png")) == files
     one, other = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in (files[0], files[2]))
+    assert one is not None and other is not None
     assert (one > 0).any() and (other > 0).any() and (one != other).any()
 
     main(command)
