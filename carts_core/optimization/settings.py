@@ -205,7 +205,7 @@ class OptimizerSettings:
             learning_rate=1e-3,
             decay=0.9,
             prior_weight=0.0,
-            lever=1.0,
+            lever=0.1,
             wide_attention_radius=10,
             blur=0.0,
             wide_blur=0.0,
