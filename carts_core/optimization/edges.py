@@ -22,7 +22,7 @@ from ..scene import Scene
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
 from .parameters import APART, ParameterVector
 from .settings import OptimizerSettings
-from .veil import unveiled
+from .veil import certainty, transmission, unveiled
 
 _ZOOM = 2.0
 """How many times larger than the working image that is in which edges are looked for, up to the camera's image [1]."""
@@ -93,12 +93,13 @@ class EdgeRefinement:
         self._parameters, self._settings = parameters, settings
         size = working_size(scene, round(settings.working_width * _ZOOM), 1)
         stacked = stacked_images(scene, images, size, "image").to(device)
-        clear = unveiled(stacked, settings.unveil)
+        through = transmission(stacked, settings.unveil)
+        clear = unveiled(stacked, through)
         down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
         # An outline beside an occluder would find the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
-        self._shown = 1.0 - attention(hidden, math.ceil(_REACH))
+        self._shown = (1.0 - attention(hidden, math.ceil(_REACH))) * certainty(through)
         self._renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)

@@ -13,7 +13,7 @@ Direction = Literal["forward", "backward"]
 class SequenceSettings:
     """Model of the measurement error and the way through the frames; defaults are measured (docs/sequences.md)."""
 
-    constant_deg: float = 1.5
+    constant_deg: float = 2.0
     """Deviation of the constant part of the error [deg]; `lever` turns it into metres."""
     drift_deg: float = 0.2
     """Deviation of the slow drift about it [deg]."""

@@ -24,7 +24,7 @@ from .inputs import pixel_weights, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
 from .settings import OptimizerSettings
-from .veil import unveiled
+from .veil import certainty, transmission, unveiled
 from .window import Window
 
 _MARGIN = (27, 16)
@@ -75,6 +75,9 @@ class _Scale:
     images: Float[Tensor, "cameras 3 h w"]
     weight: Float[Tensor, "cameras 1 h w"]
     """0 where an occluder is known to be, 1 elsewhere."""
+    fine_weight: Float[Tensor, "cameras 1 h w"]
+    """The same, less under smoke and haze. For all looks but the first ones: these search, and what they see under a
+    veil is better than nothing; later ones decide."""
     whole: Renderer
     """Of the whole image."""
 
@@ -183,11 +186,15 @@ class SurfaceObjective:
             images, ignore = self._given
             unit, _ = working_size(scene, settings.working_width, self._extractor.stride)
             size = working_size(scene, round(settings.working_width * zoom), self._extractor.stride)
+            stacked = stacked_images(scene, images, size, "image").to(device)
+            through = transmission(stacked, settings.unveil)
+            weight = pixel_weights(scene, ignore, size).to(device)
             self._scales[zoom] = _Scale(
                 zoom=size[0] / unit,
                 size=size,
-                images=unveiled(stacked_images(scene, images, size, "image").to(device), settings.unveil),
-                weight=pixel_weights(scene, ignore, size).to(device),
+                images=unveiled(stacked, through),
+                weight=weight,
+                fine_weight=weight * certainty(through),
                 whole=Renderer(scene, width=size[0], height=size[1], device=device),
             )
         return self._scales[zoom]
@@ -340,7 +347,8 @@ class SurfaceObjective:
         observed = self._extractor.surface(window.of(scale.images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
-        weight = window.of(scale.weight) * near[:, None]
+        decides = later or look == self.look(self.stages - 1)
+        weight = window.of(scale.fine_weight if decides else scale.weight) * near[:, None]
         seen = observed, weight
         blurs = [blur for number, blur in self._plan if number == look]
         stages = [

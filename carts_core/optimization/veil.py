@@ -5,6 +5,7 @@ in at least one colour, so the darkest colour of the darkest pixel nearby tells 
 channel prior of He, Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
 """
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
@@ -25,18 +26,30 @@ _LEAST = 0.25
 """Least transmission that is assumed; noise grows by its inverse [1]."""
 
 
-def unveiled(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 3 h w"]:
-    """Images without a share of the veil that lies over them.
+def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 1 h w"]:
+    """Share of the light behind a veil that comes through it, at each pixel; `_LEAST` to 1.
 
     Args:
         images: RGB in [0, 1].
-        share: of the veil that is taken off [1]; 0 leaves the images as they are.
+        share: of the veil that is believed in [1]; 0 believes in none.
     """
     if share == 0:
-        return images
+        return torch.ones_like(images[:, :1])
     darkest = functional.interpolate(images.amin(1, keepdim=True), scale_factor=1 / _COARSER, mode="area")
     reach = max(round(_REACH * darkest.shape[-1]), 1)
     veil = smoothed(-attention(-darkest, reach), reach)
     veil = functional.interpolate(veil, images.shape[-2:], mode="bilinear")
-    transmission = (1.0 - share * veil / _AIRLIGHT).clamp(min=_LEAST)
-    return ((images - _AIRLIGHT) / transmission + _AIRLIGHT).clamp(0.0, 1.0)
+    return (1.0 - share * veil / _AIRLIGHT).clamp(min=_LEAST)
+
+
+def unveiled(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Images, RGB in [0, 1], without the veil that lets that share of the light through."""
+    return ((images - _AIRLIGHT) / through + _AIRLIGHT).clamp(0.0, 1.0)
+
+
+def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
+    """What a pixel of an unveiled image tells, as a share of what it would tell without the veil [1].
+
+    Unveiling has noise grow by the inverse of the transmission, and information is the inverse of its square.
+    """
+    return through.square()
