@@ -2,7 +2,7 @@
 
 from statistics import mean
 
-from ..synthesis.config import DOMAINS
+from ..settings import DOMAINS
 from .occlusion import OCCLUSION, SHARE
 from .scope import REAL, SYNTHETIC
 from .statistics import Measurements

@@ -14,7 +14,7 @@ from ..data.background import spread
 from ..errors import SettingsError
 from ..mesh_cache import cache_dir
 from ..scene import Scene
-from ..synthesis.config import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
+from ..settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from .backdrop import backdrop
@@ -25,6 +25,7 @@ from .scope import REAL, SYNTHETIC, Scope
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
 _MOTION_SECONDS = 6.0
+_SYNTHESIS = ("synthesis/*.py", "settings/synthesis.py")
 _ALTERING_CODE = ("benchmark/backdrop.py", "benchmark/counterfactual.py", "benchmark/real_surface.py")
 
 
@@ -93,7 +94,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
         render=RenderConfig(samples=scope.samples),
     )
-    code = code_fingerprint(("synthesis/*.py",))
+    code = code_fingerprint(_SYNTHESIS)
     fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
     folder = cache_dir() / "benchmark" / f"sequence_{seed}_{fingerprint[:8]}"
 
@@ -132,7 +133,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     if not masked:
         raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
-    code = code_fingerprint(("synthesis/*.py", *_ALTERING_CODE))
+    code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
     fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
     consecutive = masked[: scope.consecutive]
     calibrating = spread(len(sequence), scope.calibration_frames)

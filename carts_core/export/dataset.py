@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -15,12 +14,11 @@ from ..data import Sequence
 from ..errors import CartsError, SettingsError
 from ..rendering import Renderer
 from ..scene import Scene
+from ..settings import Parts
 from .files import unique_file_names
 from .frames import ExportFrame
 from .monitor import Monitor
 from .png import image_png
-
-Parts = Literal["arms", "links"]
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from ..data import Frame
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from .error_model import ErrorModel, Gaussian, Information, combined, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
-from .sequence_settings import SequenceSettings
-from .settings import FreeParameters, OptimizerSettings
 from .sight import Eye, Ignore, Sight
 
 Start = Literal["warm", "cold", "keyframe", "carried"]

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..settings import OptimizerSettings
 from .evaluation import Evaluation, Solver, Stay
 from .gauss_newton import GaussNewton
 from .parameters import ParameterVector
-from .settings import OptimizerSettings
 
 _FINE_FROM = 0.5
 """Share of the iterations after which the objective's last stage begins."""

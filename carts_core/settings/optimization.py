@@ -5,7 +5,13 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 from ..errors import SettingsError
-from ..losses import Loss
+
+Loss = Literal["surface", "acs", "acs_paper", "acs_reference", "l1"]
+"""`surface`: parts and normals that the network sees against those that are rendered; the only one for Gauss-Newton.
+`acs`: mean dissimilarity inside the attention map, independent of how large that is.
+`acs_paper`: the paper's equation, 1 - mean(similarity x attention); falls when the silhouette grows.
+`acs_reference`: mean((1 - similarity) x attention); falls when the silhouette shrinks.
+`l1`: smooth L1 between the network's predictions ("CaRTS L1")."""
 
 SolverName = Literal["gauss_newton", "adam", "gradient_descent", "none"]
 """`none` evaluates the start and stops ("CaRTS without optimization")."""
@@ -38,7 +44,7 @@ class OptimizerSettings:
     solver: SolverName = "gauss_newton"
     """Which solver; `gauss_newton` needs the loss `surface`."""
     loss: Loss = "surface"
-    """Which loss; see `carts_core.losses.Loss`."""
+    """Which loss; see `carts_core.settings.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
     blurs: tuple[float, ...] = (8.0, 3.0, 1.6, 0.8)
