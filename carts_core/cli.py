@@ -1,6 +1,7 @@
 """The `carts` command. Each subcommand is a dataclass whose fields are its options and whose `run` does the work."""
 
 import sys
+from importlib.metadata import version
 from typing import Annotated
 
 import tyro
@@ -16,7 +17,10 @@ from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
 from .errors import CartsError
-from .process import tune_process
+
+_DESCRIPTION = (
+    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is."
+)
 
 BAD_INPUT = 2
 """Exit status when a file or an option is not usable."""
@@ -36,13 +40,19 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors that are meant for people end it with one message and status 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"carts {version('carts')}")
+        return
     try:
         command = tyro.cli(
             Command,
             prog="carts",
-            description="Correct a surgical robot's kinematics from its endoscope image.",
+            description=_DESCRIPTION,
             args=arguments,
         )  # pyright: ignore
+        from .process import tune_process
+
         tune_process(keep_memory=not isinstance(command, View))
         command.run()
     except CartsError as error:

@@ -9,14 +9,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from ..data import Sequence
-from ..evaluation import FrameScore, camera_groups, evaluate, evaluate_sequence, mean_score, to_json
-from ..export import write_bytes
-from ..features.extractor import FeatureExtractor
-from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
-from .hints import base_frame_hint
+from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from .selection import Mode, Network, Selection, SequencePath
 
 _WIDTH = 110
@@ -47,6 +41,13 @@ class Evaluate:
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""
+        from ..data import Sequence
+        from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
+        from ..export import write_bytes
+        from ..features.extractor import FeatureExtractor
+        from .hints import base_frame_hint
+        from .score_table import score_table
+
         console = Console()
         if not console.is_terminal:
             console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
@@ -70,7 +71,7 @@ class Evaluate:
         )
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
-        console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
+        console.print(score_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
         for group in camera_groups(cameras, self.together):
             gains = [score.base_frame_gain for score in scores if score.camera in group]
             hint = base_frame_hint(", ".join(group), gains)
@@ -79,43 +80,3 @@ class Evaluate:
         if self.json is not None:
             write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
             console.print(f"wrote {self.json}")
-
-
-def _table(scores: list[FrameScore], title: str) -> Table:
-    table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
-    for column in (
-        "domain",
-        "camera",
-        "Dice\nbefore",
-        "\nafter",
-        "worst\nchange",
-        "MAE \\[deg]\nbefore",
-        "\nafter",
-        "std",
-        "steps",
-        "s",
-    ):
-        table.add_column(column, justify="left" if column in ("domain", "camera") else "right")
-    groups: dict[tuple[str, str], list[FrameScore]] = {}
-    for score in scores:
-        groups.setdefault((score.domain, score.camera), []).append(score)
-    for (domain, camera), group in groups.items():
-        mean = mean_score(group)
-        change = [s.dice_after - s.dice_before for s in group if s.dice_after is not None and s.dice_before is not None]
-        table.add_row(
-            domain,
-            camera,
-            _number(mean["dice_before"], 4),
-            _number(mean["dice_after"], 4),
-            _number(min(change, default=None), 4),
-            _number(mean["joint_mae_deg_before"], 2),
-            _number(mean["joint_mae_deg_after"], 2),
-            _number(mean["joint_std_deg"], 2),
-            _number(mean["iterations"], 1),
-            _number(mean["seconds"], 2),
-        )
-    return table
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

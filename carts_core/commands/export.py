@@ -8,18 +8,8 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from ..data import Sequence
 from ..errors import SettingsError
-from ..export import (
-    Dataset,
-    FormatName,
-    Monitor,
-    Parts,
-    corrected_frames,
-    export,
-    measured_frames,
-    read_kinematics_csv,
-)
+from ..settings import FormatName, Parts
 from .selection import Selection, SequencePath
 
 
@@ -47,6 +37,9 @@ class Export:
 
     def run(self) -> None:
         """Write the export; on Ctrl-C or an error nothing of it is left."""
+        from ..data import Sequence
+        from ..export import Dataset, Monitor, corrected_frames, export, measured_frames, read_kinematics_csv
+
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         indices = self.select.frame_indices(sequence)

@@ -20,7 +20,7 @@ class FrameFolder:
     """
 
     def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, rows: list[KinematicsRow]) -> None:
-        self.rows, self._folder = rows, folder
+        self.rows, self.folder = rows, folder
         self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
         self._scene = sequence.scene.with_cameras(cameras)
         folders = {camera: folder / "masks" / (camera if len(cameras) > 1 else "") for camera in cameras}
@@ -40,4 +40,4 @@ class FrameFolder:
         rows = {row.frame_id: row for row in self.rows} | new
         self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
         # The table is written after the mask, so a frame in the table always has one.
-        write_bytes(self._folder / "kinematics.csv", kinematics_csv(self._scene, self.rows).encode())
+        write_bytes(self.folder / "kinematics.csv", kinematics_csv(self._scene, self.rows).encode())

@@ -8,11 +8,6 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from ..data import Frame, Sequence
-from ..evaluation import start_positions
-from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
-from ..rendering import Renderer
-from ..scene import SceneState
 from .selection import Selection, SequencePath
 
 
@@ -36,6 +31,11 @@ class Render:
 
     def run(self) -> None:
         """Write one PNG per frame, camera and domain."""
+        from ..data import Sequence
+        from ..evaluation import start_positions
+        from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
+        from ..rendering import Renderer
+
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         folder = self.output or Path("runs") / sequence.name / "render"
@@ -46,12 +46,12 @@ class Render:
                 for index in track(frames, f"{domain}, {camera}", console=console):
                     frame = sequence.frame(index, domain, [camera])
                     state = sequence.scene.state(start_positions(sequence, frame, self.perturb_deg, self.seed))
-                    png = self._png(renderer, state, frame, camera)
+                    if self.style == "mask":
+                        png = mask_png(renderer.segment(state)[0] >= 0)
+                    else:
+                        image, mask = image_and_mask(renderer, state)
+                        if self.style == "overlay":
+                            image = overlay(frame.images[camera], image, mask, self.opacity)
+                        png = image_png(image)
                     write_bytes(folder / domain / camera / f"{frame.frame_id}.png", png)
         console.print(f"wrote {folder}")
-
-    def _png(self, renderer: Renderer, state: SceneState, frame: Frame, camera: str) -> bytes:
-        if self.style == "mask":
-            return mask_png(renderer.segment(state)[0] >= 0)
-        image, mask = image_and_mask(renderer, state)
-        return image_png(image if self.style == "image" else overlay(frame.images[camera], image, mask, self.opacity))

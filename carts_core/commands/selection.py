@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..data import Sequence
 from ..errors import SettingsError
-from ..scene import Scene
+
+if TYPE_CHECKING:
+    from ..data import Sequence
+    from ..scene import Scene
 
 ALL = "all"
 
@@ -27,7 +29,7 @@ class Selection:
     domain: tuple[str, ...] = ()
     """Domains, by name, or `all`; the sequence's first one if none is named."""
 
-    def frame_indices(self, sequence: Sequence) -> list[int]:
+    def frame_indices(self, sequence: "Sequence") -> list[int]:
         """Positions of the chosen frames.
 
         Raises:
@@ -35,7 +37,7 @@ class Selection:
         """
         return parse_frames(self.frames, len(sequence))
 
-    def camera_names(self, scene: Scene) -> list[str]:
+    def camera_names(self, scene: "Scene") -> list[str]:
         """Names of the chosen cameras.
 
         Raises:
@@ -45,7 +47,7 @@ class Selection:
             return [camera.name for camera in scene.cameras]
         return [scene.camera(name).name for name in self.camera]
 
-    def domain_names(self, sequence: Sequence) -> list[str]:
+    def domain_names(self, sequence: "Sequence") -> list[str]:
         """Names of the chosen domains.
 
         Raises:
@@ -107,11 +109,13 @@ def check_device(device: str) -> None:
     Raises:
         SettingsError: it does not.
     """
+    if device == "cpu":
+        return
     import torch
 
     kind, _, number = device.partition(":")
     cards = torch.cuda.device_count()
-    if device == "cpu" or (kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards))):
+    if kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards)):
         return
     known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
     raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")

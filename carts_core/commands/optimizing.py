@@ -1,0 +1,187 @@
+"""What `carts optimize` does."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from ..data import Sequence
+from ..errors import SettingsError
+from ..evaluation import Starts, camera_groups, start_positions
+from ..export import KinematicsRow, read_kinematics_csv, write_bytes
+from ..features.extractor import FeatureExtractor
+from ..optimization import FrameOptimizer, SequenceOptimizer
+from .frame_folder import FrameFolder
+from .hints import base_frame_hint
+from .optimize import Optimize
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The frames of a domain, as cameras see them that work together."""
+
+    domain: str
+    cameras: tuple[str, ...]
+    output: FrameFolder
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.domain}, {', '.join(self.cameras)}"
+
+
+class Optimizing:
+    """Corrects frames as a command line asks for.
+
+    Args:
+        asked: the command line.
+    """
+
+    def __init__(self, asked: Optimize) -> None:
+        self._asked, self._console = asked, Console()
+        self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
+        self._extractor = FeatureExtractor.load(*asked.network.weights, device=asked.network.device)
+
+    def run(self) -> None:
+        """Optimize what is not there yet."""
+        sequence, select = self._sequence, self._asked.select
+        frames = select.frame_indices(sequence)
+        for domain in select.domain_names(sequence):
+            for cameras in camera_groups(select.camera_names(sequence.scene), self._asked.together):
+                folder = (self._asked.output or Path("runs") / sequence.name) / domain / "+".join(cameras)
+                rows = self._earlier_rows(folder)
+                self._run(frames, _Part(domain, cameras, FrameFolder(sequence, cameras, folder, rows)))
+
+    def _run(self, frames: list[int], part: _Part) -> None:
+        output = part.output
+        done = output.complete()
+        todo = [index for index in frames if self._sequence.frame_ids[index] not in done]
+        if len(todo) < len(frames):
+            self._console.print(f"{output.folder}: {len(frames) - len(todo)} of {len(frames)} frames are there already")
+        if self._asked.mode == "frame":
+            self._each_alone(todo, part)
+        elif todo:
+            # Every frame depends on all others, so one that is missing has all of them done again.
+            self._as_sequence(frames, part)
+        self._console.print(f"wrote masks and kinematics.csv of {len(output.rows)} frames to {output.folder}")
+
+    def _each_alone(self, todo: list[int], part: _Part) -> None:
+        asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
+        needed = todo and asked.optimizer.needs_background
+        background = {camera: sequence.background(camera, domain) for camera in cameras} if needed else {}
+        gains = []
+        for index in track(todo, part.name, console=self._console, disable=not todo):
+            frame = sequence.frame(index, domain, cameras)
+            optimizer = FrameOptimizer(
+                sequence.scene,
+                frame,
+                background,
+                self._extractor,
+                start=start_positions(sequence, frame, asked.perturb_deg, asked.seed),
+                settings=asked.optimizer,
+                free=asked.free,
+                cameras=cameras,
+                live=False,
+            )
+            for _ in optimizer:
+                pass
+            best = optimizer.best
+            assert best is not None
+            row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
+            part.output.write([(row, best.state)])
+            gains.append(optimizer.base_frame_gain())
+        hint = base_frame_hint(part.name, gains)
+        if hint is not None:
+            self._console.print(hint, style="yellow")
+
+    def _as_sequence(self, frames: list[int], part: _Part) -> None:
+        asked, sequence, cameras = self._asked, self._sequence, part.cameras
+        starts = Starts(sequence, part.domain, cameras, asked.perturb_deg, asked.seed)
+        optimizer = SequenceOptimizer(
+            sequence.scene,
+            starts.frame,
+            starts.times(frames),
+            self._extractor,
+            settings=asked.optimizer,
+            model=asked.model,
+            free=asked.free,
+            keyframes=self._keyframes(frames),
+            cameras=cameras,
+        )
+        try:
+            for _ in track(optimizer, part.name, total=len(frames), console=self._console):
+                pass
+        finally:
+            # Ctrl-C keeps what is there.
+            part.output.write(
+                [
+                    (
+                        KinematicsRow(
+                            estimate.frame_id,
+                            "edited" if estimate.start == "keyframe" else "optimized",
+                            estimate.joint_positions,
+                            estimate.joint_std,
+                        ),
+                        estimate.state,
+                    )
+                    for estimate in optimizer.estimates.values()
+                ]
+            )
+        self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
+
+    def _keyframes(self, frames: list[int]) -> dict[int, Mapping[str, np.ndarray]]:
+        """Position -> joint positions of the chosen frames that a person set."""
+        if self._asked.keyframes is None:
+            return {}
+        ids = self._sequence.frame_ids
+        rows = {
+            row.frame_id: row.joint_positions
+            for row in read_kinematics_csv(self._asked.keyframes, self._sequence.scene)
+            if row.source == "edited"
+        }
+        return {index: rows[ids[index]] for index in frames if ids[index] in rows}
+
+    def _earlier_rows(self, folder: Path) -> list[KinematicsRow]:
+        """Rows of an earlier, interrupted run with the same settings.
+
+        Raises:
+            SettingsError: the folder holds results of other settings.
+        """
+        asked = self._asked
+        settings = {
+            "sequence": str(asked.sequence.resolve()),
+            "weights": self._extractor.sha256,
+            "perturb_deg": asked.perturb_deg,
+            "seed": asked.seed,
+            "free": asdict(asked.free),
+            "optimizer": asdict(asked.optimizer),
+        }
+        if asked.mode == "sequence":
+            settings |= {"mode": asked.mode, "model": asdict(asked.model), "keyframes": self._keyframes_sha256()}
+        text = json.dumps(settings, indent=1)
+        file, table = folder / "settings.json", folder / "kinematics.csv"
+        same = file.is_file() and file.read_text(encoding="utf-8") == text
+        if table.is_file() and not same and not asked.overwrite:
+            raise SettingsError(
+                f"{folder} holds results of other settings (see {file}). "
+                "Add --overwrite to replace them, or name another folder with --output."
+            )
+        if table.is_file() and same and not asked.overwrite:
+            return read_kinematics_csv(table, self._sequence.scene)
+        table.unlink(missing_ok=True)
+        write_bytes(file, text.encode())
+        return []
+
+    def _keyframes_sha256(self) -> str | None:
+        keyframes = self._asked.keyframes
+        if keyframes is None:
+            return None
+        try:
+            return hashlib.sha256(keyframes.read_bytes()).hexdigest()
+        except OSError as error:
+            raise SettingsError(f"--keyframes {keyframes} cannot be read: {error.strerror}. Name a file.") from error
