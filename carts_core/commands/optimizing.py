@@ -1,21 +1,21 @@
 """What `carts optimize` does."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 
 from ..data import Sequence
-from ..errors import SettingsError
 from ..evaluation import Starts, camera_groups, start_positions
-from ..export import KinematicsRow, read_kinematics_csv, write_bytes
+from ..export import KinematicsRow, read_kinematics_csv
 from ..features.extractor import FeatureExtractor
 from ..optimization import FrameOptimizer, SequenceOptimizer
+from ..optimization.parameters import ParameterVector
 from .frame_folder import FrameFolder
 from .hints import base_frame_hint
 from .optimize import Optimize
@@ -45,20 +45,34 @@ class Optimizing:
     def __init__(self, asked: Optimize) -> None:
         self._asked, self._console = asked, Console()
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
+        self._frames = asked.select.frame_indices(self._sequence)
+        self._keyframes = self._read_keyframes()
         self._extractor = FeatureExtractor.load(*asked.network.weights, device=asked.network.device)
 
     def run(self) -> None:
-        """Optimize what is not there yet."""
-        sequence, select = self._sequence, self._asked.select
-        frames = select.frame_indices(sequence)
-        for domain in select.domain_names(sequence):
-            for cameras in camera_groups(select.camera_names(sequence.scene), self._asked.together):
-                folder = (self._asked.output or Path("runs") / sequence.name) / domain / "+".join(cameras)
-                rows = self._earlier_rows(folder)
-                self._run(frames, _Part(domain, cameras, FrameFolder(sequence, cameras, folder, rows)))
+        """Optimize what is not there yet.
 
-    def _run(self, frames: list[int], part: _Part) -> None:
-        output = part.output
+        Raises:
+            CartsError: something cannot be done as asked for; whatever can be known of that before is told before
+                anything is written.
+        """
+        scene, select = self._sequence.scene, self._asked.select
+        groups = camera_groups(select.camera_names(scene), self._asked.together)
+        parts = [self._part(domain, group) for domain in select.domain_names(self._sequence) for group in groups]
+        for part in parts:
+            self._run(part)
+
+    def _part(self, domain: str, cameras: tuple[str, ...]) -> _Part:
+        asked, sequence = self._asked, self._sequence
+        scene = sequence.scene.with_cameras(cameras)
+        start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
+        # Made for its errors: no name of what is free or locked may be wrong.
+        ParameterVector(scene, start, asked.free, asked.optimizer.lever)
+        folder = (asked.output or Path("runs") / sequence.name) / domain / "+".join(cameras)
+        return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
+
+    def _run(self, part: _Part) -> None:
+        frames, output = self._frames, part.output
         done = output.complete()
         todo = [index for index in frames if self._sequence.frame_ids[index] not in done]
         if len(todo) < len(frames):
@@ -67,7 +81,7 @@ class Optimizing:
             self._each_alone(todo, part)
         elif todo:
             # Every frame depends on all others, so one that is missing has all of them done again.
-            self._as_sequence(frames, part)
+            self._as_sequence(part)
         self._console.print(f"wrote masks and kinematics.csv of {len(output.rows)} frames to {output.folder}")
 
     def _each_alone(self, todo: list[int], part: _Part) -> None:
@@ -99,8 +113,8 @@ class Optimizing:
         if hint is not None:
             self._console.print(hint, style="yellow")
 
-    def _as_sequence(self, frames: list[int], part: _Part) -> None:
-        asked, sequence, cameras = self._asked, self._sequence, part.cameras
+    def _as_sequence(self, part: _Part) -> None:
+        asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
         starts = Starts(sequence, part.domain, cameras, asked.perturb_deg, asked.seed)
         optimizer = SequenceOptimizer(
             sequence.scene,
@@ -110,7 +124,7 @@ class Optimizing:
             settings=asked.optimizer,
             model=asked.model,
             free=asked.free,
-            keyframes=self._keyframes(frames),
+            keyframes=self._keyframes,
             cameras=cameras,
         )
         try:
@@ -134,7 +148,7 @@ class Optimizing:
             )
         self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
 
-    def _keyframes(self, frames: list[int]) -> dict[int, Mapping[str, np.ndarray]]:
+    def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
         """Position -> joint positions of the chosen frames that a person set."""
         if self._asked.keyframes is None:
             return {}
@@ -144,14 +158,10 @@ class Optimizing:
             for row in read_kinematics_csv(self._asked.keyframes, self._sequence.scene)
             if row.source == "edited"
         }
-        return {index: rows[ids[index]] for index in frames if ids[index] in rows}
+        return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
-    def _earlier_rows(self, folder: Path) -> list[KinematicsRow]:
-        """Rows of an earlier, interrupted run with the same settings.
-
-        Raises:
-            SettingsError: the folder holds results of other settings.
-        """
+    def _settings(self) -> dict[str, Any]:
+        """All that the frames depend on."""
         asked = self._asked
         settings = {
             "sequence": str(asked.sequence.resolve()),
@@ -162,26 +172,6 @@ class Optimizing:
             "optimizer": asdict(asked.optimizer),
         }
         if asked.mode == "sequence":
-            settings |= {"mode": asked.mode, "model": asdict(asked.model), "keyframes": self._keyframes_sha256()}
-        text = json.dumps(settings, indent=1)
-        file, table = folder / "settings.json", folder / "kinematics.csv"
-        same = file.is_file() and file.read_text(encoding="utf-8") == text
-        if table.is_file() and not same and not asked.overwrite:
-            raise SettingsError(
-                f"{folder} holds results of other settings (see {file}). "
-                "Add --overwrite to replace them, or name another folder with --output."
-            )
-        if table.is_file() and same and not asked.overwrite:
-            return read_kinematics_csv(table, self._sequence.scene)
-        table.unlink(missing_ok=True)
-        write_bytes(file, text.encode())
-        return []
-
-    def _keyframes_sha256(self) -> str | None:
-        keyframes = self._asked.keyframes
-        if keyframes is None:
-            return None
-        try:
-            return hashlib.sha256(keyframes.read_bytes()).hexdigest()
-        except OSError as error:
-            raise SettingsError(f"--keyframes {keyframes} cannot be read: {error.strerror}. Name a file.") from error
+            keyframes = asked.keyframes and hashlib.sha256(asked.keyframes.read_bytes()).hexdigest()
+            settings |= {"mode": asked.mode, "model": asdict(asked.model), "keyframes": keyframes}
+        return settings

@@ -144,6 +144,43 @@ def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: p
     main([*command, "--iterations", "2", "--overwrite"])
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--arms", "PSM9"], "no arm is called 'PSM9'"),
+        (["--locked-joints", "elbow"], "locked joint 'elbow' does not exist"),
+        (["--extrinsics", "--locked-cameras", "third"], "no camera is called 'third'"),
+        (["--no-joints"], "nothing is free"),
+        (["--domain", "regular", "fog"], "domain 'fog' is not in"),
+        (["--mode", "sequence", "--keyframes", "nowhere.csv"], "nowhere.csv is not a readable kinematics table"),
+        (["--mode", "sequence", "--solver", "adam"], "needs gauss_newton and surface"),
+    ],
+)
+def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
+    arguments: list[str], message: str, sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["optimize", sequence, "--output", str(tmp_path / "out"), *arguments])
+    assert stop.value.code == BAD_INPUT and message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_are_replaced_by_frames_and_not_by_an_error(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    main([*command, "--domain", "smoke"])
+    folder = tmp_path / "out" / "smoke" / "left"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit):
+        main([*command, "--domain", "smoke", "--overwrite", "--arms", "PSM9"])
+    with pytest.raises(SystemExit):
+        main([*command, "--domain", "all", "--looks", "1"])
+    assert "smoke/left holds results of other settings" in " ".join(capsys.readouterr().err.split())
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "out" / "regular").exists(), "the first domain is not begun if the second is refused"
+
+
 @pytest.mark.parametrize("style", ["overlay", "image", "mask"])
 def test_render_writes_a_picture_per_frame(sequence: str, tmp_path: Path, style: str) -> None:
     main(["render", sequence, "--style", style, "--output", str(tmp_path / "out")])
