@@ -104,8 +104,11 @@ class CalibrationOptimizer:
         cameras: Sequence[str] | None = None,
     ) -> None:
         self.settings = settings
-        if self.settings.solver != "gauss_newton":
-            raise SettingsError(f"solver is {self.settings.solver!r}; a calibration needs gauss_newton.")
+        if self.settings.chosen_solver != "gauss_newton":
+            raise SettingsError(
+                f"a calibration was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
+                "it needs gauss_newton and surface. Leave them at their defaults."
+            )
         if not frames:
             raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
         if not 1e-3 <= joint_prior_deg <= 360:

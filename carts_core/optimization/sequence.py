@@ -106,10 +106,10 @@ class SequenceOptimizer:
         self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
         self._scene, self._load, self._extractor = scene.with_cameras(cameras), load, extractor
         self._free = free or FreeParameters()
-        if (self.settings.solver, self.settings.loss) != ("gauss_newton", "surface"):
+        if self.settings.chosen_solver != "gauss_newton":
             raise SettingsError(
-                f"sequence mode was given the solver {self.settings.solver} and the loss {self.settings.loss}; it "
-                "needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
+                f"sequence mode was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
+                "it needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
             )
         self._keyframes = {
             index: {name: np.asarray(values, np.float64) for name, values in positions.items()}

@@ -76,7 +76,8 @@ def step_size(settings: OptimizerSettings, iteration: int) -> float:
 
 def make_solver(settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> Solver:
     """A fresh solver of the kind that the settings name."""
-    if settings.solver == "none":
+    name = settings.chosen_solver
+    if name == "none":
         return Stay(stages)
     kinds = {"gauss_newton": GaussNewton, "adam": Adam, "gradient_descent": GradientDescent}
-    return kinds[settings.solver](settings, parameters, stages)
+    return kinds[name](settings, parameters, stages)

@@ -134,6 +134,23 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert stop.value.code == BAD_INPUT and "needs --mode sequence" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("loss", ["acs", "l1"])
+def test_a_loss_that_is_given_alone_gets_a_solver_that_can_descend_it(sequence: str, tmp_path: Path, loss: str) -> None:
+    file = tmp_path / "out.json"
+    main(["evaluate", sequence, "--loss", loss, "--iterations", "2", "--frames", "0", "--json", str(file)])
+    (score,) = json.loads(file.read_text())["frames"]
+    assert (score["iterations"], score["stopped"]) == (2, "iterations")
+
+
+def test_a_solver_that_cannot_descend_the_loss_is_told_with_what_can(
+    sequence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", sequence, "--loss", "acs", "--solver", "gauss_newton"])
+    assert stop.value.code == BAD_INPUT
+    assert "allowed is auto, adam, gradient_descent or none for the loss" in " ".join(capsys.readouterr().err.split())
+
+
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0"]
     main([*command, "--iterations", "1"])
