@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from .selection import Mode, Network, Selection, SequencePath
 
@@ -24,7 +25,7 @@ class Evaluate:
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
-    """Write the scores of all frames and their means to this file."""
+    """Write the scores of all frames and their means to this file; folders on the way to it are made."""
     mode: Mode = "frame"
     """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
     together: bool = False
@@ -38,6 +39,10 @@ class Evaluate:
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
     model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
+
+    def __post_init__(self) -> None:
+        if self.json is not None and self.json.is_dir():
+            raise SettingsError(f"--json {self.json} is a folder. Name a file.")
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""

@@ -37,10 +37,12 @@ class Optimize:
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
     model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
 
-    def run(self) -> None:
-        """Optimize what is not there yet."""
+    def __post_init__(self) -> None:
         if self.keyframes is not None and self.mode != "sequence":
             raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
+
+    def run(self) -> None:
+        """Optimize what is not there yet."""
         from .optimizing import Optimizing
 
         Optimizing(self).run()

@@ -23,7 +23,7 @@ def sequence(tiny_sequence: Callable[..., Path]) -> str:
     return str(tiny_sequence(frames=3, domains=("regular", "smoke"), width=160, height=128))
 
 
-def test_evaluate_writes_scores_of_every_frame_and_their_means(sequence: str, tmp_path: Path) -> None:
+def test_evaluate_writes_scores_of_every_frame_into_a_folder_that_it_makes(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "scores" / "out.json"
     main(["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--iterations", "2"])
     scores = json.loads(file.read_text())

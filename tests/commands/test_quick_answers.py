@@ -38,6 +38,8 @@ def test_help_is_given_without_heavy_imports(command: tuple[str, ...]) -> None:
         (["optimize", "sequence.toml", "--looks", "many"], "--looks"),
         (["evaluate", "sequence.toml", "--solver", "newton"], "--solver"),
         (["evaluate", "sequence.toml", "--iterations", "0"], "iterations is 0; allowed is 1 to 10000"),
+        (["optimize", "sequence.toml", "--keyframes", "table.csv"], "needs --mode sequence"),
+        (["evaluate", "sequence.toml", "--json", "/"], "--json / is a folder. Name a file."),
         (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),
         (["train", "--images.width", "17"], "give positive multiples of 16"),
     ],
