@@ -1,5 +1,6 @@
 """What `carts` says without running a command is said at once: before anything is imported that takes long."""
 
+import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -52,3 +53,16 @@ def test_a_wrong_argument_is_told_without_heavy_imports(arguments: list[str], me
 def test_the_version_is_told_without_heavy_imports() -> None:
     status, text, modules = _answer("--version")
     assert (status, text) == (0, f"carts {version('carts')}") and not HEAVY & modules
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["optimize", "--help"], ["--version"], ["optimise"]])
+def test_output_that_nobody_reads_ends_quietly(arguments: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        command = [sys.executable, "-m", "carts_core.cli", *arguments]
+        finished = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False, timeout=120)
+    finally:
+        os.close(writing)
+    assert finished.returncode == (BAD_INPUT if arguments == ["optimise"] else 1)
+    assert b"Traceback" not in finished.stderr and b"BrokenPipe" not in finished.stderr
