@@ -12,7 +12,7 @@ from rich.progress import track
 
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .selection import Mode, Network, Selection, SequencePath
+from .selection import Mode, Network, Perturbation, Selection, SequencePath
 
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
@@ -30,10 +30,7 @@ class Evaluate:
     """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
     together: bool = False
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
-    perturb_deg: float = 0.0
-    """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
-    seed: int = 0
-    """Seed of the perturbation's signs; these are the same in all frames in sequence mode."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
@@ -70,8 +67,8 @@ class Evaluate:
             domains=domains,
             settings=self.optimizer,
             free=self.free,
-            perturb_deg=self.perturb_deg,
-            seed=self.seed,
+            perturb_deg=self.start.perturb_deg,
+            seed=self.start.seed,
             together=self.together,
         )
         total = len(frames) * len(cameras) * len(domains)

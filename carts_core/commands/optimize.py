@@ -8,7 +8,7 @@ import tyro
 
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .selection import Mode, Network, Selection, SequencePath
+from .selection import Mode, Network, Perturbation, Selection, SequencePath
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,7 @@ class Optimize:
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     keyframes: Path | None = None
     """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
-    perturb_deg: float = 0.0
-    """Start that many degrees (and millimetres) off on every joint; see `carts evaluate`."""
-    seed: int = 0
-    """Seed of the perturbation's signs; these are the same in all frames in sequence mode."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)

@@ -96,7 +96,7 @@ class Optimizing:
                 frame,
                 background,
                 self._extractor,
-                start=start_positions(sequence, frame, asked.perturb_deg, asked.seed),
+                start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
                 settings=asked.optimizer,
                 free=asked.free,
                 cameras=cameras,
@@ -115,7 +115,7 @@ class Optimizing:
 
     def _as_sequence(self, part: _Part) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
-        starts = Starts(sequence, part.domain, cameras, asked.perturb_deg, asked.seed)
+        starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
         optimizer = SequenceOptimizer(
             sequence.scene,
             starts.frame,
@@ -166,8 +166,8 @@ class Optimizing:
         settings = {
             "sequence": str(asked.sequence.resolve()),
             "weights": self._extractor.sha256,
-            "perturb_deg": asked.perturb_deg,
-            "seed": asked.seed,
+            "perturb_deg": asked.start.perturb_deg,
+            "seed": asked.start.seed,
             "free": asdict(asked.free),
             "optimizer": asdict(asked.optimizer),
         }

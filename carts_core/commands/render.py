@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from .selection import Selection, SequencePath
+from .selection import Perturbation, Selection, SequencePath
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,7 @@ class Render:
     """The rendering blended over the frame, alone, or its mask."""
     opacity: float = 0.6
     """Of the rendering in an overlay, 0 to 1."""
-    perturb_deg: float = 0.0
-    """Move every joint by that many degrees (and millimetres) off the truth first."""
-    seed: int = 0
-    """Seed of the perturbation's signs."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
     def run(self) -> None:
@@ -45,7 +42,8 @@ class Render:
                 renderer = Renderer(sequence.scene, cameras=[camera])
                 for index in track(frames, f"{domain}, {camera}", console=console):
                     frame = sequence.frame(index, domain, [camera])
-                    state = sequence.scene.state(start_positions(sequence, frame, self.perturb_deg, self.seed))
+                    start = start_positions(sequence, frame, self.start.perturb_deg, self.start.seed)
+                    state = sequence.scene.state(start)
                     if self.style == "mask":
                         png = mask_png(renderer.segment(state)[0] >= 0)
                     else:

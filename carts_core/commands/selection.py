@@ -1,4 +1,4 @@
-"""Which frames, cameras, domains and arms a command works on. Shared by all commands, declared once."""
+"""Which frames, cameras and domains a command works on, and from where. Shared by commands, declared once."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +88,25 @@ def parse_frames(text: str, count: int) -> list[int]:
         wrong = f"frame {outside[0]} is outside" if outside else f"{text!r} names no frame"
         raise SettingsError(f"--frames: {wrong}; the sequence has positions 0 to {count - 1}. {hint}")
     return sorted(set(chosen))
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Wrong joint positions on purpose, to see what becomes of them."""
+
+    perturb_deg: float = 0.0
+    """Start that many degrees (and millimetres) off on every measured joint: off the true joint positions where the
+    sequence has them, else off the measured ones. 0 starts at the measured ones."""
+    seed: int = 0
+    """Seed of the error's signs; these are the same in all frames in sequence mode."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.perturb_deg <= 180:
+            raise SettingsError(
+                f"--perturb-deg is {self.perturb_deg:g}; allowed is 0 to 180. Give a size; signs are drawn from --seed."
+            )
+        if self.seed < 0:
+            raise SettingsError(f"--seed is {self.seed}; allowed is 0 or more.")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,6 +53,14 @@ def test_a_perturbed_start_is_that_far_off_the_truth(sequence: str, tmp_path: Pa
     file = tmp_path / "out.json"
     main(["evaluate", sequence, "--json", str(file), "--perturb-deg", "2", "--solver", "none", "--frames", "0"])
     assert json.loads(file.read_text())["frames"][0]["joint_mae_deg_before"] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_an_optimization_from_a_perturbed_start_begins_that_far_off_the_truth(sequence: str, tmp_path: Path) -> None:
+    main(["optimize", sequence, "--output", str(tmp_path / "out"), "--perturb-deg", "2", "--solver", "none"])
+    rows = csv.DictReader((tmp_path / "out" / "regular" / "left" / "kinematics.csv").open())
+    truth = csv.DictReader((tmp_path / "truth.csv").open())
+    off = [float(row["PSM1.yaw"]) - float(true["yaw"]) for row, true in zip(rows, truth, strict=True)]
+    assert [abs(math.degrees(angle)) for angle in off] == pytest.approx([2.0] * 3, abs=1e-3)
 
 
 def test_optimize_writes_masks_and_kinematics_and_resumes(

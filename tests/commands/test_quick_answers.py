@@ -39,6 +39,9 @@ def test_help_is_given_without_heavy_imports(command: tuple[str, ...]) -> None:
         (["optimize", "sequence.toml", "--looks", "many"], "--looks"),
         (["evaluate", "sequence.toml", "--solver", "newton"], "--solver"),
         (["evaluate", "sequence.toml", "--iterations", "0"], "iterations is 0; allowed is 1 to 10000"),
+        (["optimize", "sequence.toml", "--perturb-deg", "-3"], "--perturb-deg is -3; allowed is 0 to 180"),
+        (["evaluate", "sequence.toml", "--perturb-deg", "nan"], "--perturb-deg is nan; allowed is 0 to 180"),
+        (["render", "sequence.toml", "--seed", "-1"], "--seed is -1; allowed is 0 or more"),
         (["optimize", "sequence.toml", "--keyframes", "table.csv"], "needs --mode sequence"),
         (["evaluate", "sequence.toml", "--json", "/"], "--json / is a folder. Name a file."),
         (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),
@@ -66,3 +69,9 @@ def test_output_that_nobody_reads_ends_quietly(arguments: list[str]) -> None:
         os.close(writing)
     assert finished.returncode == (BAD_INPUT if arguments == ["optimise"] else 1)
     assert b"Traceback" not in finished.stderr and b"BrokenPipe" not in finished.stderr
+
+
+@pytest.mark.parametrize("command", ["optimize", "evaluate", "render"])
+def test_help_says_what_an_error_at_the_start_is_measured_from(command: str) -> None:
+    _, text, _ = _answer(command, "--help")
+    assert "off the true joint positions where the sequence has them" in " ".join(text.replace("│", " ").split())
