@@ -12,6 +12,7 @@ from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters
 from ..rendering import Renderer
 from ..scene import Scene
+from ..wording import counted
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
 from .measurement import Measurement
@@ -76,7 +77,7 @@ class Benchmark:
                 run = next(iter(todo))
                 group = self._group(run)
                 error = "" if run.error_deg is None else f", {run.error_deg:g} deg off"
-                which = f"frame {run.frame}" if len(group) == 1 else f"{len(group)} frames"
+                which = f"frame {run.frame}" if len(group) == 1 else counted(len(group), "frame")
                 description = f"{run.source}, {run.domain}, {which}: {run.method}{error}"
                 bar.update(task, description=description)
                 for measurement in bench[run.source].measure(group, self.scope, self.extractor):
@@ -148,7 +149,7 @@ class _Bench:
     def _calibration(self, scope: Scope, extractor: FeatureExtractor) -> Scene:
         if self._calibrated is None:
             recording, _ = self._open()
-            description = f"calibrating with {scope.calibration_frames} frames"
+            description = f"calibrating with {counted(scope.calibration_frames, 'frame')}"
             task = self._bar.add_task(description, total=None)
             _log(self._bar.console, f"{self._source.name}: {description}")
             self._calibrated = calibrated_scene(recording, self._source.camera, scope.calibration_frames, extractor)

@@ -17,6 +17,7 @@ from ..scene import Scene
 from ..settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
+from ..wording import counted
 from .backdrop import backdrop
 from .counterfactual import Counterfactual
 from .fingerprints import code_fingerprint
@@ -107,10 +108,10 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
-    counted = f"{len(evaluated)} of {frames} frames by all methods, {scope.samples} paths per pixel"
+    taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
     return Source(
         SYNTHETIC,
-        f"{what}, {counted}",
+        f"{what}, {taken}",
         "left",
         evaluated,
         fingerprint,
@@ -146,10 +147,10 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         progress("backdrop of the real frames", 0, 1)
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
-    counted = f"{len(frames)} of {len(masked)} frames with masks by all methods"
+    taken = f"{len(frames)} of {counted(len(masked), 'frame')} with masks by all methods"
     return Source(
         REAL,
-        f"{sequence.name}, camera {camera.name}, {counted}",
+        f"{sequence.name}, camera {camera.name}, {taken}",
         camera.name,
         frames,
         fingerprint.hexdigest()[:32],

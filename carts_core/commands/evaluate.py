@@ -12,6 +12,7 @@ from rich.progress import track
 
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
+from ..wording import counted
 from .selection import Mode, Network, Perturbation, Selection, SequencePath
 
 _WIDTH = 110
@@ -73,7 +74,7 @@ class Evaluate:
         )
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
-        console.print(score_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
+        console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         for group in camera_groups(cameras, self.together):
             gains = [score.base_frame_gain for score in scores if score.camera in group]
             hint = base_frame_hint(", ".join(group), gains)

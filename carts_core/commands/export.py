@@ -10,6 +10,7 @@ from rich.progress import Progress
 
 from ..errors import SettingsError
 from ..settings import FormatName, Parts
+from ..wording import counted
 from .selection import Selection, SequencePath
 
 
@@ -60,7 +61,7 @@ class Export:
             frame_rate=self.frame_rate,
         )
         with Progress(console=console) as bar:
-            task = bar.add_task(f"{self.format}, {len(frames)} frames", total=None)
+            task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
             path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         console.print(f"wrote {path}")

@@ -16,6 +16,7 @@ from ..export import KinematicsRow, read_kinematics_csv
 from ..features.extractor import FeatureExtractor
 from ..optimization import FrameOptimizer, SequenceOptimizer
 from ..optimization.parameters import ParameterVector
+from ..wording import counted
 from .frame_folder import FrameFolder
 from .hints import base_frame_hint
 from .optimize import Optimize
@@ -76,13 +77,17 @@ class Optimizing:
         done = output.complete()
         todo = [index for index in frames if self._sequence.frame_ids[index] not in done]
         if len(todo) < len(frames):
-            self._console.print(f"{output.folder}: {len(frames) - len(todo)} of {len(frames)} frames are there already")
+            self._console.print(
+                f"{output.folder}: {len(frames) - len(todo)} of {counted(len(frames), 'frame')} already there"
+            )
         if self._asked.mode == "frame":
             self._each_alone(todo, part)
         elif todo:
             # Every frame depends on all others, so one that is missing has all of them done again.
             self._as_sequence(part)
-        self._console.print(f"wrote masks and kinematics.csv of {len(output.rows)} frames to {output.folder}")
+        self._console.print(
+            f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
+        )
 
     def _each_alone(self, todo: list[int], part: _Part) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ..data import Sequence, calibrated_sequence_file
 from ..optimization import CalibrationResult
+from ..wording import counted
 from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames
 
 matplotlib.use("Agg")
@@ -85,7 +86,7 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
     lines = [
         f"# Calibration of {sequence.name}",
         "",
-        f"From {len(residuals)} frames, joints as measured in all figures below. The optimization ended: "
+        f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
         f"{result.stop_reason}. The new calibration is in `sequence.toml`, all numbers are in `calibration.json`.",
         "",
         "| mean over the frames | before | after |",

@@ -71,7 +71,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     folder = tmp_path / "out" / "regular" / "left"
     first = (folder / "masks" / "001.png").stat().st_mtime_ns
     main(command)
-    assert "2 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "2 of 3 frames already there" in capsys.readouterr().out.replace("\n", " ")
     assert (folder / "masks" / "001.png").stat().st_mtime_ns == first
     with (folder / "kinematics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -99,7 +99,7 @@ def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     assert (one > 0).any() and (other > 0).any() and (one != other).any()
 
     main(command)
-    assert "2 of 2 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "2 of 2 frames already there" in capsys.readouterr().out.replace("\n", " ")
     files[3].unlink()
     main(command)
     assert files[3].is_file(), "a frame without one of its masks is done again"
@@ -136,7 +136,7 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert [float(rows[1][name]) for name in columns[2:]] == [float(value) for value in values]
     assert float(rows[1]["PSM1.yaw.std"]) == 0
     main([*command, "--keyframes", str(given)])
-    assert "3 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "3 of 3 frames already there" in capsys.readouterr().out.replace("\n", " ")
 
     with pytest.raises(SystemExit) as stop:
         main(["optimize", sequence, *output, "--keyframes", str(given)])
@@ -158,6 +158,23 @@ def test_a_solver_that_cannot_descend_the_loss_is_told_with_what_can(
         main(["evaluate", sequence, "--loss", "acs", "--solver", "gauss_newton"])
     assert stop.value.code == BAD_INPUT
     assert "allowed is auto, adam, gradient_descent or none for the loss" in " ".join(capsys.readouterr().err.split())
+
+
+def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    main(command)
+    main(command)
+    main(["evaluate", sequence, "--frames", "0", "--iterations", "1"])
+    main(["export", sequence, str(tmp_path / "export"), "--frames", "0", "--format", "masks"])
+    told = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "1 of 1 frame already there",
+        "kinematics.csv of 1 frame to",
+        "tiny: 1 frame, means",
+        "masks, 1 frame ",
+    ):
+        assert words in told
+    assert "1 frames" not in told
 
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
