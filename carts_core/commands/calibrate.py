@@ -48,10 +48,11 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate; on Ctrl-C or an error nothing is written."""
         from ..data import Sequence
-        from ..evaluation import frame_residuals, mean_dice, write_calibration
+        from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
         from ..export import MARKER, file_name, published
         from ..features.extractor import FeatureExtractor
         from ..optimization import CalibrationOptimizer
+        from .hints import print_hints
 
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
@@ -78,6 +79,7 @@ class Calibrate:
             if (means := mean_dice(residuals, camera)) is not None:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
         console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
+        print_hints(console, remark(sequence.scene, result))
 
     def _summary(self, extractor: "FeatureExtractor", indices: list[int], cameras: list[str]) -> dict:
         """How the folder was made."""

@@ -48,7 +48,7 @@ class Evaluate:
         from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
         from ..export import write_bytes
         from ..features.extractor import FeatureExtractor
-        from .hints import base_frame_hint
+        from .hints import base_frame_hint, kept_start_hint, print_hints
         from .score_table import score_table
 
         console = Console()
@@ -76,10 +76,12 @@ class Evaluate:
         scores = list(track(found, "optimizing", total=total, console=console))
         console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         for group in camera_groups(cameras, self.together):
-            gains = [score.base_frame_gain for score in scores if score.camera in group]
-            hint = base_frame_hint(", ".join(group), gains)
-            if hint is not None:
-                console.print(hint, style="yellow")
+            where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
+            print_hints(
+                console,
+                kept_start_hint(where, [score.stopped for score in seen]),
+                base_frame_hint(where, [score.base_frame_gain for score in seen]),
+            )
         if self.json is not None:
             write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
             console.print(f"wrote {self.json}")

@@ -18,7 +18,7 @@ from ..optimization import FrameOptimizer, SequenceOptimizer
 from ..optimization.parameters import ParameterVector
 from ..wording import counted
 from .frame_folder import FrameFolder
-from .hints import base_frame_hint
+from .hints import base_frame_hint, kept_start_hint, print_hints
 from .optimize import Optimize
 
 
@@ -93,7 +93,7 @@ class Optimizing:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         needed = todo and asked.optimizer.needs_background
         background = {camera: sequence.background(camera, domain) for camera in cameras} if needed else {}
-        gains = []
+        stopped, gains = [], []
         for index in track(todo, part.name, console=self._console, disable=not todo):
             frame = sequence.frame(index, domain, cameras)
             optimizer = FrameOptimizer(
@@ -110,13 +110,12 @@ class Optimizing:
             for _ in optimizer:
                 pass
             best = optimizer.best
-            assert best is not None
+            assert best is not None and optimizer.stop_reason is not None
             row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
             part.output.write([(row, best.state)])
+            stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
-        hint = base_frame_hint(part.name, gains)
-        if hint is not None:
-            self._console.print(hint, style="yellow")
+        print_hints(self._console, kept_start_hint(part.name, stopped), base_frame_hint(part.name, gains))
 
     def _as_sequence(self, part: _Part) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras

@@ -63,6 +63,18 @@ def test_an_optimization_from_a_perturbed_start_begins_that_far_off_the_truth(se
     assert [abs(math.degrees(angle)) for angle in off] == pytest.approx([2.0] * 3, abs=1e-3)
 
 
+@pytest.mark.parametrize("command", ["evaluate", "optimize"])
+def test_a_start_that_was_kept_is_told(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    output = ["--output", str(tmp_path / "out")] if command == "optimize" else ["--json", str(tmp_path / "out.json")]
+    main([command, sequence, "--frames", "0", "--perturb-deg", "0.001", *output])
+    assert "left: in 1 of 1 run the start was kept" in " ".join(capsys.readouterr().out.split())
+    if command == "evaluate":
+        (score,) = json.loads((tmp_path / "out.json").read_text())["frames"]
+        assert score["stopped"] == "start kept"
+
+
 def test_optimize_writes_masks_and_kinematics_and_resumes(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
