@@ -24,6 +24,7 @@ from .rendering.geometry import link_transforms, vertices_in_camera
 from .rendering.visibility_numba import rasterize
 from .resources import sample_sequence
 from .scene import SceneState
+from .wording import counted
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
@@ -89,7 +90,7 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
         "ACS iteration, 95th percentile": 1e3 * float(np.percentile(seconds, 95)),
         "Gauss-Newton iteration, median": 1e3 * statistics.median(steps),
         "drawing outlines to edges": 1e3 * edges,
-        f"Gauss-Newton, a whole frame ({len(steps)} steps)": milliseconds(
+        f"Gauss-Newton, a whole frame ({counted(len(steps), 'step')})": milliseconds(
             lambda: list(optimizer(OptimizerSettings())), 5
         ),
     }
@@ -105,9 +106,8 @@ def main() -> None:
     sequence = Sequence.open(arguments.sequence)
     camera = sequence.scene.cameras[0]
     faces = sum(len(mesh.faces) for arm in sequence.scene.arms for mesh in arm.robot.meshes)
-    table = Table(
-        title=f"{sequence.name}: {len(sequence.scene.arms)} arms, {faces} triangles, {camera.width}x{camera.height}"
-    )
+    arms = counted(len(sequence.scene.arms), "arm")
+    table = Table(title=f"{sequence.name}: {arms}, {faces} triangles, {camera.width}x{camera.height}")
     table.add_column("what")
     table.add_column("ms", justify="right")
     for name, value in {

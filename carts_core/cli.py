@@ -1,6 +1,10 @@
 """The `carts` command. Each subcommand is a dataclass whose fields are its options and whose `run` does the work."""
 
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
 from typing import Annotated
 
 import tyro
@@ -16,7 +20,10 @@ from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
 from .errors import CartsError
-from .process import tune_process
+
+_DESCRIPTION = (
+    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is."
+)
 
 BAD_INPUT = 2
 """Exit status when a file or an option is not usable."""
@@ -36,13 +43,15 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors that are meant for people end it with one message and status 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        command = tyro.cli(
-            Command,
-            prog="carts",
-            description="Correct a surgical robot's kinematics from its endoscope image.",
-            args=arguments,
-        )  # pyright: ignore
+        with _quiet_when_unread():
+            if arguments == ["--version"]:
+                print(f"carts {version('carts')}")
+                return
+            command = tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+        from .process import tune_process
+
         tune_process(keep_memory=not isinstance(command, View))
         command.run()
     except CartsError as error:
@@ -51,6 +60,20 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted; what was finished is kept")
         sys.exit(130)
+
+
+@contextmanager
+def _quiet_when_unread() -> Iterator[None]:
+    """End without a traceback where whoever reads the output, such as `head`, has seen enough."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Losses between what is seen and what is rendered."""
 
-from typing import Literal
-
 import cv2
 import numpy as np
 import torch
@@ -9,12 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-Loss = Literal["surface", "acs", "acs_paper", "acs_reference", "l1"]
-"""`surface`: parts and normals that the network sees against those that are rendered; the only one for Gauss-Newton.
-`acs`: mean dissimilarity inside the attention map, independent of how large that is.
-`acs_paper`: the paper's equation, 1 - mean(similarity x attention); falls when the silhouette grows.
-`acs_reference`: mean((1 - similarity) x attention); falls when the silhouette shrinks.
-`l1`: smooth L1 between the network's predictions ("CaRTS L1")."""
+from .settings import Loss
 
 _EMPTY = 1e-6
 

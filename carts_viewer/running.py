@@ -20,10 +20,10 @@ from carts_core.optimization import (
     SequenceOptimizer,
     SequenceSettings,
 )
-from carts_core.optimization.sequence_settings import Direction
 from carts_core.optimization.sight import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.scene import Scene, SceneState
+from carts_core.settings import Direction
 from carts_viewer.state import Pose
 
 

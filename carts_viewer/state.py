@@ -9,9 +9,9 @@ import torch
 from carts_core.data import Frame
 from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
 from carts_core.optimization.keypoints import Pin
-from carts_core.optimization.sequence_settings import Direction
 from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
 from carts_core.scene import SceneState
+from carts_core.settings import Direction
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Brush
 

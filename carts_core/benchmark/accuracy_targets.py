@@ -2,12 +2,13 @@
 
 from statistics import mean
 
-from ..synthesis.config import DOMAINS
+from ..settings import DOMAINS
+from ..wording import counted
 from .occlusion import OCCLUSION, SHARE
 from .scope import REAL, SYNTHETIC
 from .statistics import Measurements
 from .tables import DOMAIN_LABELS
-from .target import Target, counted, make_target
+from .target import Target, make_target
 
 _RECOVERED = 0.95
 _CONDITIONS = ("low_brightness", "bleeding", "smoke", "background_change")

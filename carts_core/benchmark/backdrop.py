@@ -6,7 +6,7 @@ from jaxtyping import UInt8
 from ..data.images import read_image
 from ..export import image_png, write_bytes
 from ..mesh_cache import cache_dir
-from ..synthesis.config import EndoscopeConfig, SynthesisConfig
+from ..settings import EndoscopeConfig, SynthesisConfig
 from ..synthesis.layout import place_cameras
 from ..synthesis.path_tracer import PathTracer
 from ..synthesis.sensor import expose, exposure_gain

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..data import Frame, Sequence
 from ..data.background import spread
+from ..settings import DOMAINS, DomainConfig, SensorConfig, SynthesisConfig
 from ..synthesis.blood import Bleeding
-from ..synthesis.config import DOMAINS, DomainConfig, SensorConfig, SynthesisConfig
 from ..synthesis.path_tracer import Surface
 from ..synthesis.sensor import expose, linear
 from ..synthesis.smoke import Smoke, SmokeOverlay

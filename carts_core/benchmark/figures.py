@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ..export import write_bytes
+from ..wording import counted
 from . import paper
 from .accuracy_tables import ROWS
 from .measurement import Measurement, Score
@@ -99,7 +100,7 @@ def _convergence(data: Measurements) -> Figure | None:
         _band(by_step, np.arange(steps + 1), dice, method)
         falling = [m for m in measurements if _falls(m)]
         if falling:
-            label = f"{SHORT_LABELS[method]}: {len(falling)} of {len(measurements)} runs"
+            label = f"{SHORT_LABELS[method]}: {len(falling)} of {counted(len(measurements), 'run')}"
             _band(loss, np.arange(steps + 1), _padded(falling, steps, _loss_to_go), method, label)
         seconds = _padded(measurements, steps, lambda m: [score.seconds for score in m.trace])
         _band(by_time, np.median(seconds, axis=0), dice, method)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from statistics import median
 
+from ..wording import counted
 from .measurement import Measurement, Score
 from .methods import METHODS
 from .occlusion import OCCLUSION, SHARE
@@ -90,7 +91,7 @@ def sequence_table(data: Measurements) -> Table | None:
                     for column in (_DICE, _JOINTS)
                 ),
                 _VISIBLE.cell(m.final for m in together),
-                Cell(f"{median(warm):.2f}" if warm else NOTHING, f"{len(warm)} frames"),
+                Cell(f"{median(warm):.2f}" if warm else NOTHING, counted(len(warm), "frame")),
                 Cell(str(len(both))),
                 _DICE.cell(alone[m.run.frame].final for m in both),
                 _DICE.cell(m.final for m in both),

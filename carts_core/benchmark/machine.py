@@ -6,6 +6,8 @@ from pathlib import Path
 
 import torch
 
+from ..wording import counted
+
 _CUDA = "cuda: "
 
 
@@ -17,7 +19,7 @@ def machine(device: torch.device) -> str:
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
         model = names[0] if names else model
     card = f", {_CUDA}{torch.cuda.get_device_name(device)}" if device.type == "cuda" else ""
-    return f"{model}, {os.cpu_count()} cores, torch threads: {torch.get_num_threads()}{card}"
+    return f"{model}, {counted(os.cpu_count() or 1, 'core')}, torch threads: {torch.get_num_threads()}{card}"
 
 
 def on_gpu(text: str) -> bool:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ..synthesis.config import SensorConfig
+from ..settings import SensorConfig
 from ..synthesis.noise import smooth_noise, smoothstep
 from ..synthesis.sensor import expose, linear
 

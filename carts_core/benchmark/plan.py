@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from ..synthesis.config import DOMAINS
+from ..settings import DOMAINS
 from .methods import MAIN, METHODS
 from .occlusion import OCCLUSION
 from .scope import REAL, SYNTHETIC, Run, Scope

@@ -11,7 +11,7 @@ from ..rendering import Renderer
 from ..rendering.geometry import link_transforms
 from ..rendering.points import visible_points
 from ..scene import Scene
-from ..synthesis.config import EndoscopeConfig
+from ..settings import EndoscopeConfig
 from ..synthesis.path_tracer import Surface
 
 _CLEARANCE = 0.005

@@ -12,6 +12,7 @@ from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters
 from ..rendering import Renderer
 from ..scene import Scene
+from ..wording import counted
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
 from .measurement import Measurement
@@ -69,19 +70,21 @@ class Benchmark:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=console) as bar:
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
             bench = {name: _Bench(source, bar) for name, source in self.sources.items()}
             task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
             while todo:
                 run = next(iter(todo))
                 group = self._group(run)
                 error = "" if run.error_deg is None else f", {run.error_deg:g} deg off"
-                which = f"frame {run.frame}" if len(group) == 1 else f"{len(group)} frames"
-                bar.update(task, description=f"{run.source}, {run.domain}, {which}: {run.method}{error}")
+                which = f"frame {run.frame}" if len(group) == 1 else counted(len(group), "frame")
+                description = f"{run.source}, {run.domain}, {which}: {run.method}{error}"
+                bar.update(task, description=description)
                 for measurement in bench[run.source].measure(group, self.scope, self.extractor):
                     facts = {"weights": self.extractor.sha256, "code": code_fingerprint()}
                     self.results.append(measurement, self.runs[measurement.run], **facts)
                     bar.advance(task, todo.pop(measurement.run, None) is not None)
+                _log(console, f"{len(self.runs) - len(todo)} of {len(self.runs)}: {description}")
             bar.update(task, description="measured")
 
     def _group(self, run: Run) -> list[Run]:
@@ -89,6 +92,12 @@ class Benchmark:
         if not METHODS[run.method].together:
             return [run]
         return [other for other in self.runs if replace(other, frame=run.frame) == run]
+
+
+def _log(console: Console, line: str) -> None:
+    """Tell a file or a pipe, which no bar can be drawn in, how things go."""
+    if not console.is_terminal:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 class _Bench:
@@ -140,7 +149,9 @@ class _Bench:
     def _calibration(self, scope: Scope, extractor: FeatureExtractor) -> Scene:
         if self._calibrated is None:
             recording, _ = self._open()
-            task = self._bar.add_task(f"calibrating with {scope.calibration_frames} frames", total=None)
+            description = f"calibrating with {counted(scope.calibration_frames, 'frame')}"
+            task = self._bar.add_task(description, total=None)
+            _log(self._bar.console, f"{self._source.name}: {description}")
             self._calibrated = calibrated_scene(recording, self._source.camera, scope.calibration_frames, extractor)
             self._bar.remove_task(task)
         return self._calibrated
@@ -148,9 +159,12 @@ class _Bench:
     def _open(self) -> tuple[Recording, Renderer]:
         if self._opened is None:
             task = self._bar.add_task("opening", total=None)
-            recording = self._source.open(
-                lambda what, done, total: self._bar.update(task, description=what, completed=done, total=total)
-            )
+
+            def report(what: str, done: int, total: int) -> None:
+                self._bar.update(task, description=what, completed=done, total=total)
+                _log(self._bar.console, f"{self._source.name}: {what}, {done} of {total}")
+
+            recording = self._source.open(report)
             self._bar.remove_task(task)
             self._opened = recording, Renderer(recording.scene, cameras=[self._source.camera])
         return self._opened

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from ..errors import SettingsError
-from ..synthesis.config import DOMAINS
+from ..settings import DOMAINS
 
 SYNTHETIC = "synthetic"
 REAL = "real"

@@ -14,9 +14,10 @@ from ..data.background import spread
 from ..errors import SettingsError
 from ..mesh_cache import cache_dir
 from ..scene import Scene
-from ..synthesis.config import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
+from ..settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
+from ..wording import counted
 from .backdrop import backdrop
 from .counterfactual import Counterfactual
 from .fingerprints import code_fingerprint
@@ -25,6 +26,7 @@ from .scope import REAL, SYNTHETIC, Scope
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
 _MOTION_SECONDS = 6.0
+_SYNTHESIS = ("synthesis/*.py", "settings/synthesis.py")
 _ALTERING_CODE = ("benchmark/backdrop.py", "benchmark/counterfactual.py", "benchmark/real_surface.py")
 
 
@@ -93,7 +95,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
         render=RenderConfig(samples=scope.samples),
     )
-    code = code_fingerprint(("synthesis/*.py",))
+    code = code_fingerprint(_SYNTHESIS)
     fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
     folder = cache_dir() / "benchmark" / f"sequence_{seed}_{fingerprint[:8]}"
 
@@ -106,10 +108,10 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
-    counted = f"{len(evaluated)} of {frames} frames by all methods, {scope.samples} paths per pixel"
+    taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
     return Source(
         SYNTHETIC,
-        f"{what}, {counted}",
+        f"{what}, {taken}",
         "left",
         evaluated,
         fingerprint,
@@ -132,7 +134,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     if not masked:
         raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
-    code = code_fingerprint(("synthesis/*.py", *_ALTERING_CODE))
+    code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
     fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
     consecutive = masked[: scope.consecutive]
     calibrating = spread(len(sequence), scope.calibration_frames)
@@ -145,10 +147,10 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         progress("backdrop of the real frames", 0, 1)
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
-    counted = f"{len(frames)} of {len(masked)} frames with masks by all methods"
+    taken = f"{len(frames)} of {counted(len(masked), 'frame')} with masks by all methods"
     return Source(
         REAL,
-        f"{sequence.name}, camera {camera.name}, {counted}",
+        f"{sequence.name}, camera {camera.name}, {taken}",
         camera.name,
         frames,
         fingerprint.hexdigest()[:32],

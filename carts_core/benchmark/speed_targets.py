@@ -2,12 +2,13 @@
 
 from statistics import mean, median
 
+from ..wording import counted
 from .machine import on_gpu
 from .measurement import Measurement
 from .pairing import GAINED, pairs
 from .scope import PAPERS_STEPS, SYNTHETIC
 from .statistics import Measurements
-from .target import Target, counted, make_target
+from .target import Target, make_target
 
 NEAR_FINAL = 0.005
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..synthesis.config import DOMAINS
+from ..settings import DOMAINS
 from .measurement import Measurement, Score
 from .methods import MAIN
 from .occlusion import OCCLUSION

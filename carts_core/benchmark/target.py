@@ -48,8 +48,3 @@ def make_target(
     near = not met and text(value) == text(least_or_most)
     reached = f"just {'below' if at_least else 'above'} {text(value)}" if near else text(value)
     return Target(what, bound, reached, met if complete or not met else None, reference, basis)
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things, such as `1 run` and `2 runs`."""
-    return f"{number} {what}{'' if number == 1 else 's'}"

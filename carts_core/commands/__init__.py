@@ -1,1 +1,1 @@
-"""The subcommands of `carts`, one module each."""
+"""The subcommands of `carts`, one module each; what takes long to import is imported when they run."""

@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from ..errors import CartsError
+from ..wording import counted
 from .selection import Network
 
 _DEFAULT_FOLDER = Path("runs") / "bench"
@@ -56,7 +57,7 @@ class Bench:
         results = ResultsFile(folder / "measurements.jsonl")
         benchmark = Benchmark(scope, sources, extractor, results, runs)
         if results.unreadable:
-            console.print(f"{results.path}: {results.unreadable} torn lines are left out and measured again")
+            console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
         stages = folder / "stages.json"
         if not self.report_only:
             benchmark.run(console)
@@ -75,4 +76,4 @@ class Bench:
             version=version("carts"),
         )
         page = write_report(folder, measurements, facts, known_stages(stages, extractor))
-        console.print(f"wrote {page} ({len(measurements)} of {len(runs)} runs)")
+        console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")

@@ -3,26 +3,20 @@
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from ..data import Sequence, spread
 from ..errors import SettingsError
-from ..evaluation import frame_residuals, mean_dice, write_calibration
-from ..export import MARKER, file_name, published
-from ..features.extractor import FeatureExtractor
-from ..optimization import (
-    CALIBRATION,
-    CALIBRATION_SETTINGS,
-    CalibrationOptimizer,
-    CalibrationResult,
-    FreeParameters,
-    OptimizerSettings,
-)
+from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
 from .selection import Network, Selection, SequencePath
+
+if TYPE_CHECKING:
+    from ..data import Sequence
+    from ..features.extractor import FeatureExtractor
+    from ..optimization import CalibrationOptimizer, CalibrationResult
 
 _SPREAD = "spread:"
 
@@ -53,6 +47,13 @@ class Calibrate:
 
     def run(self) -> None:
         """Calibrate; on Ctrl-C or an error nothing is written."""
+        from ..data import Sequence
+        from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
+        from ..export import MARKER, file_name, published
+        from ..features.extractor import FeatureExtractor
+        from ..optimization import CalibrationOptimizer
+        from .hints import print_hints
+
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
@@ -78,8 +79,9 @@ class Calibrate:
             if (means := mean_dice(residuals, camera)) is not None:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
         console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
+        print_hints(console, remark(sequence.scene, result))
 
-    def _summary(self, extractor: FeatureExtractor, indices: list[int], cameras: list[str]) -> dict:
+    def _summary(self, extractor: "FeatureExtractor", indices: list[int], cameras: list[str]) -> dict:
         """How the folder was made."""
         return {
             "format": "calibration",
@@ -94,7 +96,7 @@ class Calibrate:
         }
 
 
-def frame_indices(text: str, sequence: Sequence) -> list[int]:
+def frame_indices(text: str, sequence: "Sequence") -> list[int]:
     """Positions that `--frames` means.
 
     Raises:
@@ -105,10 +107,12 @@ def frame_indices(text: str, sequence: Sequence) -> list[int]:
     count = text.removeprefix(_SPREAD)
     if not (count.isdecimal() and int(count) >= 1):
         raise SettingsError(f"--frames {text!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+    from ..data import spread
+
     return spread(len(sequence), int(count))
 
 
-def _optimized(optimizer: CalibrationOptimizer, console: Console) -> CalibrationResult:
+def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("calibrating", total=None)
         for iterate in optimizer:

@@ -9,15 +9,11 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from ..data import Sequence
-from ..evaluation import FrameScore, camera_groups, evaluate, evaluate_sequence, mean_score, to_json
-from ..export import write_bytes
-from ..features.extractor import FeatureExtractor
-from ..optimization import FreeParameters, OptimizerSettings, SequenceSettings
-from .hints import base_frame_hint
-from .selection import Mode, Network, Selection, SequencePath
+from ..errors import SettingsError
+from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
+from ..wording import counted
+from .selection import Mode, Network, Perturbation, Selection, SequencePath
 
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
@@ -30,23 +26,31 @@ class Evaluate:
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
-    """Write the scores of all frames and their means to this file."""
+    """Write the scores of all frames and their means to this file; folders on the way to it are made."""
     mode: Mode = "frame"
     """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
     together: bool = False
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
-    perturb_deg: float = 0.0
-    """Start that many degrees (and millimetres) off the truth on every joint, instead of at the measured values."""
-    seed: int = 0
-    """Seed of the perturbation's signs; these are the same in all frames in sequence mode."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
     model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
 
+    def __post_init__(self) -> None:
+        if self.json is not None and self.json.is_dir():
+            raise SettingsError(f"--json {self.json} is a folder. Name a file.")
+
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""
+        from ..data import Sequence
+        from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
+        from ..export import write_bytes
+        from ..features.extractor import FeatureExtractor
+        from .hints import base_frame_hint, kept_start_hint, print_hints
+        from .score_table import score_table
+
         console = Console()
         if not console.is_terminal:
             console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
@@ -64,58 +68,20 @@ class Evaluate:
             domains=domains,
             settings=self.optimizer,
             free=self.free,
-            perturb_deg=self.perturb_deg,
-            seed=self.seed,
+            perturb_deg=self.start.perturb_deg,
+            seed=self.start.seed,
             together=self.together,
         )
         total = len(frames) * len(cameras) * len(domains)
         scores = list(track(found, "optimizing", total=total, console=console))
-        console.print(_table(scores, f"{sequence.name}: {len(frames)} frames, means"))
+        console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         for group in camera_groups(cameras, self.together):
-            gains = [score.base_frame_gain for score in scores if score.camera in group]
-            hint = base_frame_hint(", ".join(group), gains)
-            if hint is not None:
-                console.print(hint, style="yellow")
+            where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
+            print_hints(
+                console,
+                kept_start_hint(where, [score.stopped for score in seen]),
+                base_frame_hint(where, [score.base_frame_gain for score in seen]),
+            )
         if self.json is not None:
             write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
             console.print(f"wrote {self.json}")
-
-
-def _table(scores: list[FrameScore], title: str) -> Table:
-    table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
-    for column in (
-        "domain",
-        "camera",
-        "Dice\nbefore",
-        "\nafter",
-        "worst\nchange",
-        "MAE \\[deg]\nbefore",
-        "\nafter",
-        "std",
-        "steps",
-        "s",
-    ):
-        table.add_column(column, justify="left" if column in ("domain", "camera") else "right")
-    groups: dict[tuple[str, str], list[FrameScore]] = {}
-    for score in scores:
-        groups.setdefault((score.domain, score.camera), []).append(score)
-    for (domain, camera), group in groups.items():
-        mean = mean_score(group)
-        change = [s.dice_after - s.dice_before for s in group if s.dice_after is not None and s.dice_before is not None]
-        table.add_row(
-            domain,
-            camera,
-            _number(mean["dice_before"], 4),
-            _number(mean["dice_after"], 4),
-            _number(min(change, default=None), 4),
-            _number(mean["joint_mae_deg_before"], 2),
-            _number(mean["joint_mae_deg_after"], 2),
-            _number(mean["joint_std_deg"], 2),
-            _number(mean["iterations"], 1),
-            _number(mean["seconds"], 2),
-        )
-    return table
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -8,18 +8,9 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from ..data import Sequence
 from ..errors import SettingsError
-from ..export import (
-    Dataset,
-    FormatName,
-    Monitor,
-    Parts,
-    corrected_frames,
-    export,
-    measured_frames,
-    read_kinematics_csv,
-)
+from ..settings import FormatName, Parts
+from ..wording import counted
 from .selection import Selection, SequencePath
 
 
@@ -47,6 +38,9 @@ class Export:
 
     def run(self) -> None:
         """Write the export; on Ctrl-C or an error nothing of it is left."""
+        from ..data import Sequence
+        from ..export import Dataset, Monitor, corrected_frames, export, measured_frames, read_kinematics_csv
+
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         indices = self.select.frame_indices(sequence)
@@ -67,7 +61,7 @@ class Export:
             frame_rate=self.frame_rate,
         )
         with Progress(console=console) as bar:
-            task = bar.add_task(f"{self.format}, {len(frames)} frames", total=None)
+            task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
             path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         console.print(f"wrote {path}")

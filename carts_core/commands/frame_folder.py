@@ -1,43 +1,80 @@
 """A folder of masks and a table of kinematics, as `carts optimize` fills it."""
 
+import json
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from ..data import Sequence
-from ..export import KinematicsRow, kinematics_csv, mask_png, write_bytes
+from ..errors import SettingsError
+from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv, write_bytes
 from ..rendering import Renderer
 from ..scene import SceneState
 
 
 class FrameFolder:
-    """Masks and kinematics (`kinematics.csv`), never half written.
+    """Masks, kinematics (`kinematics.csv`) and what they were made with (`settings.json`), never half written.
 
-    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` where there are several cameras.
+    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` where there are several cameras. Nothing is made or changed
+    before the first frame is written.
 
     Args:
         sequence, cameras: whose frames these are.
         folder: where to write.
-        rows: what is in its table already.
+        settings: all that frames depend on; those in the folder count if theirs are the same.
+        overwrite: start over, whatever is there.
+
+    Attributes:
+        rows: what is in the table.
+
+    Raises:
+        SettingsError: the folder holds results of other settings.
     """
 
-    def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, rows: list[KinematicsRow]) -> None:
-        self.rows, self._folder = rows, folder
+    def __init__(
+        self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, settings: dict[str, Any], overwrite: bool
+    ) -> None:
+        self.folder = folder
         self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
         self._scene = sequence.scene.with_cameras(cameras)
-        folders = {camera: folder / "masks" / (camera if len(cameras) > 1 else "") for camera in cameras}
-        self._views = {folders[camera]: Renderer(self._scene, cameras=[camera]) for camera in cameras}
+        self._masks = {camera: folder / "masks" / (camera if len(cameras) > 1 else "") for camera in cameras}
+        self._table, self._settings_file = folder / "kinematics.csv", folder / "settings.json"
+        self._settings = json.dumps(settings, indent=1)
+        self._goes_on = self._table.is_file() and not overwrite
+        if self._goes_on and not self._same_settings():
+            raise SettingsError(
+                f"{folder} holds results of other settings (see {self._settings_file}). "
+                "Add --overwrite to replace them, or name another folder with --output."
+            )
+        self.rows = read_kinematics_csv(self._table, sequence.scene) if self._goes_on else []
 
     def complete(self) -> set[str]:
         """Frames that are in the table and have all their masks."""
         ids = (row.frame_id for row in self.rows)
-        return {name for name in ids if all((masks / f"{name}.png").is_file() for masks in self._views)}
+        return {name for name in ids if all((masks / f"{name}.png").is_file() for masks in self._masks.values())}
 
     def write(self, found: list[tuple[KinematicsRow, SceneState]]) -> None:
         """Write masks and rows of frames, in place of earlier ones."""
+        if not found:
+            return
+        if not self._goes_on:
+            self._table.unlink(missing_ok=True)
+            write_bytes(self._settings_file, self._settings.encode())
+            self._goes_on = True
         for row, state in found:
-            for masks, renderer in self._views.items():
-                write_bytes(masks / f"{row.frame_id}.png", mask_png(renderer.segment(state.to("cpu"))[0] >= 0))
+            for camera, renderer in self._renderers.items():
+                mask = renderer.segment(state.to("cpu"))[0] >= 0
+                write_bytes(self._masks[camera] / f"{row.frame_id}.png", mask_png(mask))
         new = {row.frame_id: row for row, _ in found}
         rows = {row.frame_id: row for row in self.rows} | new
         self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
         # The table is written after the mask, so a frame in the table always has one.
-        write_bytes(self._folder / "kinematics.csv", kinematics_csv(self._scene, self.rows).encode())
+        write_bytes(self._table, kinematics_csv(self._scene, self.rows).encode())
+
+    @cached_property
+    def _renderers(self) -> dict[str, Renderer]:
+        return {camera: Renderer(self._scene, cameras=[camera]) for camera in self._masks}
+
+    def _same_settings(self) -> bool:
+        file = self._settings_file
+        return file.is_file() and file.read_text(encoding="utf-8") == self._settings

@@ -3,8 +3,33 @@
 from collections.abc import Sequence
 
 import numpy as np
+from rich.console import Console
 
 from ..optimization import BASE_FRAME_GAIN
+from ..wording import counted
+
+
+def print_hints(console: Console, *hints: str | None) -> None:
+    """Print those that there are."""
+    for hint in hints:
+        if hint is not None:
+            console.print(hint, style="yellow")
+
+
+def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
+    """Why some estimates are nothing but the start, or None if none is.
+
+    Args:
+        where: as below.
+        stopped: why each optimization ended.
+    """
+    kept = sum(reason == "start kept" for reason in stopped)
+    if not kept:
+        return None
+    return (
+        f"{where}: in {kept} of {counted(len(stopped), 'run')} the start was kept, which the image does not contradict "
+        "enough to leave it (--keep-start)."
+    )
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:

@@ -8,12 +8,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from ..data import Frame, Sequence
-from ..evaluation import start_positions
-from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
-from ..rendering import Renderer
-from ..scene import SceneState
-from .selection import Selection, SequencePath
+from .selection import Perturbation, Selection, SequencePath
 
 
 @dataclass(frozen=True)
@@ -28,14 +23,16 @@ class Render:
     """The rendering blended over the frame, alone, or its mask."""
     opacity: float = 0.6
     """Of the rendering in an overlay, 0 to 1."""
-    perturb_deg: float = 0.0
-    """Move every joint by that many degrees (and millimetres) off the truth first."""
-    seed: int = 0
-    """Seed of the perturbation's signs."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
     def run(self) -> None:
         """Write one PNG per frame, camera and domain."""
+        from ..data import Sequence
+        from ..evaluation import start_positions
+        from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
+        from ..rendering import Renderer
+
         console = Console()
         sequence = Sequence.open(self.sequence, progress=console.print)
         folder = self.output or Path("runs") / sequence.name / "render"
@@ -45,13 +42,14 @@ class Render:
                 renderer = Renderer(sequence.scene, cameras=[camera])
                 for index in track(frames, f"{domain}, {camera}", console=console):
                     frame = sequence.frame(index, domain, [camera])
-                    state = sequence.scene.state(start_positions(sequence, frame, self.perturb_deg, self.seed))
-                    png = self._png(renderer, state, frame, camera)
+                    start = start_positions(sequence, frame, self.start.perturb_deg, self.start.seed)
+                    state = sequence.scene.state(start)
+                    if self.style == "mask":
+                        png = mask_png(renderer.segment(state)[0] >= 0)
+                    else:
+                        image, mask = image_and_mask(renderer, state)
+                        if self.style == "overlay":
+                            image = overlay(frame.images[camera], image, mask, self.opacity)
+                        png = image_png(image)
                     write_bytes(folder / domain / camera / f"{frame.frame_id}.png", png)
         console.print(f"wrote {folder}")
-
-    def _png(self, renderer: Renderer, state: SceneState, frame: Frame, camera: str) -> bytes:
-        if self.style == "mask":
-            return mask_png(renderer.segment(state)[0] >= 0)
-        image, mask = image_and_mask(renderer, state)
-        return image_png(image if self.style == "image" else overlay(frame.images[camera], image, mask, self.opacity))

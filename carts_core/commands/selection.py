@@ -1,14 +1,16 @@
-"""Which frames, cameras, domains and arms a command works on. Shared by all commands, declared once."""
+"""Which frames, cameras and domains a command works on, and from where. Shared by commands, declared once."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..data import Sequence
 from ..errors import SettingsError
-from ..scene import Scene
+
+if TYPE_CHECKING:
+    from ..data import Sequence
+    from ..scene import Scene
 
 ALL = "all"
 
@@ -27,7 +29,7 @@ class Selection:
     domain: tuple[str, ...] = ()
     """Domains, by name, or `all`; the sequence's first one if none is named."""
 
-    def frame_indices(self, sequence: Sequence) -> list[int]:
+    def frame_indices(self, sequence: "Sequence") -> list[int]:
         """Positions of the chosen frames.
 
         Raises:
@@ -35,7 +37,7 @@ class Selection:
         """
         return parse_frames(self.frames, len(sequence))
 
-    def camera_names(self, scene: Scene) -> list[str]:
+    def camera_names(self, scene: "Scene") -> list[str]:
         """Names of the chosen cameras.
 
         Raises:
@@ -45,7 +47,7 @@ class Selection:
             return [camera.name for camera in scene.cameras]
         return [scene.camera(name).name for name in self.camera]
 
-    def domain_names(self, sequence: Sequence) -> list[str]:
+    def domain_names(self, sequence: "Sequence") -> list[str]:
         """Names of the chosen domains.
 
         Raises:
@@ -89,6 +91,25 @@ def parse_frames(text: str, count: int) -> list[int]:
 
 
 @dataclass(frozen=True)
+class Perturbation:
+    """Wrong joint positions on purpose, to see what becomes of them."""
+
+    perturb_deg: float = 0.0
+    """Start that many degrees (and millimetres) off on every measured joint: off the true joint positions where the
+    sequence has them, else off the measured ones. 0 starts at the measured ones."""
+    seed: int = 0
+    """Seed of the error's signs; these are the same in all frames in sequence mode."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.perturb_deg <= 180:
+            raise SettingsError(
+                f"--perturb-deg is {self.perturb_deg:g}; allowed is 0 to 180. Give a size; signs are drawn from --seed."
+            )
+        if self.seed < 0:
+            raise SettingsError(f"--seed is {self.seed}; allowed is 0 or more.")
+
+
+@dataclass(frozen=True)
 class Network:
     """The networks and where they run."""
 
@@ -107,11 +128,13 @@ def check_device(device: str) -> None:
     Raises:
         SettingsError: it does not.
     """
+    if device == "cpu":
+        return
     import torch
 
     kind, _, number = device.partition(":")
     cards = torch.cuda.device_count()
-    if device == "cpu" or (kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards))):
+    if kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards)):
         return
     known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
     raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")

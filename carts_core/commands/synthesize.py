@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from ..synthesis.config import SynthesisConfig
+from ..settings import SynthesisConfig
 
 
 @dataclass(frozen=True)

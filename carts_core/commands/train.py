@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress, TimeRemainingColumn
 
-from ..features.training_config import TrainingConfig
+from ..settings import TrainingConfig
 from .selection import check_device
 
 

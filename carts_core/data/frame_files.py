@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from ..errors import SequenceError
+from ..wording import counted
 from .frame_list import FrameList
 from .patterns import EXAMPLES, FrameId, expand, is_glob, is_per_frame
 
@@ -29,7 +30,7 @@ def frame_files(
     found = sorted((path for path in fixed.glob(str(base.relative_to(fixed))) if path.is_file()), key=_natural)
     if len(found) != len(frames.frame_ids):
         raise SequenceError(
-            f"{key}: {filled!r} matches {len(found)} files in {fixed}, but {frames.counted}. "
+            f"{key}: {filled!r} matches {counted(len(found), 'file')} in {fixed}, but {frames.counted}. "
             f"The n-th file belongs to the n-th of them: make them as many, "
             "or name the files by frame, as in " + EXAMPLES + "."
         )
@@ -47,7 +48,7 @@ def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: st
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
         rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
         raise SequenceError(
-            f"{key}: {len(missing)} of {len(files)} files are missing: {shown}{rest}, but {frames.counted} "
+            f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted} "
             f"and every one needs its file: put them back, correct the pattern, or remove the rows.{hint}"
         )
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import SequenceError
+from ..wording import counted
 from .patterns import FrameId, expand
 from .table import Table, read_table
 from .toml_table import TomlTable
@@ -82,7 +83,9 @@ def take_frame_list(section: TomlTable) -> FrameList:
     timestamp = section.take("timestamp", str, "timestamp")
     if not timestamp:
         raise section.error("timestamp", "is empty. Name the column with the time of every frame [s].")
-    return list_of_rows(table, take_frame_names(section), timestamp, section, f"{table.path} has {len(table)} rows")
+    return list_of_rows(
+        table, take_frame_names(section), timestamp, section, f"{table.path} has {counted(len(table), 'row')}"
+    )
 
 
 def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
@@ -131,7 +134,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
         )
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
-    return FrameList(ids, index.timestamps, numbers, f"{path} has {index.count} frames")
+    return FrameList(ids, index.timestamps, numbers, f"{path} has {counted(index.count, 'frame')}")
 
 
 def _take_pattern(section: TomlTable) -> str:

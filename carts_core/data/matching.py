@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import SequenceError
+from ..wording import counted
 from .frame_list import FrameList
 from .table import Table
 from .toml_table import TomlTable
@@ -92,7 +93,7 @@ class JointSamples:
             if 0 <= index < len(self.times)
         )
         return SequenceError(
-            f"{self.path} has no joint positions for {len(far)} of {len(wanted)} frames. The first is frame "
+            f"{self.path} has no joint positions for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
             f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
             f"{matching.time_offset:g} s), next to {near}; a row that is used may be {matching.max_gap:g} s away. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "

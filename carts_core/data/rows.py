@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import SequenceError
+from ..wording import counted
 from .frame_list import FrameList, FrameNames, list_of_rows, take_delimiter, take_frame_list, take_frame_names
 from .joints import JointColumns
 from .matching import JointSamples, TimeMatching, row_times, take_matching
@@ -73,7 +74,9 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
     timestamp, truth = section.take("timestamp", str, ""), section.take("truth", str, "")
     if frames_section is None:
         names, matching = take_frame_names(section), None
-        frames = list_of_rows(table, names, timestamp, section, f"the kinematics table has {len(table)} rows")
+        frames = list_of_rows(
+            table, names, timestamp, section, f"the kinematics table has {counted(len(table), 'row')}"
+        )
     else:
         for key in ("frame", "frame_id", "video_frame"):
             if key in section:
@@ -92,7 +95,7 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
 def _check_same_frames(table: Table, ids: tuple[str, ...], wanted: tuple[str, ...]) -> None:
     if len(ids) != len(wanted):
         raise SequenceError(
-            f"{table.path} has {len(ids)} rows, but the kinematics table has {len(wanted)}. "
+            f"{table.path} has {counted(len(ids), 'row')}, but the kinematics table has {len(wanted)}. "
             "All tables of a sequence must have the same frames in the same order."
         )
     for given, expected, line in zip(ids, wanted, table.lines, strict=True):

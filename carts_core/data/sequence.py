@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from ..errors import SequenceError
 from ..rendering import Renderer
 from ..scene import Scene
+from ..wording import counted
 from .background import estimate_background, spread, widen
 from .cache import ByteCache
 from .camera_input import CameraInput
@@ -116,8 +117,8 @@ class Sequence:
         return len(self.frame_ids)
 
     def __repr__(self) -> str:
-        cameras = ", ".join(self._cameras)
-        return f"Sequence({self.name!r}, {len(self)} frames, cameras {cameras}, domains {', '.join(self.domains)})"
+        frames, cameras, domains = counted(len(self), "frame"), ", ".join(self._cameras), ", ".join(self.domains)
+        return f"Sequence({self.name!r}, {frames}, cameras {cameras}, domains {domains})"
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """One frame with the images of some cameras (all by default), in a domain (the first by default).

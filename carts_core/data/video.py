@@ -15,6 +15,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from ..errors import SequenceError
+from ..wording import counted
 from .video_index import decoded_frames, index_video, open_video
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ogv")
@@ -53,8 +54,8 @@ class Video:
         """Number of the frame that was decoded last; None before the first after a jump."""
         if (count := self._index.count) <= max(numbers):
             raise SequenceError(
-                f"video {path} has {count} frames, but frame number {max(numbers)} (counted from 0) is asked for. "
-                "Shorten the table, or give it a column with frame numbers (`video_frame`)."
+                f"video {path} has {counted(count, 'frame')}, but frame number {max(numbers)} (counted from 0) "
+                "is asked for. Shorten the table, or give it a column with frame numbers (`video_frame`)."
             )
 
     def name(self, index: int) -> str:

@@ -4,6 +4,7 @@ from .calibration import FrameResidual as FrameResidual
 from .calibration import calibration_json as calibration_json
 from .calibration import frame_residuals as frame_residuals
 from .calibration import mean_dice as mean_dice
+from .calibration import remark as remark
 from .calibration_report import write_calibration as write_calibration
 from .evaluate import FrameScore as FrameScore
 from .evaluate import camera_groups as camera_groups
@@ -33,6 +34,7 @@ __all__ = [
     "mean_dice",
     "mean_score",
     "normalized_surface_distance",
+    "remark",
     "start_positions",
     "to_json",
     "write_calibration",

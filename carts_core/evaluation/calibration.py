@@ -94,6 +94,19 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
     ]
 
 
+def remark(before: Scene, result: CalibrationResult) -> str | None:
+    """What to know before the calibration is used; None where only intrinsics changed."""
+    if not any(unknown.change for unknown in result.unknowns):
+        return "The start was kept: no step made these frames fit better, so the calibration is as it was."
+    if not moved_frames(before, result.scene):
+        return None
+    return (
+        "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame, "
+        "and not at all where an arm stands still. What moved here may be either: it fits these joint readings, and is "
+        "no more right than they are."
+    )
+
+
 def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     angle, distance = _distance(before, after)
     return {

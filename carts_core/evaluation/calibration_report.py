@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from ..data import Sequence, calibrated_sequence_file
 from ..optimization import CalibrationResult
-from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames
+from ..wording import counted
+from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames, remark
 
 matplotlib.use("Agg")
 
@@ -85,7 +86,7 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
     lines = [
         f"# Calibration of {sequence.name}",
         "",
-        f"From {len(residuals)} frames, joints as measured in all figures below. The optimization ended: "
+        f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
         f"{result.stop_reason}. The new calibration is in `sequence.toml`, all numbers are in `calibration.json`.",
         "",
         "| mean over the frames | before | after |",
@@ -95,11 +96,11 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
     for camera in cameras:
         if (means := mean_dice(residuals, camera)) is not None:
             lines.append(f"| Dice, {camera} | {means[0]:.4f} | {means[1]:.4f} |")
-    lines += ["", "| what moved | by [deg] | by [mm] |", "|---|---|---|"]
-    lines += [
-        f"| {name} | {angle:.3f} | {distance:.3f} |"
-        for name, angle, distance in moved_frames(sequence.scene, result.scene)
-    ]
+    if moved := moved_frames(sequence.scene, result.scene):
+        lines += ["", "| what moved | by [deg] | by [mm] |", "|---|---|---|"]
+        lines += [f"| {name} | {angle:.3f} | {distance:.3f} |" for name, angle, distance in moved]
+    if (text := remark(sequence.scene, result)) is not None:
+        lines += ["", f"**{text}**"]
     lines += [
         "",
         "## Unknowns",

@@ -1,12 +1,12 @@
 """What people take away: one module per format."""
 
+from ..settings import FormatName as FormatName
+from ..settings import Parts as Parts
 from .dataset import Dataset as Dataset
-from .dataset import Parts as Parts
 from .files import file_name as file_name
 from .files import write_bytes as write_bytes
 from .formats import FORMATS as FORMATS
 from .formats import ExportFormat as ExportFormat
-from .formats import FormatName as FormatName
 from .formats import export as export
 from .frames import ExportFrame as ExportFrame
 from .frames import corrected_frames as corrected_frames

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -15,12 +14,12 @@ from ..data import Sequence
 from ..errors import CartsError, SettingsError
 from ..rendering import Renderer
 from ..scene import Scene
+from ..settings import Parts
+from ..wording import counted
 from .files import unique_file_names
 from .frames import ExportFrame
 from .monitor import Monitor
 from .png import image_png
-
-Parts = Literal["arms", "links"]
 
 
 @dataclass(frozen=True)
@@ -173,8 +172,8 @@ def labelled(
         return np.full_like(rendered, -1)
     if (rendered < 0).all():
         raise CartsError(
-            f"{where}: the mask has {int(mask.sum())} pixels, but no arm is in view there, so it is not known whose "
-            "they are. Correct the joint positions of this frame, clear its mask, or leave it out."
+            f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view there, so it is not "
+            "known whose they are. Correct the joint positions of this frame, clear its mask, or leave it out."
         )
     rows, columns = np.asarray(distance_transform_edt(rendered < 0, return_distances=False, return_indices=True))
     return np.where(mask, rendered[rows, columns], -1)

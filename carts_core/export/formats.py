@@ -4,8 +4,8 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+from ..settings import FormatName
 from .coco import write_coco
 from .cvat import write_cvat
 from .dataset import Dataset
@@ -18,8 +18,6 @@ from .publish import MARKER, published
 from .video import write_video
 from .voc import write_voc
 from .yolo import write_yolo
-
-FormatName = Literal["masks", "coco", "yolo", "voc", "cvat", "datumaro", "csv", "npz", "json", "dvrk", "video"]
 
 
 @dataclass(frozen=True)

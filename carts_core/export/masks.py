@@ -3,7 +3,8 @@
 import json
 from pathlib import Path
 
-from .dataset import Dataset, Parts
+from ..settings import Parts
+from .dataset import Dataset
 from .monitor import Monitor
 from .png import label_png, mask_png
 

@@ -1,7 +1,7 @@
 """Learning the paper's features: what `FeatureNetwork` is trained on, and how well it does."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -9,14 +9,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..robot import Robot
+from ..settings import TrainingConfig
 from .domain_randomization import PairGenerator, TrainingPair
 from .network import FeatureNetwork
 from .objective import feature_loss
 from .task import Batch, flips
 from .validation import validate
-
-if TYPE_CHECKING:
-    from .training_config import TrainingConfig
 
 
 class FeatureTask:
@@ -29,11 +27,11 @@ class FeatureTask:
         "similarity_misaligned": "cosine, misaligned",
     }
 
-    def network(self, config: "TrainingConfig") -> FeatureNetwork:
+    def network(self, config: TrainingConfig) -> FeatureNetwork:
         """A network with random weights."""
         return FeatureNetwork(config.architecture)
 
-    def generator(self, config: "TrainingConfig", stream: Sequence[int]) -> PairGenerator:
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> PairGenerator:
         """An endless source of pairs."""
         return PairGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
@@ -48,7 +46,7 @@ class FeatureTask:
         classes = np.stack([sample.observed_classes, sample.hybrid_classes])
         return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(np.ascontiguousarray(classes))
 
-    def loss(self, config: "TrainingConfig", network: FeatureNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, config: TrainingConfig, network: FeatureNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
         images, classes = batch
         return feature_loss(network, images.float() / 255, classes, config.objective)

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from ..settings import TrainingConfig
 from .task import Batch
 from .tasks import task_of
-from .training_config import TrainingConfig
 
 VALIDATION_STREAM = 1
 _TRAINING_STREAM = 0

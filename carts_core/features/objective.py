@@ -1,35 +1,16 @@
 """What training minimises: the paper's cross-entropy, and terms that make features comparable across images."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from ..errors import SettingsError
+from ..settings import ObjectiveWeights
 from .network import FeatureNetwork
 
 _NEIGHBOURHOOD = 21
 _TINY = 1e-8
 _OTHER_PART = 0.6
-
-
-@dataclass(frozen=True)
-class ObjectiveWeights:
-    """Weights of the terms of the training loss; zero leaves a term out."""
-
-    cross_entropy: float = 1.0
-    """Binary cross-entropy of the instrument's probability, as in the paper."""
-    dice: float = 0.5
-    """One minus soft Dice per image, so that small instruments count as much as large ones."""
-    consistency: float = 1.0
-    """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
 
 
 def feature_loss(

@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..wording import counted
 from .checkpoint import History
 
 matplotlib.use("Agg")
@@ -64,7 +65,8 @@ def _page(config: dict, history: History, columns: dict[str, str]) -> str:
     lines = [
         f"# Training of the {config['network']} network",
         "",
-        f"{config['steps']} steps of {config['batch_size']} samples, {history.seconds / 60:.0f} minutes, robots: "
+        f"{counted(config['steps'], 'step')} of {counted(config['batch_size'], 'sample')}, "
+        f"{counted(round(history.seconds / 60), 'minute')}, robots: "
         f"{', '.join(config['robots'])}.",
         "",
         "![curves](curves.png)",

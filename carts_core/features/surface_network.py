@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..parts import PARTS
+from ..settings import Architecture
 from ..surface import SURFACE_CHANNELS
-from .network import Architecture, UNet
+from .network import UNet
 
 _HIDDEN = 24
 

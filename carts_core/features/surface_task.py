@@ -1,8 +1,7 @@
 """Learning to see surfaces: what `SurfaceNetwork` is trained on, what it minimises, how well it does."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -10,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from ..errors import SettingsError
 from ..parts import PARTS
 from ..robot import Robot
+from ..settings import TrainingConfig
 from ..surface import COVERAGE, NORMALS
 from .domain_randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
 from .objective import dilated, weighted_mean
@@ -20,29 +19,7 @@ from .surface_network import SurfaceNetwork
 from .task import Batch, byte_tensor, flips
 from .validation import dice
 
-if TYPE_CHECKING:
-    from .training_config import TrainingConfig
-
 _SMOOTH = 0.2
-
-
-@dataclass(frozen=True)
-class SurfaceWeights:
-    """Weights of the terms of the surface network's loss; zero leaves a term out."""
-
-    everywhere: float = 1.0
-    """Cross-entropy of coverage, all pixels."""
-    near: float = 1.0
-    """The same near instruments, where the optimizer looks."""
-    dice: float = 0.5
-    """One minus soft Dice per image and part, so that small parts count as much as large ones."""
-    normals: float = 1.0
-    """Smooth L1 of normals near instruments."""
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
 
 
 class SurfaceTask:
@@ -55,11 +32,11 @@ class SurfaceTask:
         "normal_error_deg": "error of normals [deg]",
     }
 
-    def network(self, config: "TrainingConfig") -> SurfaceNetwork:
+    def network(self, config: TrainingConfig) -> SurfaceNetwork:
         """A network with random weights."""
         return SurfaceNetwork(config.architecture)
 
-    def generator(self, config: "TrainingConfig", stream: Sequence[int]) -> SurfaceGenerator:
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
         """An endless source of samples."""
         return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
@@ -77,7 +54,7 @@ class SurfaceTask:
         """A sample as tensors of bytes."""
         return byte_tensor(sample.observed), byte_tensor(sample.believed), byte_tensor(sample.surface)
 
-    def loss(self, config: "TrainingConfig", network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, config: TrainingConfig, network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
         images, believed, surface = _floats(batch)
         predicted = network(images, believed)

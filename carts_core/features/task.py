@@ -1,14 +1,13 @@
 """What a training run needs to know about the network that it trains."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from .training_config import TrainingConfig
+from ..settings import TrainingConfig
 
 Batch = tuple[Tensor, ...]
 """Tensors of bytes, each with a leading dimension of samples."""
@@ -20,11 +19,11 @@ class Task(Protocol):
     columns: ClassVar[dict[str, str]]
     """Validation figures: name -> heading in the report."""
 
-    def network(self, config: "TrainingConfig") -> nn.Module:
+    def network(self, config: TrainingConfig) -> nn.Module:
         """A network with random weights."""
         ...
 
-    def generator(self, config: "TrainingConfig", stream: Sequence[int]) -> Callable[[], Any]:
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[], Any]:
         """An endless source of samples; every stream of a seed is another one."""
         ...
 
@@ -36,7 +35,7 @@ class Task(Protocol):
         """A sample as tensors of bytes."""
         ...
 
-    def loss(self, config: "TrainingConfig", network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
         ...
 

@@ -1,12 +1,9 @@
 """The networks that can be trained, by name."""
 
-from typing import Literal
-
+from ..settings import NetworkName
 from .feature_task import FeatureTask
 from .surface_task import SurfaceTask
 from .task import Task
-
-NetworkName = Literal["feature", "surface"]
 
 
 def task_of(network: NetworkName) -> Task:

@@ -11,6 +11,7 @@ import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ..errors import SettingsError
+from ..settings import TrainingConfig
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .growth import grow
 from .loader import training_batches, validation_set
@@ -18,7 +19,6 @@ from .network import UNet, channels_last
 from .report import write_report
 from .task import Batch
 from .tasks import task_of
-from .training_config import TrainingConfig
 from .weights import read_weights, save_weights
 
 _LOG_EVERY = 10

@@ -10,7 +10,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ..errors import SettingsError, WeightsError
-from .network import Architecture, FeatureNetwork, UNet
+from ..settings import Architecture
+from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
 
 VERSION = "1"

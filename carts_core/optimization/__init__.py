@@ -1,7 +1,10 @@
 """The ACS optimizer: unknowns, settings, solvers, and one steppable object."""
 
-from .calibration import CALIBRATION as CALIBRATION
-from .calibration import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
+from ..settings import CALIBRATION as CALIBRATION
+from ..settings import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
+from ..settings import FreeParameters as FreeParameters
+from ..settings import OptimizerSettings as OptimizerSettings
+from ..settings import SequenceSettings as SequenceSettings
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
@@ -13,9 +16,6 @@ from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
 from .sequence import FrameEstimate as FrameEstimate
 from .sequence import SequenceOptimizer as SequenceOptimizer
-from .sequence_settings import SequenceSettings as SequenceSettings
-from .settings import FreeParameters as FreeParameters
-from .settings import OptimizerSettings as OptimizerSettings
 
 __all__ = [
     "BASE_FRAME_GAIN",

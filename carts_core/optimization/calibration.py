@@ -13,26 +13,11 @@ from ..data import Frame
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
 from .calibration_objective import CalibrationEvaluation, CalibrationObjective, Ignored
 from .frame import Progress
 from .gauss_newton import GaussNewton
 from .parameters import ParameterVector
-from .settings import FreeParameters, OptimizerSettings
-
-CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
-"""What a calibration frees unless told otherwise."""
-
-CALIBRATION_SETTINGS = OptimizerSettings(
-    noise=0.5,
-    normals_weight=0.0,
-    frame_prior_deg=3.0,
-    intrinsics_prior=0.05,
-    glance=False,
-    coarse_robust=0.5,
-    coarse_tolerance=0.01,
-)
-"""How a calibration goes about it unless told otherwise. Normals are left out: where they are wrong by the same angle
-in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +104,11 @@ class CalibrationOptimizer:
         cameras: Sequence[str] | None = None,
     ) -> None:
         self.settings = settings
-        if self.settings.solver != "gauss_newton":
-            raise SettingsError(f"solver is {self.settings.solver!r}; a calibration needs gauss_newton.")
+        if self.settings.chosen_solver != "gauss_newton":
+            raise SettingsError(
+                f"a calibration was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
+                "it needs gauss_newton and surface. Leave them at their defaults."
+            )
         if not frames:
             raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
         if not 1e-3 <= joint_prior_deg <= 360:

@@ -17,10 +17,10 @@ from torch import Tensor
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters, OptimizerSettings
 from .elimination import Eliminated, eliminate
 from .evaluation import Evaluation
 from .parameters import ParameterVector
-from .settings import FreeParameters, OptimizerSettings
 from .surface_objective import SurfaceObjective
 
 Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]

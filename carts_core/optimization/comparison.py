@@ -11,10 +11,10 @@ from torch.nn import functional
 
 from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
+from ..settings import OptimizerSettings
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .inputs import kernel_radius, smoothed
 from .parameters import APART
-from .settings import OptimizerSettings
 from .window import Window
 
 _FACTORS = (1, 2, 4, 8)

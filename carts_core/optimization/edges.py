@@ -19,9 +19,9 @@ from torch.nn import functional
 from ..losses import attention
 from ..rendering import Outline, Renderer, Tangents
 from ..scene import Scene
+from ..settings import OptimizerSettings
 from .inputs import pixel_weights, smoothed, stacked_images, working_size
 from .parameters import APART, ParameterVector
-from .settings import OptimizerSettings
 from .veil import certainty, transmission, unveiled
 
 _ZOOM = 2.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .sequence_settings import SequenceSettings
+from ..settings import SequenceSettings
 
 
 @dataclass(frozen=True)

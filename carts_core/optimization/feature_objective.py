@@ -12,10 +12,10 @@ from ..features.hybrid import hybrid
 from ..losses import attention, attentional_loss, cosine_similarity, smooth_l1
 from ..rendering import Renderer
 from ..scene import Scene
+from ..settings import OptimizerSettings
 from .evaluation import Evaluation
 from .inputs import blurred, stacked_images, working_size
 from .parameters import ParameterVector
-from .settings import OptimizerSettings
 from .window import Window
 
 _SURROUNDINGS = 16

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters, OptimizerSettings
 from .edges import EdgeRefinement
 from .evaluation import Evaluation, Objective
 from .feature_objective import FeatureObjective
@@ -19,7 +20,6 @@ from .ignore import propose_ignore
 from .observability import Uncertainty
 from .parameters import ParameterVector
 from .restart import Restart
-from .settings import FreeParameters, OptimizerSettings
 from .solvers import make_solver
 from .surface_objective import SurfaceObjective
 

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..settings import OptimizerSettings
 from .evaluation import Evaluation
 from .parameters import ParameterVector
-from .settings import OptimizerSettings
 
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
 _SOFTER, _HARDER = 0.25, 8.0

@@ -11,8 +11,8 @@ from torch import Tensor
 from ..errors import SettingsError
 from ..keypoints import Keypoint, project_keypoints
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters, OptimizerSettings
 from .parameters import ParameterVector
-from .settings import FreeParameters, OptimizerSettings
 
 _DAMPINGS = (1e-6, 1e8)
 _ENOUGH = 1e-9

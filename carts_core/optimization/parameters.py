@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..errors import SettingsError
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters
 from .prior import Prior
-from .settings import FreeParameters
 
 STEP = 1e-3
 """Distance of an unknown's two neighbouring states from its value [rad]."""

@@ -3,9 +3,9 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from ..settings import OptimizerSettings
 from .evaluation import Objective, Solver
 from .gauss_newton import GaussNewton
-from .settings import OptimizerSettings
 from .surface_objective import SurfaceObjective
 
 _DOUBTFUL = 0.03

@@ -17,11 +17,10 @@ from ..data import Frame
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
+from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from .error_model import ErrorModel, Gaussian, Information, combined, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
-from .sequence_settings import SequenceSettings
-from .settings import FreeParameters, OptimizerSettings
 from .sight import Eye, Ignore, Sight
 
 Start = Literal["warm", "cold", "keyframe", "carried"]
@@ -107,10 +106,10 @@ class SequenceOptimizer:
         self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
         self._scene, self._load, self._extractor = scene.with_cameras(cameras), load, extractor
         self._free = free or FreeParameters()
-        if (self.settings.solver, self.settings.loss) != ("gauss_newton", "surface"):
+        if self.settings.chosen_solver != "gauss_newton":
             raise SettingsError(
-                f"sequence mode was given the solver {self.settings.solver} and the loss {self.settings.loss}; it "
-                "needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
+                f"sequence mode was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
+                "it needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
             )
         self._keyframes = {
             index: {name: np.asarray(values, np.float64) for name, values in positions.items()}

@@ -11,13 +11,13 @@ from torch import Tensor
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene
+from ..settings import OptimizerSettings
 from .edges import EdgeRefinement
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation, Objective
 from .parameters import ParameterVector
 from .prior import Prior
 from .restart import Restart
-from .settings import OptimizerSettings
 from .solvers import make_solver
 from .surface_objective import SurfaceObjective
 

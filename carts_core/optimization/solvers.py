@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..settings import OptimizerSettings
 from .evaluation import Evaluation, Solver, Stay
 from .gauss_newton import GaussNewton
 from .parameters import ParameterVector
-from .settings import OptimizerSettings
 
 _FINE_FROM = 0.5
 """Share of the iterations after which the objective's last stage begins."""
@@ -76,7 +76,8 @@ def step_size(settings: OptimizerSettings, iteration: int) -> float:
 
 def make_solver(settings: OptimizerSettings, parameters: ParameterVector, stages: int) -> Solver:
     """A fresh solver of the kind that the settings name."""
-    if settings.solver == "none":
+    name = settings.chosen_solver
+    if name == "none":
         return Stay(stages)
     kinds = {"gauss_newton": GaussNewton, "adam": Adam, "gradient_descent": GradientDescent}
-    return kinds[settings.solver](settings, parameters, stages)
+    return kinds[name](settings, parameters, stages)

@@ -17,13 +17,13 @@ from ..features.extractor import FeatureExtractor
 from ..losses import attention
 from ..rendering import Renderer
 from ..scene import Scene
+from ..settings import OptimizerSettings
 from ..surface import COVERAGE
 from .comparison import Stage
 from .evaluation import Evaluation
 from .inputs import pixel_weights, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
-from .settings import OptimizerSettings
 from .veil import certainty, transmission, unveiled
 from .window import Window
 

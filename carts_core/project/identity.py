@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..wording import counted
+
 if TYPE_CHECKING:
     from ..data import Sequence
 
@@ -60,7 +62,7 @@ class SequenceIdentity:
     def difference(self, other: "SequenceIdentity") -> str | None:
         """In words, the first thing in which `other` is another recording; None if it is the same."""
         if len(self.frame_ids) != len(other.frame_ids):
-            return f"{len(self.frame_ids)} frames against {len(other.frame_ids)}"
+            return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
             if own != others:
                 return f"frame number {index} is called {own!r} against {others!r}"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from ..errors import ProjectError
+from ..wording import counted
 from . import database, journal
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
@@ -154,7 +155,9 @@ class Project:
         with self._edit:
             state = self.state
             if not 0 <= position <= len(state.steps):
-                raise ProjectError(f"the history has {len(state.steps)} steps; position {position} is not among them.")
+                raise ProjectError(
+                    f"the history has {counted(len(state.steps), 'step')}; position {position} is not among them."
+                )
             if position == state.position:
                 return None
             with self._transaction() as connection:

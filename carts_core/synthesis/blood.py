@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from .config import DomainConfig
+from ..settings import DomainConfig
 from .noise import smooth_noise, smoothstep
 from .path_tracer import Surface
 from .tissue import EXTENT, Tissue, sample

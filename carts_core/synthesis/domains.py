@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..settings import SynthesisConfig
 from .blood import Bleeding
-from .config import SynthesisConfig
 from .path_tracer import INTENSITY, LIGHTS_CAMERA, Surface
 from .sensor import expose
 from .smoke import Smoke, SmokeOverlay

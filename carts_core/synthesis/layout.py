@@ -8,7 +8,7 @@ from ..camera import Camera
 from ..errors import RobotError
 from ..robot import Robot
 from ..scene import Arm
-from .config import EndoscopeConfig, SynthesisConfig
+from ..settings import EndoscopeConfig, SynthesisConfig
 
 ARM_NAMES = ("psm1", "psm2")
 """Seen from the camera: the arm that comes in from the left, and the one from the right."""

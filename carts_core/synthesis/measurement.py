@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import SettingsError
-from .config import MeasurementError
+from ..settings import MeasurementError
 
 
 def measure(

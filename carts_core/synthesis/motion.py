@@ -12,7 +12,7 @@ from ..camera import Camera
 from ..errors import SettingsError
 from ..robot import Robot
 from ..scene import Arm
-from .config import SynthesisConfig
+from ..settings import SynthesisConfig
 from .layout import WORK_POINTS
 from .path_tracer import NEAR
 from .tissue import Tissue

@@ -13,7 +13,7 @@ from scipy.ndimage import rank_filter
 
 from ..camera import Camera
 from ..errors import CartsError
-from .config import RenderConfig
+from ..settings import RenderConfig
 from .tissue import Tissue
 
 LIGHTS_CAMERA = ((-0.0042, -0.0030, 0.0), (0.0042, -0.0030, 0.0))

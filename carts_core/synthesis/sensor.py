@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from .config import SensorConfig
+from ..settings import SensorConfig
 
 _SHOULDER = 0.65
 

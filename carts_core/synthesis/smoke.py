@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import map_coordinates
 
-from .config import DomainConfig
+from ..settings import DomainConfig
 from .noise import smooth_noise
 
 _GRID = 96

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import SettingsError
-from .config import SynthesisConfig
+from ..settings import SynthesisConfig
 from .domains import Conditions, View
 from .layout import load_robot, place_arms, place_cameras
 from .measurement import measure

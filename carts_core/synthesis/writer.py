@@ -13,7 +13,7 @@ from ..camera import Camera
 from ..errors import CartsError
 from ..resources import shipped_robot
 from ..scene import Arm
-from .config import SynthesisConfig
+from ..settings import SynthesisConfig
 
 
 def frame_name(frame: int) -> str:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from carts_core.optimization.sequence_settings import Direction
+from carts_core.settings import Direction
 from carts_viewer.intents.base import Intent
 
 

@@ -2,8 +2,8 @@
 
 import viser
 
-from carts_core.optimization.sequence_settings import Direction
 from carts_core.project import ProjectState, between_kept
+from carts_core.settings import Direction
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write

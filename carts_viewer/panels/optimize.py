@@ -4,8 +4,8 @@ from typing import get_args
 
 import viser
 
-from carts_core.losses import Loss
 from carts_core.optimization import BASE_FRAME_GAIN
+from carts_core.settings import Loss
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write

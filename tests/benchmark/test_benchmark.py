@@ -1,5 +1,6 @@
 """A whole small benchmark: runs, stops, goes on, and reports."""
 
+import io
 import os
 import signal
 import subprocess
@@ -78,6 +79,43 @@ def test_a_stopped_benchmark_goes_on_where_it_was(
     resumed = tiny_benchmark()
     resumed.run(QUIET)
     assert len(count_runs) == RUNS and resumed.measurements()[:5] == kept
+
+
+def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
+    tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    log, measure = tmp_path / "log.txt", _Bench.measure
+    seen: list[str] = []
+
+    def stop_at_three(self: _Bench, *arguments) -> list[Measurement]:
+        seen.append(log.read_text())
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        return measure(self, *arguments)
+
+    monkeypatch.setattr(runner._Bench, "measure", stop_at_three)
+    with log.open("w") as file, pytest.raises(KeyboardInterrupt):
+        tiny_benchmark().run(Console(file=file))
+    assert [text.count("\n") for text in seen] == [0, 1, 2]
+    assert [line.split(":")[0] for line in seen[2].splitlines()] == [f"1 of {RUNS}", f"2 of {RUNS}"]
+    assert "synthetic, regular, frame 0: " in seen[2]
+
+
+def test_a_terminal_gets_a_bar_and_no_lines(
+    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = _Bench.measure
+
+    def stop_at_two(self: _Bench, *arguments) -> list[Measurement]:
+        if len(count_runs) == 2:
+            raise KeyboardInterrupt
+        return measure(self, *arguments)
+
+    monkeypatch.setattr(runner._Bench, "measure", stop_at_two)
+    screen = io.StringIO()
+    with pytest.raises(KeyboardInterrupt):
+        tiny_benchmark().run(Console(file=screen, force_terminal=True, width=120))
+    assert f"2/{RUNS}" in screen.getvalue() and f"of {RUNS}:" not in screen.getvalue()
 
 
 def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[..., Benchmark]) -> None:

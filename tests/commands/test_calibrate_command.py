@@ -12,6 +12,7 @@ import pytest
 from carts_core.cli import BAD_INPUT, main
 from carts_core.data import Sequence, calibrated_sequence_file
 
+CAUTION = "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame"
 QUICK = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
 
 
@@ -20,9 +21,12 @@ def sequence(tiny_sequence: Callable[..., Path]) -> Path:
     return tiny_sequence(frames=3, cameras=("left", "right"), width=160, height=128)
 
 
-def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(sequence: Path, tmp_path: Path) -> None:
+def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output, scores = tmp_path / "a" / "b", tmp_path / "scores.json"
     main(["calibrate", str(sequence), "--output", str(output), *QUICK])
+    assert " ".join(capsys.readouterr().out.split()).count(CAUTION) == 1
     names = {"sequence.toml", "calibration.json", "README.md", "frames.png", "unknowns.png", "export.json"}
     assert {path.name for path in output.iterdir()} == names
     before, after = Sequence.open(sequence), Sequence.open(output / "sequence.toml")
@@ -40,6 +44,17 @@ def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(sequence: P
     assert evaluated == pytest.approx([frame["dice_after"]["right"] for frame in content["frames"]], abs=1e-6)
     page = (output / "README.md").read_text()
     assert "| T_world_base of PSM1 |" in page and "| 003 |" in page
+    assert page.count(CAUTION) == 1
+
+
+def test_a_calibration_that_moved_nothing_says_so(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--iterations", "1"])
+    page = (tmp_path / "out" / "README.md").read_text()
+    for text in (page, " ".join(capsys.readouterr().out.split())):
+        assert "The start was kept" in text and CAUTION not in text
+    assert "what moved" not in page
 
 
 def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Path) -> None:
@@ -50,6 +65,7 @@ def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Pat
     assert before.scene.cameras[0].intrinsics != after.scene.cameras[0].intrinsics
     assert before.scene.cameras[1].intrinsics == after.scene.cameras[1].intrinsics
     assert np.array_equal(before.measured["PSM1"], after.measured["PSM1"])
+    assert CAUTION not in (output / "README.md").read_text()
     units = [unknown["unit"] for unknown in json.loads((output / "calibration.json").read_text())["unknowns"]]
     assert units == ["%", "%", "px", "px"]
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def sequence(tiny_sequence: Callable[..., Path]) -> str:
     return str(tiny_sequence(frames=3, domains=("regular", "smoke"), width=160, height=128))
 
 
-def test_evaluate_writes_scores_of_every_frame_and_their_means(sequence: str, tmp_path: Path) -> None:
+def test_evaluate_writes_scores_of_every_frame_into_a_folder_that_it_makes(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "scores" / "out.json"
     main(["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--iterations", "2"])
     scores = json.loads(file.read_text())
@@ -54,6 +55,26 @@ def test_a_perturbed_start_is_that_far_off_the_truth(sequence: str, tmp_path: Pa
     assert json.loads(file.read_text())["frames"][0]["joint_mae_deg_before"] == pytest.approx(2.0, abs=1e-3)
 
 
+def test_an_optimization_from_a_perturbed_start_begins_that_far_off_the_truth(sequence: str, tmp_path: Path) -> None:
+    main(["optimize", sequence, "--output", str(tmp_path / "out"), "--perturb-deg", "2", "--solver", "none"])
+    rows = csv.DictReader((tmp_path / "out" / "regular" / "left" / "kinematics.csv").open())
+    truth = csv.DictReader((tmp_path / "truth.csv").open())
+    off = [float(row["PSM1.yaw"]) - float(true["yaw"]) for row, true in zip(rows, truth, strict=True)]
+    assert [abs(math.degrees(angle)) for angle in off] == pytest.approx([2.0] * 3, abs=1e-3)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "optimize"])
+def test_a_start_that_was_kept_is_told(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    output = ["--output", str(tmp_path / "out")] if command == "optimize" else ["--json", str(tmp_path / "out.json")]
+    main([command, sequence, "--frames", "0", "--perturb-deg", "0.001", *output])
+    assert "left: in 1 of 1 run the start was kept" in " ".join(capsys.readouterr().out.split())
+    if command == "evaluate":
+        (score,) = json.loads((tmp_path / "out.json").read_text())["frames"]
+        assert score["stopped"] == "start kept"
+
+
 def test_optimize_writes_masks_and_kinematics_and_resumes(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,7 +83,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     folder = tmp_path / "out" / "regular" / "left"
     first = (folder / "masks" / "001.png").stat().st_mtime_ns
     main(command)
-    assert "2 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "2 of 3 frames already there" in capsys.readouterr().out.replace("\n", " ")
     assert (folder / "masks" / "001.png").stat().st_mtime_ns == first
     with (folder / "kinematics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -90,7 +111,7 @@ def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     assert (one > 0).any() and (other > 0).any() and (one != other).any()
 
     main(command)
-    assert "2 of 2 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "2 of 2 frames already there" in capsys.readouterr().out.replace("\n", " ")
     files[3].unlink()
     main(command)
     assert files[3].is_file(), "a frame without one of its masks is done again"
@@ -127,11 +148,45 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert [float(rows[1][name]) for name in columns[2:]] == [float(value) for value in values]
     assert float(rows[1]["PSM1.yaw.std"]) == 0
     main([*command, "--keyframes", str(given)])
-    assert "3 of 3 frames are there already" in capsys.readouterr().out.replace("\n", " ")
+    assert "3 of 3 frames already there" in capsys.readouterr().out.replace("\n", " ")
 
     with pytest.raises(SystemExit) as stop:
         main(["optimize", sequence, *output, "--keyframes", str(given)])
     assert stop.value.code == BAD_INPUT and "needs --mode sequence" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("loss", ["acs", "l1"])
+def test_a_loss_that_is_given_alone_gets_a_solver_that_can_descend_it(sequence: str, tmp_path: Path, loss: str) -> None:
+    file = tmp_path / "out.json"
+    main(["evaluate", sequence, "--loss", loss, "--iterations", "2", "--frames", "0", "--json", str(file)])
+    (score,) = json.loads(file.read_text())["frames"]
+    assert (score["iterations"], score["stopped"]) == (2, "iterations")
+
+
+def test_a_solver_that_cannot_descend_the_loss_is_told_with_what_can(
+    sequence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", sequence, "--loss", "acs", "--solver", "gauss_newton"])
+    assert stop.value.code == BAD_INPUT
+    assert "allowed is auto, adam, gradient_descent or none for the loss" in " ".join(capsys.readouterr().err.split())
+
+
+def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    main(command)
+    main(command)
+    main(["evaluate", sequence, "--frames", "0", "--iterations", "1"])
+    main(["export", sequence, str(tmp_path / "export"), "--frames", "0", "--format", "masks"])
+    told = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "1 of 1 frame already there",
+        "kinematics.csv of 1 frame to",
+        "tiny: 1 frame, means",
+        "masks, 1 frame ",
+    ):
+        assert words in told
+    assert "1 frames" not in told
 
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,6 +197,43 @@ def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: p
     assert stop.value.code == BAD_INPUT
     assert "--overwrite" in capsys.readouterr().err
     main([*command, "--iterations", "2", "--overwrite"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--arms", "PSM9"], "no arm is called 'PSM9'"),
+        (["--locked-joints", "elbow"], "locked joint 'elbow' does not exist"),
+        (["--extrinsics", "--locked-cameras", "third"], "no camera is called 'third'"),
+        (["--no-joints"], "nothing is free"),
+        (["--domain", "regular", "fog"], "domain 'fog' is not in"),
+        (["--mode", "sequence", "--keyframes", "nowhere.csv"], "nowhere.csv is not a readable kinematics table"),
+        (["--mode", "sequence", "--solver", "adam"], "needs gauss_newton and surface"),
+    ],
+)
+def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
+    arguments: list[str], message: str, sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["optimize", sequence, "--output", str(tmp_path / "out"), *arguments])
+    assert stop.value.code == BAD_INPUT and message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_are_replaced_by_frames_and_not_by_an_error(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    main([*command, "--domain", "smoke"])
+    folder = tmp_path / "out" / "smoke" / "left"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit):
+        main([*command, "--domain", "smoke", "--overwrite", "--arms", "PSM9"])
+    with pytest.raises(SystemExit):
+        main([*command, "--domain", "all", "--looks", "1"])
+    assert "smoke/left holds results of other settings" in " ".join(capsys.readouterr().err.split())
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "out" / "regular").exists(), "the first domain is not begun if the second is refused"
 
 
 @pytest.mark.parametrize("style", ["overlay", "image", "mask"])

@@ -183,7 +183,7 @@ def test_more_rows_than_images_name_the_missing_images(tiny_sequence):
     for row in range(2, 7):
         (path.parent / f"regular/left/{row:03d}.png").unlink()
     message = error_of(path)
-    assert f"5 of 6 files are missing: {path.parent / 'regular/left/002.png'} (frame 002)" in message
+    assert f"5 of 6 files missing: {path.parent / 'regular/left/002.png'} (frame 002)" in message
     assert "and 2 more" in message
     assert "remove the rows" in message
 
@@ -192,7 +192,7 @@ def test_a_missing_mask_names_the_key_for_sparse_masks(tiny_sequence):
     path = tiny_sequence()
     (path.parent / "masks/left/002.png").unlink()
     message = error_of(path)
-    assert "1 of 3 files are missing" in message
+    assert "1 of 3 files missing" in message
     assert "sparse_masks = true" in message
 
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from carts_core.features.domain_randomization import ImageSettings, PairGenerator, TrainingPair
-from carts_core.features.network import Architecture, FeatureNetwork
+from carts_core.features.network import FeatureNetwork
 from carts_core.features.weights import save_weights
 from carts_core.robot import Robot
+from carts_core.settings import Architecture
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ from carts_core.features.domain_randomization.geometry import RobotGeometry
 from carts_core.features.domain_randomization.lens import tone
 from carts_core.features.domain_randomization.occluders import occlude
 from carts_core.features.domain_randomization.placement import perturbed, random_intrinsics, random_placement
-from carts_core.features.domain_randomization.ranges import DARKEST_BRIGHTNESS
 from carts_core.features.domain_randomization.shading import shade
 from carts_core.robot import Robot
+from carts_core.settings import DARKEST_BRIGHTNESS
 
 SIZE = (192, 160)
 

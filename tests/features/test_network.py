@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.features.network import Architecture, FeatureNetwork, standardize
+from carts_core.features.network import FeatureNetwork, standardize
+from carts_core.settings import Architecture
 
 
 def test_features_have_the_size_of_the_image_and_the_first_levels_channels(small_network: FeatureNetwork):

@@ -3,7 +3,8 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.features.network import FeatureNetwork
-from carts_core.features.objective import ObjectiveWeights, consistency_loss, feature_loss, soft_dice_loss
+from carts_core.features.objective import consistency_loss, feature_loss, soft_dice_loss
+from carts_core.settings import ObjectiveWeights
 
 
 def _scene() -> tuple[torch.Tensor, torch.Tensor]:

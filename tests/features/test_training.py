@@ -15,10 +15,9 @@ from carts_core.features import FeatureExtractor
 from carts_core.features.checkpoint import CHECKPOINT_FILE, load_checkpoint
 from carts_core.features.domain_randomization import ImageSettings
 from carts_core.features.loader import training_batches, validation_set
-from carts_core.features.network import Architecture
 from carts_core.features.training import TrainingProgress, schedule, train
-from carts_core.features.training_config import TrainingConfig
 from carts_core.features.weights import read_weights
+from carts_core.settings import Architecture, TrainingConfig
 
 SMALL = {
     "batch_size": 2,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, combined, without
-from carts_core.optimization.sequence_settings import SequenceSettings
+from carts_core.settings import SequenceSettings
 
 N, FRAMES = 3, 5
 GAPS = np.array([0.0, 0.5, 0.1, 2.0, 0.3])

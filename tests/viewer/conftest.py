@@ -15,9 +15,10 @@ from viewer_desk import Desk
 from viewer_tab import Tab
 
 from carts_core.data import Sequence
-from carts_core.features.network import Architecture, FeatureNetwork
+from carts_core.features.network import FeatureNetwork
 from carts_core.features.weights import save_weights
 from carts_core.project import Project
+from carts_core.settings import Architecture
 from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 from carts_viewer.running import OptimizerFactory

@@ -19,4 +19,4 @@ def run_without_end(app: ViewerApp) -> None:
     for name, value in _SETTINGS.items():
         app.mailbox.put(ask.SetSetting(name, value))
     state = app.wait_until_shown()
-    assert state.settings.solver == "adam" and state.settings_error is None, state.settings_error
+    assert state.settings.chosen_solver == "adam" and state.settings_error is None, state.settings_error

@@ -1,12 +1,12 @@
 """Training images for the networks, made on the fly and varied far beyond any one operating room."""
 
-from .observer import ImageSettings as ImageSettings
+from ...settings import AppearanceRanges as AppearanceRanges
+from ...settings import ImageSettings as ImageSettings
 from .pairs import BACKGROUND as BACKGROUND
 from .pairs import HEAD as HEAD
 from .pairs import SHAFT as SHAFT
 from .pairs import PairGenerator as PairGenerator
 from .pairs import TrainingPair as TrainingPair
-from .ranges import AppearanceRanges as AppearanceRanges
 from .surfaces import SURFACE_UNIT as SURFACE_UNIT
 from .surfaces import SurfaceGenerator as SurfaceGenerator
 from .surfaces import SurfaceSample as SurfaceSample

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from ...settings import AppearanceRanges
 from .backgrounds import smooth_noise
-from .ranges import AppearanceRanges
 
 Image = Float[np.ndarray, "h w 3"]
 

@@ -1,14 +1,14 @@
 """Observed training images: random arms in front of a random camera, shaded and photographed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from ...errors import SettingsError
 from ...robot import Robot
+from ...settings import ImageSettings
 from .backgrounds import random_background
 from .clutter import add_clutter, cast_shadow, contact_shadow
 from .gbuffer import GBuffer, render_gbuffer
@@ -16,7 +16,6 @@ from .geometry import Intrinsics, RobotGeometry
 from .lens import photograph
 from .occluders import occlude
 from .placement import Placement, random_intrinsics, random_placement
-from .ranges import AppearanceRanges
 from .shading import shade
 from .variants import Variant, random_variant
 
@@ -26,43 +25,6 @@ _VARIANT_LIFE = 40
 _TRIES = 12
 _CONTACT = 0.4
 """Share of images with a crisp shadow beside the arms."""
-
-
-@dataclass(frozen=True)
-class ImageSettings:
-    """What training images look like."""
-
-    width: int = 192
-    """Width of a training image [px]."""
-    height: int = 160
-    """Height of a training image [px]."""
-    field_width: int = 320
-    """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
-    two_arms: float = 0.4
-    """Share of pairs with two arms."""
-    same_kinematics: float = 0.5
-    """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
-    same_background: float = 0.7
-    """Share of pairs whose mean background is that of the observed image."""
-    occluded: float = 0.4
-    """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
-    coverage: tuple[float, float] = (0.004, 0.5)
-    """Allowed share of the image that shows arms."""
-    appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
-    """The camera's ranges."""
-
-    def __post_init__(self) -> None:
-        if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
-            raise SettingsError(
-                f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
-            )
-        if self.field_width < self.width:
-            raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
-        for name in ("two_arms", "same_kinematics", "same_background", "occluded"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
-        if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
-            raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")
 
 
 @dataclass(frozen=True)

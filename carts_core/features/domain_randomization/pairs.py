@@ -10,12 +10,13 @@ from jaxtyping import Int
 
 from ...robot import Robot
 from ...scene import SceneState
+from ...settings import ImageSettings
 from ..hybrid import hybrid
 from .backgrounds import random_background
 from .gbuffer import GBuffer
 from .geometry import Intrinsics
 from .lens import photograph, tone
-from .observer import ImageSettings, Observer, look, to_uint8
+from .observer import Observer, look, to_uint8
 from .placement import Placement, perturbed
 from .variants import Variant
 

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Int
 
 from ...robot import Robot
+from ...settings import ImageSettings
 from ...surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from .gbuffer import GBuffer
 from .geometry import RobotGeometry
-from .observer import ImageSettings, Observer, look, to_uint8
+from .observer import Observer, look, to_uint8
 from .placement import perturbed
 
 SURFACE_UNIT = 127

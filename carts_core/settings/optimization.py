@@ -5,10 +5,16 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 from ..errors import SettingsError
-from ..losses import Loss
 
-SolverName = Literal["gauss_newton", "adam", "gradient_descent", "none"]
-"""`none` evaluates the start and stops ("CaRTS without optimization")."""
+Loss = Literal["surface", "acs", "acs_paper", "acs_reference", "l1"]
+"""`surface`: parts and normals that the network sees against those that are rendered; the only one for Gauss-Newton.
+`acs`: mean dissimilarity inside the attention map, independent of how large that is.
+`acs_paper`: the paper's equation, 1 - mean(similarity x attention); falls when the silhouette grows.
+`acs_reference`: mean((1 - similarity) x attention); falls when the silhouette shrinks.
+`l1`: smooth L1 between the network's predictions ("CaRTS L1")."""
+
+SolverName = Literal["auto", "gauss_newton", "adam", "gradient_descent", "none"]
+"""`auto` suits the loss; `none` evaluates the start and stops ("CaRTS without optimization")."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +41,10 @@ class FreeParameters:
 class OptimizerSettings:
     """How one frame is optimized. The defaults are a measured compromise; `paper()` gives the paper's."""
 
-    solver: SolverName = "gauss_newton"
-    """Which solver; `gauss_newton` needs the loss `surface`."""
+    solver: SolverName = "auto"
+    """Which solver; `auto` is `gauss_newton` for the loss `surface`, which alone can have it, and `adam` for others."""
     loss: Loss = "surface"
-    """Which loss; see `carts_core.losses.Loss`."""
+    """Which loss; see `carts_core.settings.Loss`."""
     iterations: int = 60
     """Largest number of steps [1]; `gauss_newton` mostly stops earlier by itself."""
     blurs: tuple[float, ...] = (8.0, 3.0, 1.6, 0.8)
@@ -146,7 +152,7 @@ class OptimizerSettings:
         proposes = not self.propose_ignore or self.loss == "surface"
         _require(proposes, "propose_ignore", self.propose_ignore, f"False for the loss {self.loss}")
         fits = self.solver != "gauss_newton" or self.loss == "surface"
-        _require(fits, "solver", self.solver, f"adam or gradient_descent for the loss {self.loss}")
+        _require(fits, "solver", self.solver, f"auto, adam, gradient_descent or none for the loss {self.loss}")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")
         _require(0 < self.decay <= 1, "decay", self.decay, "above 0, at most 1")
         _require(1 <= self.decay_every <= 10_000, "decay_every", self.decay_every, "1 to 10000")
@@ -167,6 +173,13 @@ class OptimizerSettings:
         _require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
 
     @property
+    def chosen_solver(self) -> SolverName:
+        """The solver, with `auto` replaced by what it means for the loss."""
+        if self.solver != "auto":
+            return self.solver
+        return "gauss_newton" if self.loss == "surface" else "adam"
+
+    @property
     def needs_background(self) -> bool:
         """Whether the loss compares images, which takes the mean background."""
         return self.loss != "surface"
@@ -174,19 +187,17 @@ class OptimizerSettings:
     @property
     def draws_to_edges(self) -> bool:
         """Whether outlines are drawn to edges."""
-        return self.solver == "gauss_newton" and self.edge_steps > 0 and self.edge_weight > 0
+        return self.chosen_solver == "gauss_newton" and self.edge_steps > 0 and self.edge_weight > 0
 
     def with_loss(self, loss: Loss) -> "OptimizerSettings":
         """These settings for another loss, with a solver that can descend it.
 
-        Gauss-Newton gives way to Adam for a loss without residuals, and takes over again for `surface`. Ignore masks
-        are proposed for `surface` only.
+        Gauss-Newton gives way for a loss without residuals, and takes over again for `surface`. Ignore masks are
+        proposed for `surface` only.
         """
         solver = self.solver
-        if loss == "surface" and solver != "none":
-            solver = "gauss_newton"
-        elif solver == "gauss_newton":
-            solver = "adam"
+        if solver == "gauss_newton" or (loss == "surface" and solver != "none"):
+            solver = "auto"
         return replace(self, loss=loss, solver=solver, propose_ignore=self.propose_ignore and loss == "surface")
 
     @staticmethod

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from ..errors import SettingsError
 from ..resources import shipped_robot
-from .domain_randomization import ImageSettings
+from .loss_weights import ObjectiveWeights, SurfaceWeights
 from .network import Architecture
-from .objective import ObjectiveWeights
-from .surface_task import SurfaceWeights
-from .tasks import NetworkName
+from .training_images import ImageSettings
+
+NetworkName = Literal["feature", "surface"]
+"""Which network is trained."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ...errors import SettingsError
+from ..errors import SettingsError
 
 Range = tuple[float, float]
 

@@ -1,0 +1,31 @@
+"""What people can set, in plain dataclasses that check their ranges.
+
+Nothing here imports torch or what needs it, so that the command line knows its options at once.
+"""
+
+from .appearance import DARKEST_BRIGHTNESS as DARKEST_BRIGHTNESS
+from .appearance import AppearanceRanges as AppearanceRanges
+from .calibration import CALIBRATION as CALIBRATION
+from .calibration import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
+from .export import FormatName as FormatName
+from .export import Parts as Parts
+from .loss_weights import ObjectiveWeights as ObjectiveWeights
+from .loss_weights import SurfaceWeights as SurfaceWeights
+from .network import Architecture as Architecture
+from .optimization import FreeParameters as FreeParameters
+from .optimization import Loss as Loss
+from .optimization import OptimizerSettings as OptimizerSettings
+from .optimization import SolverName as SolverName
+from .sequence import Direction as Direction
+from .sequence import SequenceSettings as SequenceSettings
+from .synthesis import DOMAINS as DOMAINS
+from .synthesis import DomainConfig as DomainConfig
+from .synthesis import EndoscopeConfig as EndoscopeConfig
+from .synthesis import MeasurementError as MeasurementError
+from .synthesis import MotionConfig as MotionConfig
+from .synthesis import RenderConfig as RenderConfig
+from .synthesis import SensorConfig as SensorConfig
+from .synthesis import SynthesisConfig as SynthesisConfig
+from .training import NetworkName as NetworkName
+from .training import TrainingConfig as TrainingConfig
+from .training_images import ImageSettings as ImageSettings

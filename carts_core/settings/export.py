@@ -1,0 +1,9 @@
+"""What an export can be told."""
+
+from typing import Literal
+
+FormatName = Literal["masks", "coco", "yolo", "voc", "cvat", "datumaro", "csv", "npz", "json", "dvrk", "video"]
+"""Names of the export formats."""
+
+Parts = Literal["arms", "links"]
+"""What gets a category of its own."""

@@ -1,0 +1,43 @@
+"""What the images look like that networks are trained on."""
+
+from dataclasses import dataclass, field
+
+from ..errors import SettingsError
+from .appearance import AppearanceRanges
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """What training images look like."""
+
+    width: int = 192
+    """Width of a training image [px]."""
+    height: int = 160
+    """Height of a training image [px]."""
+    field_width: int = 320
+    """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
+    two_arms: float = 0.4
+    """Share of pairs with two arms."""
+    same_kinematics: float = 0.5
+    """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
+    same_background: float = 0.7
+    """Share of pairs whose mean background is that of the observed image."""
+    occluded: float = 0.4
+    """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
+    coverage: tuple[float, float] = (0.004, 0.5)
+    """Allowed share of the image that shows arms."""
+    appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
+    """The camera's ranges."""
+
+    def __post_init__(self) -> None:
+        if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
+            raise SettingsError(
+                f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
+            )
+        if self.field_width < self.width:
+            raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
+        for name in ("two_arms", "same_kinematics", "same_background", "occluded"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
+        if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
+            raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")

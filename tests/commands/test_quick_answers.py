@@ -1,0 +1,77 @@
+"""What `carts` says without running a command is said at once: before anything is imported that takes long."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+from carts_core.cli import BAD_INPUT
+
+HEAVY = {"torch", "numba", "cv2", "kornia", "scipy", "trimesh", "matplotlib", "viser", "mitsuba"}
+COMMANDS = ("view", "optimize", "evaluate", "calibrate", "render", "export", "synthesize", "train", "bench")
+
+
+def _answer(*arguments: str) -> tuple[int, str, set[str]]:
+    """Exit status, what was printed, and all modules that were imported."""
+    command = [sys.executable, "-X", "importtime", "-m", "carts_core.cli", *arguments]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    lines = finished.stderr.splitlines()
+    modules = {line.rpartition("|")[2].strip() for line in lines if line.startswith("import time:")}
+    errors = [line for line in lines if not line.startswith("import time:")]
+    assert "carts_core.cli" in modules or "carts_core.commands.optimize" in modules
+    return finished.returncode, " ".join((finished.stdout + "\n".join(errors)).split()), modules
+
+
+@pytest.mark.parametrize("command", [(), *((name,) for name in COMMANDS)], ids=lambda words: " ".join(words) or "carts")
+def test_help_is_given_without_heavy_imports(command: tuple[str, ...]) -> None:
+    status, text, modules = _answer(*command, "--help")
+    assert status == 0 and "usage: carts" in text and not HEAVY & modules
+    assert all(name in text for name in (COMMANDS if not command else command))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["optimise"], "Unrecognized options: optimise"),
+        (["optimize"], "PATH"),
+        (["optimize", "sequence.toml", "--looks", "many"], "--looks"),
+        (["evaluate", "sequence.toml", "--solver", "newton"], "--solver"),
+        (["evaluate", "sequence.toml", "--iterations", "0"], "iterations is 0; allowed is 1 to 10000"),
+        (["optimize", "sequence.toml", "--perturb-deg", "-3"], "--perturb-deg is -3; allowed is 0 to 180"),
+        (["evaluate", "sequence.toml", "--perturb-deg", "nan"], "--perturb-deg is nan; allowed is 0 to 180"),
+        (["render", "sequence.toml", "--seed", "-1"], "--seed is -1; allowed is 0 or more"),
+        (["optimize", "sequence.toml", "--keyframes", "table.csv"], "needs --mode sequence"),
+        (["evaluate", "sequence.toml", "--json", "/"], "--json / is a folder. Name a file."),
+        (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),
+        (["train", "--images.width", "17"], "give positive multiples of 16"),
+    ],
+)
+def test_a_wrong_argument_is_told_without_heavy_imports(arguments: list[str], message: str) -> None:
+    status, text, modules = _answer(*arguments)
+    assert status == BAD_INPUT and message in text and not HEAVY & modules
+
+
+def test_the_version_is_told_without_heavy_imports() -> None:
+    status, text, modules = _answer("--version")
+    assert (status, text) == (0, f"carts {version('carts')}") and not HEAVY & modules
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["optimize", "--help"], ["--version"], ["optimise"]])
+def test_output_that_nobody_reads_ends_quietly(arguments: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        command = [sys.executable, "-m", "carts_core.cli", *arguments]
+        finished = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False, timeout=120)
+    finally:
+        os.close(writing)
+    assert finished.returncode == (BAD_INPUT if arguments == ["optimise"] else 1)
+    assert b"Traceback" not in finished.stderr and b"BrokenPipe" not in finished.stderr
+
+
+@pytest.mark.parametrize("command", ["optimize", "evaluate", "render"])
+def test_help_says_what_an_error_at_the_start_is_measured_from(command: str) -> None:
+    _, text, _ = _answer(command, "--help")
+    assert "off the true joint positions where the sequence has them" in " ".join(text.replace("│", " ").split())
