@@ -48,6 +48,16 @@ def test_the_first_iterate_is_the_start_and_the_last_one_says_why_it_stopped(
     assert optimizer.step() is None
 
 
+def test_the_first_step_in_the_papers_setting_is_a_milliradian_or_a_tenth_of_a_millimetre(
+    sequence: Sequence, extractor: FeatureExtractor
+) -> None:
+    first, second = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings.paper(1))
+    step = np.abs(second.joint_positions()["PSM1"] - first.joint_positions()["PSM1"])
+    insertion = sequence.scene.arms[0].robot.joint_names.index("insertion")
+    assert step[insertion] == pytest.approx(1e-4, rel=1e-2)
+    assert np.delete(step, insertion).max() == pytest.approx(1e-3, rel=1e-2)
+
+
 def test_loss_falls_and_dice_rises(sequence: Sequence, extractor: FeatureExtractor) -> None:
     optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings.acs(iterations=20))
     first, *_ = list(optimizer)
