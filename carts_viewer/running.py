@@ -77,7 +77,7 @@ class OptimizerFactory:
         Raises:
             WeightsError: the networks cannot be loaded.
         """
-        used = {**asdict(settings), "free": asdict(free), "cameras": list(cameras)}
+        used = {**asdict(settings.resolved()), "free": asdict(free), "cameras": list(cameras)}
         return Provenance.made_by_optimizer(used, self.prepare().sha256)
 
     def make(
@@ -162,7 +162,7 @@ class OptimizerFactory:
             cameras=list(cameras),
         )
         used = {
-            **asdict(settings),
+            **asdict(settings.resolved()),
             "model": asdict(model),
             "free": asdict(free),
             "cameras": list(cameras),

@@ -92,7 +92,7 @@ class Calibrate:
             "domain": self.domain,
             "joint_prior_deg": self.joint_prior_deg,
             "free": asdict(self.free),
-            "optimizer": asdict(self.optimizer),
+            "optimizer": asdict(self.optimizer.resolved()),
         }
 
 

@@ -173,7 +173,7 @@ class Optimizing:
             "perturb_deg": asked.start.perturb_deg,
             "seed": asked.start.seed,
             "free": asdict(asked.free),
-            "optimizer": asdict(asked.optimizer),
+            "optimizer": asdict(asked.optimizer.resolved()),
         }
         if asked.mode == "sequence":
             keyframes = asked.keyframes and hashlib.sha256(asked.keyframes.read_bytes()).hexdigest()

@@ -97,7 +97,9 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
 def remark(before: Scene, result: CalibrationResult) -> str | None:
     """What to know before the calibration is used; None where only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
-        return "The start was kept: no step made these frames fit better, so the calibration is as it was."
+        return (
+            "The start was kept: nothing that was tried made these frames fit better, so the calibration is as it was."
+        )
     if not moved_frames(before, result.scene):
         return None
     return (

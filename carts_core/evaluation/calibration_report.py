@@ -83,11 +83,13 @@ def _unknowns_figure(result: CalibrationResult) -> Figure:
 
 def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]) -> str:
     cameras = _cameras(residuals)
+    unchanged = not any(unknown.change for unknown in result.unknowns)
+    which = "The calibration, as it was," if unchanged else "The new calibration"
     lines = [
         f"# Calibration of {sequence.name}",
         "",
         f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
-        f"{result.stop_reason}. The new calibration is in `sequence.toml`, all numbers are in `calibration.json`.",
+        f"{result.stop_reason}. {which} is in `sequence.toml`, all numbers are in `calibration.json`.",
         "",
         "| mean over the frames | before | after |",
         "|---|---|---|",

@@ -38,6 +38,7 @@ class Stage:
         window: Window,
         observed: Float[Tensor, "cameras 6 h w"],
         weight: Float[Tensor, "cameras 1 h w"],
+        certainty: Float[Tensor, "cameras 1 h w"],
         blur: float,
         settings: OptimizerSettings,
     ) -> None:
@@ -53,6 +54,8 @@ class Stage:
             scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=observed.device
         )
         self._weight = functional.avg_pool2d(weight, factor)
+        self.certainty = functional.avg_pool2d(certainty, factor)
+        """What a pixel tells, as a share of what it would tell in a clear image [1]."""
         maps = functional.avg_pool2d(observed * weight, factor)
         self._observed = compared(smoothed(maps, self._blur))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=maps.device)
@@ -67,7 +70,7 @@ class Stage:
         for first in range(0, len(states.intrinsics), at_once):
             part = states.map(lambda values, first=first: values[first : first + at_once])
             _, squared, ratio = self._difference(self.renderer.surface_maps(part))
-            found.append(0.5 * self.area * (squared * ratio).flatten(1).sum(1))
+            found.append(0.5 * self.area * (squared * ratio * self.certainty).flatten(1).sum(1))
         return torch.cat(found)
 
     def compare(self, state: SceneState, *, gradient: bool) -> "Comparison":
@@ -80,15 +83,15 @@ class Stage:
         rendering = self.renderer.surface(state, APART if gradient else None, margin)
         model, squared, ratio = self._difference(rendering.maps)
         comparison = Comparison(
-            0.5 * self.area * float((squared * ratio).sum()),
+            0.5 * self.area * float((squared * ratio * self.certainty).sum()),
             rendering,
             (1.0 - squared[:, 0]).clamp(min=-1.0),
-            (ratio.square() * self._weight)[:, 0],
+            (ratio.square() * self._weight * self.certainty)[:, 0],
         )
         if not gradient:
             return comparison
         residual = self._observed - model
-        weight = ratio.square() * self._channels * self._precision
+        weight = ratio.square() * self._channels * self._precision * self.certainty
         grown = torch.zeros_like(residual)
         grown[:, COVERAGE.start] = _growth(model[:, COVERAGE.start]) / math.sqrt(self.area)
         # Half of the states around it are an unknown each.
@@ -136,7 +139,7 @@ class Comparison:
     """How a state compares with what is observed, in one stage."""
 
     cost: float
-    """Half the sum of robust squared residuals [px of the working image]."""
+    """Half the sum of robust squared residuals, each as far as it is believed [px of the working image]."""
     rendering: SurfaceRendering
     similarity: Float[Tensor, "cameras h w"]
     trust: Float[Tensor, "cameras h w"]

@@ -75,9 +75,8 @@ class _Scale:
     images: Float[Tensor, "cameras 3 h w"]
     weight: Float[Tensor, "cameras 1 h w"]
     """0 where an occluder is known to be, 1 elsewhere."""
-    fine_weight: Float[Tensor, "cameras 1 h w"]
-    """The same, less under smoke and haze. For all looks but the first ones: these search, and what they see under a
-    veil is better than nothing; later ones decide."""
+    certainty: Float[Tensor, "cameras 1 h w"]
+    """What a pixel tells, as a share of what it would tell without smoke and haze [1]."""
     whole: Renderer
     """Of the whole image."""
 
@@ -91,10 +90,10 @@ class _View:
     window: Window
     coverage: Float[Tensor, "cameras h w"]
     """Of all arms, in the window."""
-    seen: tuple[Float[Tensor, "cameras 6 h w"], Float[Tensor, "cameras 1 h w"]]
-    """The surface map and what each pixel counts, in the window."""
+    seen: tuple[Float[Tensor, "cameras 6 h w"], Float[Tensor, "cameras 1 h w"], Float[Tensor, "cameras 1 h w"]]
+    """The surface map, what each pixel counts, and how far it is believed, in the window."""
     area: float
-    """Of what is seen of arms and counts [px of the working image]."""
+    """Of what is seen of arms, as far as it counts and is believed [px of the working image]."""
     stages: list[Stage]
     shown: Stage | None
     """What iterates are seen in; None for the stage that they are compared in."""
@@ -188,13 +187,13 @@ class SurfaceObjective:
             size = working_size(scene, round(settings.working_width * zoom), self._extractor.stride)
             stacked = stacked_images(scene, images, size, "image").to(device)
             through = transmission(stacked, settings.unveil)
-            weight = pixel_weights(scene, ignore, size).to(device)
             self._scales[zoom] = _Scale(
                 zoom=size[0] / unit,
                 size=size,
                 images=unveiled(stacked, through),
-                weight=weight,
-                fine_weight=weight * certainty(through),
+                weight=pixel_weights(scene, ignore, size).to(device),
+                # Smoke, which the network has not seen, misleads it by more than noise: measured, docs/architecture.md.
+                certainty=certainty(through).square(),
                 whole=Renderer(scene, width=size[0], height=size[1], device=device),
             )
         return self._scales[zoom]
@@ -347,9 +346,11 @@ class SurfaceObjective:
         observed = self._extractor.surface(window.of(scale.images), window.of(believed))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
+        weight = window.of(scale.weight) * near[:, None]
+        # A look that others follow up searches, and what it sees under a veil is better than nothing.
         decides = later or look == self.look(self.stages - 1)
-        weight = window.of(scale.fine_weight if decides else scale.weight) * near[:, None]
-        seen = observed, weight
+        certain = window.of(scale.certainty) if decides else torch.ones_like(weight)
+        seen = observed, weight, certain
         blurs = [blur for number, blur in self._plan if number == look]
         stages = [
             Stage(self.scene, scale.size, scale.zoom, window, *seen, blur, self._of(blur, whole)) for blur in blurs
@@ -360,7 +361,7 @@ class SurfaceObjective:
             finer = self._plan[len(blurs)][1]
             shown = Stage(self.scene, scale.size, scale.zoom, window, *seen, finer, self.settings)
         coverage = observed[:, COVERAGE].sum(1)
-        area = float((coverage * weight[:, 0]).sum()) / scale.zoom**2
+        area = float((coverage * (weight * certain)[:, 0]).sum()) / scale.zoom**2
         self._view = _View(look, scale, window, coverage, seen, area, stages, shown)
 
     def _of(self, blur: float, whole: bool) -> OptimizerSettings:
@@ -391,7 +392,9 @@ class SurfaceObjective:
                     _OUTLINE * compared.outline,
                 )
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
-        area = 0.5 * max(float(coverage.sum()) * shown.area + self._viewed.area, 1.0)
+        # Weighted as the cost is, so that losses compare between clear images and veiled ones.
+        rendered = float((coverage * shown.certainty[:, 0]).sum()) * shown.area
+        area = 0.5 * max(rendered + self._viewed.area, 1.0)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(

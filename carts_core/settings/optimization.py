@@ -179,6 +179,10 @@ class OptimizerSettings:
             return self.solver
         return "gauss_newton" if self.loss == "surface" else "adam"
 
+    def resolved(self) -> "OptimizerSettings":
+        """These settings with the solver that `auto` stands for: what is kept of a run."""
+        return replace(self, solver=self.chosen_solver)
+
     @property
     def needs_background(self) -> bool:
         """Whether the loss compares images, which takes the mean background."""

@@ -202,7 +202,7 @@ def test_many_states_are_compared_at_once_as_each_alone(
     parameters = ParameterVector(scene, scene.state(frame.measured), FreeParameters(), 0.15)
     observed = Renderer(scene).surface_maps(scene.state(frame.truth or {}))
     weight, window = torch.ones_like(observed[:, :1]), Window(0, 0, 320, 240)
-    stage = Stage(scene, (320, 240), 1.0, window, observed, weight, 4.0, OptimizerSettings())
+    stage = Stage(scene, (320, 240), 1.0, window, observed, weight, torch.ones_like(weight), 4.0, OptimizerSettings())
     offsets = torch.linspace(-0.1, 0.1, 5)[:, None] * torch.ones(len(parameters))
     costs = stage.costs(parameters.state(offsets))
     alone = [stage.compare(parameters.state(each), gradient=False).cost for each in offsets]
