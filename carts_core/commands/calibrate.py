@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from ..errors import SettingsError
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
-from .selection import Network, Selection, SequencePath
+from .selection import Network, Selection, SequencePath, check_second_order
 
 if TYPE_CHECKING:
     from ..data import Sequence
@@ -44,6 +44,9 @@ class Calibrate:
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = CALIBRATION_SETTINGS
+
+    def __post_init__(self) -> None:
+        check_second_order("a calibration", self.optimizer)
 
     def run(self) -> None:
         """Calibrate; on Ctrl-C or an error nothing is written."""

@@ -13,7 +13,7 @@ from rich.progress import track
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from ..wording import counted
-from .selection import Mode, Network, Perturbation, Selection, SequencePath
+from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_second_order, check_writable
 
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
@@ -41,6 +41,10 @@ class Evaluate:
     def __post_init__(self) -> None:
         if self.json is not None and self.json.is_dir():
             raise SettingsError(f"--json {self.json} is a folder. Name a file.")
+        if self.json is not None:
+            check_writable(self.json.parent)
+        if self.mode == "sequence":
+            check_second_order("--mode sequence", self.optimizer)
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""

@@ -10,6 +10,7 @@ from ..errors import SettingsError
 from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv, write_bytes
 from ..rendering import Renderer
 from ..scene import SceneState
+from .selection import check_writable
 
 
 class FrameFolder:
@@ -28,12 +29,13 @@ class FrameFolder:
         rows: what is in the table.
 
     Raises:
-        SettingsError: the folder holds results of other settings.
+        SettingsError: the folder holds results of other settings, or cannot be written to.
     """
 
     def __init__(
         self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, settings: dict[str, Any], overwrite: bool
     ) -> None:
+        check_writable(folder)
         self.folder = folder
         self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
         self._scene = sequence.scene.with_cameras(cameras)

@@ -27,8 +27,8 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     if not kept:
         return None
     return (
-        f"{where}: in {kept} of {counted(len(stopped), 'run')} the start was kept, which the image does not contradict "
-        "enough to leave it (--keep-start)."
+        f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}, as the image hardly speaks against "
+        "it there; --keep-start 0 always moves."
     )
 
 

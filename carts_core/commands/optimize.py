@@ -8,7 +8,7 @@ import tyro
 
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .selection import Mode, Network, Perturbation, Selection, SequencePath
+from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_second_order
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Optimize:
     def __post_init__(self) -> None:
         if self.keyframes is not None and self.mode != "sequence":
             raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
+        if self.mode == "sequence":
+            check_second_order("--mode sequence", self.optimizer)
 
     def run(self) -> None:
         """Optimize what is not there yet."""

@@ -85,9 +85,10 @@ class Optimizing:
         elif todo:
             # Every frame depends on all others, so one that is missing has all of them done again.
             self._as_sequence(part)
-        self._console.print(
-            f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
-        )
+        if todo:
+            self._console.print(
+                f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
+            )
 
     def _each_alone(self, todo: list[int], part: _Part) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras

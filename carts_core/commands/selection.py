@@ -1,5 +1,6 @@
 """Which frames, cameras and domains a command works on, and from where. Shared by commands, declared once."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..errors import SettingsError
+from ..settings import OptimizerSettings
 
 if TYPE_CHECKING:
     from ..data import Sequence
@@ -138,6 +140,34 @@ def check_device(device: str) -> None:
         return
     known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
     raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")
+
+
+def check_second_order(what: str, settings: OptimizerSettings) -> None:
+    """See that settings are of the one solver that knows how certain it is.
+
+    Args:
+        what: needs that.
+        settings: of the optimizer.
+
+    Raises:
+        SettingsError: they are of another solver or loss.
+    """
+    if settings.chosen_solver != "gauss_newton":
+        raise SettingsError(
+            f"{what} needs gauss_newton and surface; given are --solver {settings.solver} and --loss {settings.loss}. "
+            "Leave both out."
+        )
+
+
+def check_writable(folder: Path) -> None:
+    """See that a folder can be written to or made, before any work is done.
+
+    Raises:
+        SettingsError: it cannot.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK)):
+        raise SettingsError(f"{folder} cannot be made or written to, because of {there}. Name another folder.")
 
 
 SequencePath = Annotated[Path, tyro.conf.Positional]

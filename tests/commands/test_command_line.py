@@ -69,7 +69,7 @@ def test_a_start_that_was_kept_is_told(
 ) -> None:
     output = ["--output", str(tmp_path / "out")] if command == "optimize" else ["--json", str(tmp_path / "out.json")]
     main([command, sequence, "--frames", "0", "--perturb-deg", "0.001", *output])
-    assert "left: in 1 of 1 run the start was kept" in " ".join(capsys.readouterr().out.split())
+    assert "left: the start was kept in 1 of 1 run" in " ".join(capsys.readouterr().out.split())
     if command == "evaluate":
         (score,) = json.loads((tmp_path / "out.json").read_text())["frames"]
         assert score["stopped"] == "start kept"

@@ -81,6 +81,22 @@ def test_edges_of_an_occluder_do_not_count(sequence: Sequence) -> None:
     assert drawn.offsets.abs().max() == 0
 
 
+def test_edges_under_a_veil_count_by_the_square_of_what_comes_through(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carts_core.optimization.edges.unveiled", lambda images, _: images)
+    found = []
+    for through in (1.0, 0.5):
+        monkeypatch.setattr(
+            "carts_core.optimization.edges.transmission",
+            lambda images, _, t=through: t * torch.ones_like(images[:, :1]),
+        )
+        found.append(draw(sequence, settings={"edge_steps": 1})[0].curvature)
+    clear, veiled = found
+    assert clear.abs().max() > 0
+    torch.testing.assert_close(veiled, 0.25 * clear)
+
+
 def test_edges_where_the_network_sees_no_arm_do_not_count(sequence: Sequence) -> None:
     drawn, _ = draw(sequence, seen=torch.zeros(1, 360, 480))
     assert drawn.offsets.abs().max() == 0

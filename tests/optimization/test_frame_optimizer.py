@@ -131,20 +131,6 @@ def test_the_default_solver_raises_dice_on_every_device(sequence: Sequence, devi
         assert after > before
 
 
-def test_gauss_newton_refuses_a_loss_without_residuals() -> None:
-    with pytest.raises(SettingsError, match="solver is 'gauss_newton'; allowed is auto, adam, gradient_descent or"):
-        OptimizerSettings(loss="acs", solver="gauss_newton")
-
-
-def test_a_solver_that_is_not_chosen_follows_the_loss() -> None:
-    assert OptimizerSettings().chosen_solver == "gauss_newton"
-    assert OptimizerSettings(loss="l1").chosen_solver == "adam"
-    assert OptimizerSettings(loss="l1", solver="gradient_descent").chosen_solver == "gradient_descent"
-    chosen = OptimizerSettings(solver="gauss_newton").with_loss("acs")
-    assert chosen.chosen_solver == "adam" and chosen.with_loss("surface").chosen_solver == "gauss_newton"
-    assert OptimizerSettings(solver="none").with_loss("acs").chosen_solver == "none"
-
-
 def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: FeatureExtractor) -> None:
     frame = sequence.frame(0, cameras=["left"])
     mask = (frame.masks or {})["left"]

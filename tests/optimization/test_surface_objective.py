@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -211,6 +212,33 @@ def test_many_states_are_compared_at_once_as_each_alone(
     assert len({round(cost, 1) for cost in alone}) == len(alone)
     monkeypatch.setattr("carts_core.optimization.comparison._STATES_AT_ONCE", 2)
     assert torch.equal(stage.costs(parameters.state(offsets)), costs), "in parts where they are too many"
+
+
+def test_what_is_seen_through_a_veil_counts_less_in_looks_that_decide(
+    sequence: Sequence, sight: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, scene = sequence.frame(0), sequence.scene
+    parameters = ParameterVector(scene, scene.state(frame.measured), FreeParameters(), 0.15)
+    at = torch.zeros(len(parameters))
+    # These eyes see the same through any veil, so all that changes is how far they are believed.
+    found = {}
+    for through in (1.0, 0.5):
+        constant = partial(torch.full_like, fill_value=through)
+        monkeypatch.setattr(
+            "carts_core.optimization.surface_objective.transmission", lambda images, _, c=constant: c(images[:, :1])
+        )
+        objective = SurfaceObjective(scene, frame.images, sight, parameters, OptimizerSettings(), live=False)
+        prior = objective(at, 0, gradient=False).prior
+        assert prior == 0
+        found[through] = [objective(at, stage, gradient=True) for stage in (0, objective.stages - 1)]
+    precision = torch.diag(parameters.prior_precision(OptimizerSettings().prior_deg))
+    for (clear, veiled), share in zip(zip(found[1.0], found[0.5], strict=True), (1.0, 0.5**4), strict=True):
+        assert clear.curvature is not None and veiled.curvature is not None
+        torch.testing.assert_close(
+            veiled.curvature - precision, share * (clear.curvature - precision), rtol=1e-3, atol=1.0
+        )
+        torch.testing.assert_close(veiled.gradient, share * clear.gradient, rtol=1e-3, atol=1e-2)
+        assert veiled.loss == pytest.approx(clear.loss, rel=1e-3), "losses compare"
 
 
 def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, sight: FeatureExtractor) -> None:

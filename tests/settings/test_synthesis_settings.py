@@ -1,9 +1,9 @@
-"""Settings."""
+"""Settings of a synthetic sequence."""
 
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.synthesis import DomainConfig, EndoscopeConfig, MotionConfig, SensorConfig, SynthesisConfig
+from carts_core.settings import DomainConfig, EndoscopeConfig, MotionConfig, SensorConfig, SynthesisConfig
 
 
 @pytest.mark.parametrize(
