@@ -151,13 +151,13 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
     tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement]
 ) -> None:
     benchmark = tiny_benchmark()
-    runs = [Run("synthetic", "regular", frame, "sequence", 2.0) for frame in (0, 1)]
+    runs = [Run("synthetic", "regular", frame, "sequence", 1.0) for frame in (0, 1)]
     benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
     benchmark.run(QUIET)
     first = benchmark.measurements()
     assert [entry.stopped for entry in first] == ["cold", "warm"]
     starts = [entry.start for entry in first]
-    assert all(start and start.joint_mae_deg == pytest.approx(2.0, abs=1e-3) for start in starts)
+    assert all(start and start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) for start in starts)
     lines = benchmark.results.path.read_bytes().splitlines(keepends=True)
     benchmark.results.path.write_bytes(lines[0])
     results = ResultsFile(benchmark.results.path)
