@@ -15,16 +15,14 @@ from torch import Tensor
 
 from ..features.extractor import FeatureExtractor
 from ..losses import attention
-from ..rendering import Renderer
 from ..scene import Scene
 from ..settings import OptimizerSettings
 from ..surface import COVERAGE
 from .comparison import Stage
 from .evaluation import Evaluation
-from .inputs import pixel_weights, stacked_images, working_size
 from .observability import uncertainty
 from .parameters import ParameterVector
-from .veil import certainty, transmission, unveiled
+from .scale import Scale, scaled
 from .window import Window
 
 _MARGIN = (27, 16)
@@ -65,28 +63,11 @@ says how near an arm is, so it matters most to the joints that move it along the
 
 
 @dataclass(frozen=True)
-class _Scale:
-    """The images in a size in which they are compared."""
-
-    zoom: float
-    """How many times larger than the working image [1]."""
-    size: tuple[int, int]
-    """Width and height [px]."""
-    images: Float[Tensor, "cameras 3 h w"]
-    weight: Float[Tensor, "cameras 1 h w"]
-    """0 where an occluder is known to be, 1 elsewhere."""
-    certainty: Float[Tensor, "cameras 1 h w"]
-    """What a pixel tells, as a share of what it would tell without smoke and haze [1]."""
-    whole: Renderer
-    """Of the whole image."""
-
-
-@dataclass(frozen=True)
 class _View:
     """What the network saw in a look at the image."""
 
     look: int
-    scale: _Scale
+    scale: Scale
     window: Window
     coverage: Float[Tensor, "cameras h w"]
     """Of all arms, in the window."""
@@ -152,7 +133,7 @@ class SurfaceObjective:
         self._begun_at: Tensor | None = None
         self.stages = len(self._plan)
         self._given = images, ignore or {}
-        self._scales: dict[float, _Scale] = {}
+        self._scales: dict[float, Scale] = {}
         self._scale(0)
         self._prior = parameters.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         self._view: _View | None = None
@@ -177,25 +158,13 @@ class SurfaceObjective:
             first = next(index for index, (number, _) in enumerate(self._plan) if number == look)
             return self._evaluate(offsets, self._viewed.stages[stage - first], gradient)
 
-    def _scale(self, look: int) -> _Scale:
+    def _scale(self, look: int) -> Scale:
         """The images as a look sees them."""
-        settings, scene, device = self.settings, self.scene, self._extractor.device
-        zoom = settings.zoom if look >= self.first_look else min(settings.zoom, _GLANCE_ZOOM)
+        zoom = self.settings.zoom
+        if look < self.first_look:
+            zoom = min(zoom, _GLANCE_ZOOM)
         if zoom not in self._scales:
-            images, ignore = self._given
-            unit, _ = working_size(scene, settings.working_width, self._extractor.stride)
-            size = working_size(scene, round(settings.working_width * zoom), self._extractor.stride)
-            stacked = stacked_images(scene, images, size, "image").to(device)
-            through = transmission(stacked, settings.unveil)
-            self._scales[zoom] = _Scale(
-                zoom=size[0] / unit,
-                size=size,
-                images=unveiled(stacked, through),
-                weight=pixel_weights(scene, ignore, size).to(device),
-                # Smoke, which the network has not seen, misleads it by more than noise: measured, docs/architecture.md.
-                certainty=certainty(through).square(),
-                whole=Renderer(scene, width=size[0], height=size[1], device=device),
-            )
+            self._scales[zoom] = scaled(self.scene, *self._given, zoom, self.settings, self._extractor)
         return self._scales[zoom]
 
     @property

@@ -225,7 +225,7 @@ def test_what_is_seen_through_a_veil_counts_less_in_looks_that_decide(
     for through in (1.0, 0.5):
         constant = partial(torch.full_like, fill_value=through)
         monkeypatch.setattr(
-            "carts_core.optimization.surface_objective.transmission", lambda images, _, c=constant: c(images[:, :1])
+            "carts_core.optimization.scale.transmission", lambda images, _, c=constant: c(images[:, :1])
         )
         objective = SurfaceObjective(scene, frame.images, sight, parameters, OptimizerSettings(), live=False)
         prior = objective(at, 0, gradient=False).prior
