@@ -201,6 +201,8 @@ class SequenceRun:
     def status(self) -> str:
         """How it goes, for people."""
         done, total = self._optimizer.progress
+        if done == 0:
+            return "Looking at some frames to find where to begin"
         if done == total:
             return f"All {total} frames seen, looking again where they disagree"
         seconds = (total - done) / self._optimizer.frames_per_second

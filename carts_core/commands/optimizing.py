@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress, track
 
 from ..data import Sequence
 from ..evaluation import Starts, camera_groups, start_positions
@@ -133,8 +133,10 @@ class Optimizing:
             cameras=cameras,
         )
         try:
-            for _ in track(optimizer, part.name, total=len(frames), console=self._console):
-                pass
+            with Progress(console=self._console) as bar:
+                task = bar.add_task(part.name, total=len(frames))
+                for _ in optimizer:
+                    bar.update(task, completed=optimizer.progress[0])
         finally:
             # Ctrl-C keeps what is there.
             part.output.write(

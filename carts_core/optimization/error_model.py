@@ -129,6 +129,19 @@ def combined(belief: Gaussian, information: Information, C: Float[np.ndarray, "m
     return Gaussian(mean, 0.5 * (covariance + covariance.T))
 
 
+def news(seconds: float, memory: float) -> float:
+    """Share of a frame's information that those before it have not told already [1].
+
+    Errors of images are alike for a while: an autoregressive process of first order, whose mean over many frames is as
+    certain as that of (1 - r) / (1 + r) times as many independent ones, with r = exp(-seconds / memory).
+
+    Args:
+        seconds: since the frame before [s].
+        memory: time after which the correlation has fallen to 1/e [s].
+    """
+    return math.tanh(0.5 * seconds / memory)
+
+
 def without(smoothed: Gaussian, own: Information) -> Gaussian:
     """What the other frames say of a correction, from what all say and what its own frame says."""
     precision = np.linalg.inv(smoothed.covariance)

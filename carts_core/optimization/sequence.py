@@ -14,11 +14,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..data import Frame
-from ..errors import SettingsError
+from ..data.background import spread
+from ..errors import CartsError, SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .error_model import ErrorModel, Gaussian, Information, combined, without
+from .beginning import suiting_all
+from .error_model import ErrorModel, Gaussian, Information, combined, news, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
 from .sight import Eye, Ignore, Sight
@@ -55,7 +57,7 @@ class FrameEstimate:
 
 @dataclass(frozen=True)
 class _Visit:
-    """What is kept of a frame that was seen."""
+    """What is kept of a frame that was seen, or asked for its opinion."""
 
     frame_id: str
     parameters: ParameterVector
@@ -67,9 +69,10 @@ class _Visit:
 class SequenceOptimizer:
     """Corrects the frames of a sequence one after another.
 
-    A frame starts at the correction that the frames before it let expect, and is held there as firmly as they know it.
-    After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what came of it is
-    visited again. Frames in `keyframes` stay exactly as given, and everything else follows them.
+    A few frames, evenly spread, are looked at alone first, and what suits all of them best is where the first frame
+    starts. A later frame starts at the correction that the frames before it let expect, and is held there as firmly as
+    they know it. After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what
+    came of it is visited again. Frames in `keyframes` stay exactly as given, and everything else follows them.
 
     Args:
         scene: arms and cameras.
@@ -123,11 +126,19 @@ class SequenceOptimizer:
             raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
         self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}))
         self._queue = list(self._gaps)
+        self._news = {index: news(gap, self.model.image_seconds) for index, gap in self._gaps.items()}
+        self._news[self._queue[0]] = 1.0
+        asked = [self._queue[place] for place in spread(len(self._queue), self.model.opinions)]
+        # A frame that is alone, or that a person began with, needs no other opinion.
+        self._to_ask = asked if len(asked) > 1 and self._queue[0] not in self._keyframes else []
+        self._asked: dict[int, _Visit] = {}
+        self._begin_at: np.ndarray | None = None
         _, parameters = self._open(self._queue[0])
         precision = parameters.prior_precision(
             self.model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
         )
         self._errors = ErrorModel(self.model, precision.cpu().double().numpy() ** -0.5)
+        self._fresh = self._errors.correction(self._errors.initial())
         self._visits: dict[int, _Visit] = {}
         self._beliefs: list[Gaussian] = []
         self._stale = False
@@ -137,7 +148,7 @@ class SequenceOptimizer:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Frames that were visited, and all frames; contradicted ones are visited again after that."""
+        """Frames that were visited, and all frames; some are looked at before, and contradicted ones again after."""
         return len(self._visits), len(self._gaps)
 
     @property
@@ -151,7 +162,9 @@ class SequenceOptimizer:
         """Position -> estimate of every frame visited so far, in the light of all of them; ordered as visited."""
         if self._estimates is None:
             corrections = self._smoothed()
-            self._estimates = {index: self._estimate(index, corrections[index]) for index in corrections}
+            self._estimates = {
+                index: self._estimate(index, self._visits[index], corrections[index]) for index in corrections
+            }
         return dict(self._estimates)
 
     def cancel(self) -> None:
@@ -166,10 +179,14 @@ class SequenceOptimizer:
     def step(self) -> FrameEstimate | None:
         """Visit the next frame; None once all is done.
 
-        The estimate knows the frames visited before it; those in `estimates` know all others.
+        The first steps look at a few frames alone, and what they return is not among `estimates`. After them the
+        estimate knows the frames visited before it; those in `estimates` know all others.
         """
         if self.stop_reason is not None:
             return None
+        while self._to_ask:
+            if (opinion := self._ask(self._to_ask.pop(0))) is not None:
+                return opinion
         if self._queue:
             return self._visit(self._queue.pop(0))
         if self._revisits is None:
@@ -179,11 +196,29 @@ class SequenceOptimizer:
         self.stop_reason = "finished"
         return None
 
+    def _ask(self, index: int) -> FrameEstimate | None:
+        """What a frame alone says; None if it cannot be read, which is told when its turn comes."""
+        began = time.perf_counter()
+        try:
+            frame, parameters = self._open(index)
+        except CartsError:
+            return None
+        start: Start = "keyframe" if index in self._keyframes else "cold"
+        if start == "keyframe":
+            sight = self._keyframe(frame, parameters, self._fresh)
+        else:
+            sight = self._eye.cold(frame, parameters, self._fresh, quick=True)
+        visit = self._asked[index] = _Visit(frame.frame_id, parameters, sight, start, time.perf_counter() - began)
+        return self._estimate(index, visit, combined(self._fresh, sight.information))
+
     def _visit(self, index: int) -> FrameEstimate:
         began = time.perf_counter()
+        if self._asked and not self._visits:
+            opinions = {asked: visit.sight.correction for asked, visit in self._asked.items()}
+            self._begin_at = suiting_all(opinions, self._eye, self._open, self._fresh, self.model.cold_factor)
         frame, parameters = self._open(index)
         errors = self._errors
-        fresh = expected = errors.initial()
+        expected = errors.initial()
         if self._beliefs:
             expected = errors.predicted(self._beliefs[-1], self._gaps[index])
         hoped = errors.correction(expected)
@@ -191,34 +226,41 @@ class SequenceOptimizer:
             start: Start = "keyframe"
             sight = self._keyframe(frame, parameters, hoped)
         else:
-            start, sight, lost = self._look(frame, parameters, hoped, errors.correction(fresh))
+            start, sight, lost = self._look(frame, parameters, hoped)
             if self._beliefs and sight.information.surprise(hoped) > _SURPRISE:
                 # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
                 if lost:
                     start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
                 else:
-                    self._gaps[index], expected = math.inf, fresh
-        self._beliefs.append(errors.updated(expected, sight.information))
+                    self._gaps[index], self._news[index], expected = math.inf, 1.0, errors.initial()
+        self._beliefs.append(errors.updated(expected, sight.information.scaled(self._news[index])))
         self._estimates = None
-        self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, time.perf_counter() - began)
-        return self._estimate(index, errors.correction(self._beliefs[-1]))
+        seconds = time.perf_counter() - began
+        if index in self._asked:
+            seconds += self._asked[index].seconds
+            sight = replace(sight, iterations=sight.iterations + self._asked[index].sight.iterations)
+        visit = self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
+        return self._estimate(index, visit, combined(errors.correction(expected), sight.information))
 
-    def _look(
-        self, frame: Frame, parameters: ParameterVector, expected: Gaussian, fresh: Gaussian
-    ) -> tuple[Start, Sight, bool]:
+    def _look(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> tuple[Start, Sight, bool]:
         """Look warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
         if not self._beliefs:
-            return "cold", self._eye.cold(frame, parameters, fresh), False
+            return "cold", self._first_look(frame, parameters), False
         losses = [visit.sight.loss for visit in self._visits.values() if visit.start != "carried"]
         usual = self.model.cold_factor * statistics.median(losses or [math.inf])
         warm = self._eye.warm(frame, parameters, expected, expected.mean)
         if warm.loss <= usual:
             return "warm", warm, False
-        cold = self._eye.cold(frame, parameters, fresh)
+        cold = self._eye.cold(frame, parameters, self._fresh)
         best = min(warm, cold, key=lambda sight: sight.loss)
         best = replace(best, iterations=warm.iterations + cold.iterations)
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
         return "warm" if best.loss == warm.loss else "cold", best, lost
+
+    def _first_look(self, frame: Frame, parameters: ParameterVector) -> Sight:
+        if self._begin_at is None:
+            return self._eye.cold(frame, parameters, self._fresh)
+        return self._eye.warm(frame, parameters, self._fresh, self._begin_at)
 
     def _keyframe(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
         given = self._keyframes[frame.index]
@@ -233,17 +275,25 @@ class SequenceOptimizer:
         return frame, ParameterVector(self._scene, state, self._free, self.settings.lever)
 
     def _smoothed(self) -> dict[int, Gaussian]:
-        """Corrections of all visited frames, each in the light of all of them."""
+        """Corrections of all visited frames, each in the light of all of them.
+
+        Frames tell others what is new in them only, and themselves all they show.
+        """
         if not self._visits:
             return {}
         gaps = [self._gaps[index] for index in self._visits]
         if self._stale:
             self._beliefs, belief = [], self._errors.initial()
-            for visit, gap in zip(self._visits.values(), gaps, strict=True):
-                belief = self._errors.updated(self._errors.predicted(belief, gap), visit.sight.information)
+            for (index, visit), gap in zip(self._visits.items(), gaps, strict=True):
+                told = visit.sight.information.scaled(self._news[index])
+                belief = self._errors.updated(self._errors.predicted(belief, gap), told)
                 self._beliefs.append(belief)
             self._stale = False
-        return dict(zip(self._visits, self._errors.smoothed(self._beliefs, gaps), strict=True))
+        smoothed = zip(self._visits.items(), self._errors.smoothed(self._beliefs, gaps), strict=True)
+        return {
+            index: combined(belief, visit.sight.information.scaled(1.0 - self._news[index]))
+            for (index, visit), belief in smoothed
+        }
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
         """Frames whose image does not fit what all frames together say, and what the others say of them."""
@@ -265,12 +315,11 @@ class SequenceOptimizer:
             start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
         sight = replace(sight, iterations=earlier.sight.iterations + sight.iterations)
         seconds = earlier.seconds + time.perf_counter() - began
-        self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
+        visit = self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
         self._stale, self._estimates = True, None
-        return self._estimate(index, combined(expected, sight.information))
+        return self._estimate(index, visit, combined(expected, sight.information))
 
-    def _estimate(self, index: int, correction: Gaussian) -> FrameEstimate:
-        visit = self._visits[index]
+    def _estimate(self, index: int, visit: _Visit, correction: Gaussian) -> FrameEstimate:
         offsets = torch.from_numpy(correction.mean).to(visit.parameters.lower)
         state = visit.parameters.state(visit.parameters.clamp(offsets)).detached()
         known = self._uncertainty(visit.parameters, correction)
@@ -297,8 +346,7 @@ class SequenceOptimizer:
 
     def _uncertainty(self, parameters: ParameterVector, correction: Gaussian) -> Uncertainty:
         scales = parameters.scales.cpu().double().numpy()
-        fresh = self._errors.correction(self._errors.initial())
-        std, expected = (np.sqrt(g.covariance.diagonal().clip(min=0.0)) * scales for g in (correction, fresh))
+        std, expected = (np.sqrt(g.covariance.diagonal().clip(min=0.0)) * scales for g in (correction, self._fresh))
         return Uncertainty(tuple(parameters.names), tuple(std.tolist()), tuple(expected.tolist()))
 
 

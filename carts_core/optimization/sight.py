@@ -1,6 +1,6 @@
 """What one frame's images say of its correction, near a place where it is looked for."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +62,7 @@ class Eye:
             stage_iterations=min(settings.stage_iterations, _WARM_STEPS),
             tolerance=max(settings.tolerance, _WARM_TOLERANCE),
         )
+        self._quick, self._glimpse = (replace(self._coarse, zoom=1.0), replace(self._fine, zoom=1.25))
 
     def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
         """Find the correction near `start` [n]."""
@@ -89,11 +90,12 @@ class Eye:
         information = Information(seen.precision + precision, seen.vector + vector)
         return replace(end, correction=correction, information=information)
 
-    def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
-        """Find the correction from the measured values on, coarse to fine."""
+    def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, *, quick: bool = False) -> Sight:
+        """Find the correction from the measured values on, coarse to fine; quick in smaller images, up to the end."""
+        settings = self._quick if quick else self._coarse
         parameters.prior = _prior(expected, parameters)
-        objective = self._objective(frame, parameters, self._coarse)
-        found = _descend(objective, parameters, self._coarse, np.zeros(len(parameters)))
+        objective = self._objective(frame, parameters, settings)
+        found = _descend(objective, parameters, settings, np.zeros(len(parameters)))
         end = self.warm(frame, parameters, expected, found.correction)
         return replace(end, iterations=found.iterations + end.iterations)
 
@@ -105,6 +107,18 @@ class Eye:
         evaluation = objective(offsets, objective.stages - 1, gradient=True)
         information = _information(offsets, evaluation, parameters).scaled(self._share)
         return Sight(correction, information, evaluation.loss, 0)
+
+    def losses(
+        self, frame: Frame, parameters: ParameterVector, expected: Gaussian, corrections: Sequence[np.ndarray]
+    ) -> list[float]:
+        """How badly given corrections [n] fit, in a smaller image; the network is told each before it looks."""
+        parameters.prior = _prior(expected, parameters)
+        objective, found = self._objective(frame, parameters, self._glimpse), []
+        for correction in corrections:
+            objective.forget()
+            offsets = parameters.clamp(torch.from_numpy(correction).to(parameters.lower))
+            found.append(objective(offsets, objective.stages - 1, gradient=False).loss)
+        return found
 
     def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
         ignore = self._ignore(frame.index)

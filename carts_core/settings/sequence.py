@@ -23,12 +23,18 @@ class SequenceSettings:
     """Deviation of the error that is new in every frame [deg]."""
     sight_noise: float = 4.0
     """As `noise`, for what a frame tells others; larger, since the errors of neighbouring pixels are alike [1]."""
+    image_seconds: float = 0.5
+    """Time after which errors of images are no longer alike (a correlation of 1/e); frames that follow each other
+    faster tell the others less [s]."""
+    opinions: int = 5
+    """How many frames, evenly spread, are looked at alone before the first one, which starts where suits all of them
+    best; 1 asks the first frame only [1]."""
     cold_factor: float = 2.0
     """A loss of that many times the usual one has a frame start cold [1]."""
     direction: Direction = "forward"
     """Where the first pass begins: at the first frame, or at the last one."""
-    frame_seconds: float = 0.04
-    """Time between frames, where the sequence does not tell [s]."""
+    frame_seconds: float = 0.25
+    """Time between frames, where the sequence does not tell; images without times are mostly a few per second [s]."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -45,6 +51,8 @@ _RANGES = {
     "drift_seconds": (1e-3, 1e6),
     "jitter_deg": (1e-3, 360.0),
     "sight_noise": (1e-3, 100.0),
+    "image_seconds": (1e-6, 1e6),
+    "opinions": (1, 1000),
     "cold_factor": (1.0, 100.0),
     "frame_seconds": (1e-6, 1e6),
 }

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, combined, without
+from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, combined, news, without
 from carts_core.settings import SequenceSettings
 
 N, FRAMES = 3, 5
@@ -112,3 +112,12 @@ def test_what_is_believed_less_says_the_same_less_firmly() -> None:
     shown = seen.precision @ np.linalg.pinv(seen.precision)
     np.testing.assert_allclose(shown @ free.mean, shown @ held.mean, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(less.precision, 0.25 * seen.precision)
+
+
+def test_news_of_correlated_errors_is_what_their_mean_becomes_certain_by() -> None:
+    frames, memory, gap = 2000, 0.5, 0.25
+    times = gap * np.arange(frames)
+    correlation = np.exp(-np.abs(times[:, None] - times) / memory)
+    variance_of_mean = correlation.mean()
+    assert variance_of_mean == pytest.approx(1.0 / (frames * news(gap, memory)), rel=2e-3)
+    assert news(math.inf, memory) == 1.0 and news(0.0, memory) == 0.0

@@ -11,7 +11,7 @@ import torch
 from perfect_sight import PerfectSight
 
 from carts_core.data import Frame, Sequence
-from carts_core.errors import RobotError, SettingsError
+from carts_core.errors import RobotError, SequenceError, SettingsError
 from carts_core.optimization import (
     FrameOptimizer,
     FreeParameters,
@@ -19,12 +19,14 @@ from carts_core.optimization import (
     SequenceOptimizer,
     SequenceSettings,
 )
+from carts_core.optimization.beginning import suiting_all
 from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.optimization.sight import Eye, Sight
 from carts_core.rendering import Renderer
 
 FRAMES = 6
+ALONE = SequenceSettings(opinions=1)
 ARM = "PSM1"
 WRIST_PITCH = 4
 
@@ -84,7 +86,7 @@ def wrist_hidden(sights: Sights, hidden: set[int]) -> Callable[[int], dict[str, 
 
 
 def test_a_constant_error_is_recovered_in_every_frame(sights: Sights) -> None:
-    sequence = optimizer(sights)
+    sequence = optimizer(sights, model=ALONE)
     steps = list(sequence)
     assert [step.index for step in steps[:FRAMES]] == list(range(FRAMES))
     assert [step.start for step in steps[:FRAMES]] == ["cold"] + ["warm"] * (FRAMES - 1)
@@ -151,7 +153,7 @@ def test_a_keyframe_stays_as_given_and_draws_the_others(sights: Sights) -> None:
 
 
 def test_cancelling_keeps_what_is_there(sights: Sights) -> None:
-    sequence = optimizer(sights)
+    sequence = optimizer(sights, model=ALONE)
     sequence.step()
     sequence.step()
     sequence.cancel()
@@ -166,9 +168,83 @@ def test_nothing_was_visited_yet(sights: Sights) -> None:
     assert sequence.estimates == {} and sequence.frames_per_second == 0
 
 
+def test_a_few_frames_are_asked_before_the_first_one(sights: Sights) -> None:
+    sequence = optimizer(sights, model=SequenceSettings(opinions=4))
+    opinions = [sequence.step() for _ in range(4)]
+    assert [(opinion.index, opinion.start) for opinion in opinions if opinion] == [(i, "cold") for i in (0, 2, 3, 5)]
+    assert sequence.progress == (0, FRAMES) and sequence.estimates == {} and sequence.frames_per_second == 0
+    first = sequence.step()
+    assert first is not None and (first.index, first.start) == (0, "cold")
+    list(sequence)
+    assert sequence.progress == (FRAMES, FRAMES)
+    # What was asked counts as time and steps of its frame.
+    assert opinions[1] is not None and sequence.estimates[2].iterations > opinions[1].iterations
+    assert sequence.estimates[2].seconds > opinions[1].seconds
+
+
+def test_a_frame_that_cannot_be_read_is_told_when_its_turn_comes(sights: Sights) -> None:
+    def load(index: int) -> Frame:
+        if index == FRAMES - 1:
+            raise SequenceError("frame 5 is broken")
+        return sights.load(index)
+
+    times = {index: float(index) for index in range(FRAMES)}
+    sequence = SequenceOptimizer(sights.sequence.scene, load, times, sights)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(SequenceError, match="frame 5 is broken"):
+        list(sequence)
+    assert list(sequence.estimates) == list(range(FRAMES - 1))
+
+
+@pytest.mark.parametrize("jumped", [False, True])
+def test_where_it_begins_suits_all_frames_that_were_asked(sights: Sights, jumped: bool) -> None:
+    """Frame 0 sees something else than the others, and believes it: it deceives, unless the error has jumped."""
+    scene, settings = sights.sequence.scene, OptimizerSettings()
+    right, wrong = np.zeros(7), np.deg2rad([-2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    truths = [sights.sequence.frame(index).truth or {} for index in range(FRAMES)]
+    if jumped:
+        sights.all[0] = PerfectSight(sights.sequence, scene.state({ARM: truths[0][ARM] + wrong})).maps
+    else:
+        sights.blind = {0}
+
+    def open_frame(index: int) -> tuple[Frame, ParameterVector]:
+        return sights.load(index), ParameterVector(scene, scene.state(truths[index]), FreeParameters(), settings.lever)
+
+    eye = Eye(scene, sights, settings, settings.noise, lambda _: {})  # pyright: ignore[reportArgumentType]
+    expected = Gaussian(np.zeros(7), np.eye(7) * np.deg2rad(2.0) ** 2)
+    found = suiting_all({0: wrong, 2: right, 4: right}, eye, open_frame, expected, allowance=2.0)
+    assert np.array_equal(found, wrong if jumped else right)
+
+
+def test_frames_in_quick_succession_tell_others_less(sights: Sights) -> None:
+    """Errors of images are alike for a while, so the same frames in a shorter time make nobody as certain."""
+    slow, fast = (SequenceSettings(opinions=1, image_seconds=memory) for memory in (0.01, 1.0))
+    stds = []
+    for model in (slow, fast):
+        sequence = optimizer(sights, model=model)
+        list(sequence)
+        stds.append(sequence.estimates[3].joint_std[ARM])
+    assert (stds[1] > 1.2 * stds[0]).any() and (stds[1] > 0.99 * stds[0]).all()
+
+
+def test_a_keyframe_at_the_beginning_asks_nobody(sights: Sights) -> None:
+    given = {ARM: (sights.sequence.frame(0).truth or {})[ARM]}
+    sequence = optimizer(sights, keyframes={0: given})
+    first = sequence.step()
+    assert first is not None and first.start == "keyframe" and sequence.progress == (1, FRAMES)
+
+
+def test_a_later_keyframe_is_an_opinion(sights: Sights) -> None:
+    given = {ARM: (sights.sequence.frame(5).truth or {})[ARM]}
+    sequence = optimizer(sights, model=SequenceSettings(opinions=2), keyframes={5: given})
+    cold, keyframe = sequence.step(), sequence.step()
+    assert cold is not None and keyframe is not None
+    assert (cold.start, keyframe.start) == ("cold", "keyframe")
+    assert np.array_equal(keyframe.joint_positions[ARM], given[ARM])
+
+
 def test_backward_begins_at_the_last_frame_and_ends_alike(sights: Sights) -> None:
-    model = SequenceSettings(direction="backward")
-    backward, forward = optimizer(sights, model=model), optimizer(sights)
+    model = replace(ALONE, direction="backward")
+    backward, forward = optimizer(sights, model=model), optimizer(sights, model=ALONE)
     steps = list(backward)
     list(forward)
     assert [step.index for step in steps[:FRAMES]] == list(reversed(range(FRAMES)))
@@ -195,7 +271,7 @@ def test_a_jump_of_the_error_begins_anew(sights: Sights) -> None:
 
 
 def test_locked_joints_stay_measured_and_have_no_deviation(sights: Sights) -> None:
-    sequence = optimizer(sights, free=FreeParameters(locked_joints=("roll",)))
+    sequence = optimizer(sights, model=ALONE, free=FreeParameters(locked_joints=("roll",)))
     sequence.step()
     (estimate,) = sequence.estimates.values()
     measured = sights.sequence.frame(0).measured[ARM]
