@@ -115,7 +115,7 @@ class Propagator:
         self._controller.change(playing=False, error=None)
         self._run = self._make(frames, kept)
         self._work = self._bits(self._run)
-        self._controller.change(busy=None, solve=SolveState(frames, text="Looking at some frames to find where to begin"))
+        self._controller.change(busy=None, solve=SolveState(frames, text="Looking at the first frame"))
 
     @handle.register
     def _(self, intent: ask.StopSolving) -> None:

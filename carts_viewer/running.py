@@ -205,7 +205,7 @@ class SequenceRun:
             return "Looking at some frames to find where to begin"
         if done == total:
             return f"All {total} frames seen, looking again where they disagree"
-        seconds = (total - done) / self._optimizer.frames_per_second
+        seconds = self._optimizer.seconds_left
         left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         return f"Frame {done} of {total}, about {left} left"
 

@@ -10,16 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data import Frame
-from .error_model import Gaussian
 from .parameters import ParameterVector
 from .sight import Eye
 
 
-def suiting_all(
+def best_beginning(
     opinions: Mapping[int, Float[np.ndarray, " n"]],
     eye: Eye,
     open_frame: Callable[[int], tuple[Frame, ParameterVector]],
-    expected: Gaussian,
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
     """The opinion with the lowest loss, mean over the frames that were asked.
@@ -30,10 +28,9 @@ def suiting_all(
         opinions: position of each frame that was asked -> the correction that it sees [rad].
         eye: looks at these frames again, told each opinion.
         open_frame: a frame and its unknowns.
-        expected: of a correction, before any image.
         allowance: how many times as large as the lowest loss in the first frame one there may be [1].
     """
     corrections = list(opinions.values())
-    losses = np.array([eye.losses(*open_frame(index), expected, corrections) for index in opinions])
+    losses = np.array([eye.losses(*open_frame(index), corrections) for index in opinions])
     suits = losses[0] <= allowance * losses[0].min()
     return corrections[int(np.where(suits, losses.mean(0), np.inf).argmin())]

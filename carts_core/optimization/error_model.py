@@ -129,17 +129,21 @@ def combined(belief: Gaussian, information: Information, C: Float[np.ndarray, "m
     return Gaussian(mean, 0.5 * (covariance + covariance.T))
 
 
-def news(seconds: float, memory: float) -> float:
-    """Share of a frame's information that those before it have not told already [1].
+def news(gaps: Sequence[float], memory: float) -> list[float]:
+    """Share of each frame's information that counts for the others, because errors of images are alike for a while [1].
 
-    Errors of images are alike for a while: an autoregressive process of first order, whose mean over many frames is as
-    certain as that of (1 - r) / (1 + r) times as many independent ones, with r = exp(-seconds / memory).
+    They are taken for an autoregressive process of first order. The mean of many of its values, a gap apart, is as
+    certain as that of (1 - r) / (1 + r) times as many independent ones, with r = exp(-gap / memory). A frame gets the
+    mean of that for the gaps on either side.
 
     Args:
-        seconds: since the frame before [s].
+        gaps: from the frame before to each frame [s]; that of the first one does not matter.
         memory: time after which the correlation has fallen to 1/e [s].
     """
-    return math.tanh(0.5 * seconds / memory)
+    shares = [math.tanh(0.5 * gap / memory) for gap in gaps[1:]]
+    if not shares:
+        return [1.0] * len(gaps)
+    return [0.5 * (before + after) for before, after in zip([shares[0], *shares], [*shares, shares[-1]], strict=True)]
 
 
 def without(smoothed: Gaussian, own: Information) -> Gaussian:

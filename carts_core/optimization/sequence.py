@@ -19,7 +19,7 @@ from ..errors import CartsError, SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .beginning import suiting_all
+from .beginning import best_beginning
 from .error_model import ErrorModel, Gaussian, Information, combined, news, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
@@ -126,11 +126,12 @@ class SequenceOptimizer:
             raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
         self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}))
         self._queue = list(self._gaps)
-        self._news = {index: news(gap, self.model.image_seconds) for index, gap in self._gaps.items()}
-        self._news[self._queue[0]] = 1.0
-        asked = [self._queue[place] for place in spread(len(self._queue), self.model.opinions)]
+        self._told = self._shares()
+        asked = {self._queue[place] for place in spread(len(self._queue), self.model.opinions)}
+        asked.update([index for index in self._queue if index in self._keyframes][:1])
         # A frame that is alone, or that a person began with, needs no other opinion.
-        self._to_ask = asked if len(asked) > 1 and self._queue[0] not in self._keyframes else []
+        alone = len(asked) == 1 or self._queue[0] in self._keyframes
+        self._to_ask = [] if alone else [index for index in self._queue if index in asked]
         self._asked: dict[int, _Visit] = {}
         self._begin_at: np.ndarray | None = None
         _, parameters = self._open(self._queue[0])
@@ -156,6 +157,12 @@ class SequenceOptimizer:
         """Frames that were visited per second spent on them [1/s]."""
         seconds = sum(visit.seconds for visit in self._visits.values())
         return len(self._visits) / seconds if seconds else 0.0
+
+    @property
+    def seconds_left(self) -> float:
+        """How long the frames that are left will take, if each takes as long as most did so far [s]."""
+        visited, frames = self.progress
+        return (frames - visited) * statistics.median([visit.seconds for visit in self._visits.values()] or [0.0])
 
     @property
     def estimates(self) -> dict[int, FrameEstimate]:
@@ -197,17 +204,17 @@ class SequenceOptimizer:
         return None
 
     def _ask(self, index: int) -> FrameEstimate | None:
-        """What a frame alone says; None if it cannot be read, which is told when its turn comes."""
+        """What a frame alone says; None if it is not usable, which is told when its turn comes."""
         began = time.perf_counter()
+        start: Start = "keyframe" if index in self._keyframes else "cold"
         try:
             frame, parameters = self._open(index)
+            if start == "keyframe":
+                sight = self._keyframe(frame, parameters, self._fresh)
+            else:
+                sight = self._eye.cold(frame, parameters, self._fresh, quick=True)
         except CartsError:
             return None
-        start: Start = "keyframe" if index in self._keyframes else "cold"
-        if start == "keyframe":
-            sight = self._keyframe(frame, parameters, self._fresh)
-        else:
-            sight = self._eye.cold(frame, parameters, self._fresh, quick=True)
         visit = self._asked[index] = _Visit(frame.frame_id, parameters, sight, start, time.perf_counter() - began)
         return self._estimate(index, visit, combined(self._fresh, sight.information))
 
@@ -215,7 +222,7 @@ class SequenceOptimizer:
         began = time.perf_counter()
         if self._asked and not self._visits:
             opinions = {asked: visit.sight.correction for asked, visit in self._asked.items()}
-            self._begin_at = suiting_all(opinions, self._eye, self._open, self._fresh, self.model.cold_factor)
+            self._begin_at = best_beginning(opinions, self._eye, self._open, self.model.cold_factor)
         frame, parameters = self._open(index)
         errors = self._errors
         expected = errors.initial()
@@ -232,13 +239,15 @@ class SequenceOptimizer:
                 if lost:
                     start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
                 else:
-                    self._gaps[index], self._news[index], expected = math.inf, 1.0, errors.initial()
-        self._beliefs.append(errors.updated(expected, sight.information.scaled(self._news[index])))
+                    self._gaps[index], expected = math.inf, errors.initial()
+                    self._told, self._stale = self._shares(), True
+        self._beliefs.append(errors.updated(expected, sight.information.scaled(self._told[index])))
         self._estimates = None
         seconds = time.perf_counter() - began
-        if index in self._asked:
-            seconds += self._asked[index].seconds
-            sight = replace(sight, iterations=sight.iterations + self._asked[index].sight.iterations)
+        if not self._visits:
+            seconds += sum(visit.seconds for visit in self._asked.values())
+            asked = sum(visit.sight.iterations for visit in self._asked.values())
+            sight = replace(sight, iterations=sight.iterations + asked)
         visit = self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
         return self._estimate(index, visit, combined(errors.correction(expected), sight.information))
 
@@ -274,24 +283,28 @@ class SequenceOptimizer:
         state = self._scene.state(frame.measured, self._extractor.device)
         return frame, ParameterVector(self._scene, state, self._free, self.settings.lever)
 
-    def _smoothed(self) -> dict[int, Gaussian]:
-        """Corrections of all visited frames, each in the light of all of them.
+    def _shares(self) -> dict[int, float]:
+        """Position -> share of a frame's information that it tells the others; a person's word counts whole."""
+        told = news(list(self._gaps.values()), self.model.image_seconds)
+        return {
+            index: 1.0 if index in self._keyframes else share for index, share in zip(self._gaps, told, strict=True)
+        }
 
-        Frames tell others what is new in them only, and themselves all they show.
-        """
+    def _smoothed(self) -> dict[int, Gaussian]:
+        """Corrections of all visited frames, each in the light of all of them, and of all that it shows itself."""
         if not self._visits:
             return {}
         gaps = [self._gaps[index] for index in self._visits]
         if self._stale:
             self._beliefs, belief = [], self._errors.initial()
             for (index, visit), gap in zip(self._visits.items(), gaps, strict=True):
-                told = visit.sight.information.scaled(self._news[index])
+                told = visit.sight.information.scaled(self._told[index])
                 belief = self._errors.updated(self._errors.predicted(belief, gap), told)
                 self._beliefs.append(belief)
             self._stale = False
         smoothed = zip(self._visits.items(), self._errors.smoothed(self._beliefs, gaps), strict=True)
         return {
-            index: combined(belief, visit.sight.information.scaled(1.0 - self._news[index]))
+            index: combined(belief, visit.sight.information.scaled(1.0 - self._told[index]))
             for (index, visit), belief in smoothed
         }
 

@@ -26,6 +26,9 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 _WARM_STEPS, _WARM_TOLERANCE = 2, 1e-2
 """As `stage_iterations` and `tolerance`: the linear model at the last step takes care of what is left."""
 
+_QUICK_ZOOM, _LOSS_ZOOM = 1.0, 1.25
+"""Largest `OptimizerSettings.zoom` of a quick cold start, and of given corrections that are only compared [1]."""
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -46,7 +49,7 @@ class Eye:
         scene: with the cameras that take part.
         extractor: the networks.
         settings: of a cold start; a warm one has its finest blur, one look and few steps.
-        sight_noise: as `OptimizerSettings.noise`, for what a frame tells others.
+        sight_noise: as `OptimizerSettings.noise`, for what a frame tells.
         ignore: position of a frame -> camera name -> pixels that show an occluder.
     """
 
@@ -62,7 +65,8 @@ class Eye:
             stage_iterations=min(settings.stage_iterations, _WARM_STEPS),
             tolerance=max(settings.tolerance, _WARM_TOLERANCE),
         )
-        self._quick, self._glimpse = (replace(self._coarse, zoom=1.0), replace(self._fine, zoom=1.25))
+        self._quick = replace(settings, zoom=min(settings.zoom, _QUICK_ZOOM))
+        self._brief = replace(self._fine, zoom=min(settings.zoom, _LOSS_ZOOM))
 
     def warm(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, start: np.ndarray) -> Sight:
         """Find the correction near `start` [n]."""
@@ -91,7 +95,7 @@ class Eye:
         return replace(end, correction=correction, information=information)
 
     def cold(self, frame: Frame, parameters: ParameterVector, expected: Gaussian, *, quick: bool = False) -> Sight:
-        """Find the correction from the measured values on, coarse to fine; quick in smaller images, up to the end."""
+        """Find the correction from the measured values on, coarse to fine; quick in smaller images but for the end."""
         settings = self._quick if quick else self._coarse
         parameters.prior = _prior(expected, parameters)
         objective = self._objective(frame, parameters, settings)
@@ -108,12 +112,9 @@ class Eye:
         information = _information(offsets, evaluation, parameters).scaled(self._share)
         return Sight(correction, information, evaluation.loss, 0)
 
-    def losses(
-        self, frame: Frame, parameters: ParameterVector, expected: Gaussian, corrections: Sequence[np.ndarray]
-    ) -> list[float]:
+    def losses(self, frame: Frame, parameters: ParameterVector, corrections: Sequence[np.ndarray]) -> list[float]:
         """How badly given corrections [n] fit, in a smaller image; the network is told each before it looks."""
-        parameters.prior = _prior(expected, parameters)
-        objective, found = self._objective(frame, parameters, self._glimpse), []
+        objective, found = self._objective(frame, parameters, self._brief), []
         for correction in corrections:
             objective.forget()
             offsets = parameters.clamp(torch.from_numpy(correction).to(parameters.lower))

@@ -22,7 +22,7 @@ class SequenceSettings:
     jitter_deg: float = 0.05
     """Deviation of the error that is new in every frame [deg]."""
     sight_noise: float = 4.0
-    """As `noise`, for what a frame tells others; larger, since the errors of neighbouring pixels are alike [1]."""
+    """As `noise`, for what a frame tells; larger, since the errors of neighbouring pixels are alike [1]."""
     image_seconds: float = 0.5
     """Time after which errors of images are no longer alike (a correlation of 1/e); frames that follow each other
     faster tell the others less [s]."""
@@ -52,7 +52,7 @@ _RANGES = {
     "jitter_deg": (1e-3, 360.0),
     "sight_noise": (1e-3, 100.0),
     "image_seconds": (1e-6, 1e6),
-    "opinions": (1, 1000),
+    "opinions": (1, 20),
     "cold_factor": (1.0, 100.0),
     "frame_seconds": (1e-6, 1e6),
 }

@@ -118,6 +118,11 @@ def test_news_of_correlated_errors_is_what_their_mean_becomes_certain_by() -> No
     frames, memory, gap = 2000, 0.5, 0.25
     times = gap * np.arange(frames)
     correlation = np.exp(-np.abs(times[:, None] - times) / memory)
-    variance_of_mean = correlation.mean()
-    assert variance_of_mean == pytest.approx(1.0 / (frames * news(gap, memory)), rel=2e-3)
-    assert news(math.inf, memory) == 1.0 and news(0.0, memory) == 0.0
+    shares = news([0.0] + [gap] * (frames - 1), memory)
+    assert correlation.mean() == pytest.approx(1.0 / sum(shares), rel=2e-3)
+
+
+def test_news_is_the_same_in_both_directions_and_whole_for_a_frame_that_is_far_from_others() -> None:
+    forward, backward = news([9.9, 0.1, 2.0, 0.4], 0.5), news([0.0, 0.4, 2.0, 0.1], 0.5)
+    assert forward == pytest.approx(backward[::-1])
+    assert news([0.0], 0.5) == [1.0] and news([0.0, math.inf, math.inf], 0.5) == [1.0] * 3
