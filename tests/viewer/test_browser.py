@@ -211,13 +211,13 @@ def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_ca
 def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    app = open_viewer(frames=8, width=160, height=120)
+    app = open_viewer(frames=16, width=160, height=120)
     tab, other = open_tab(app), open_tab(app, (1000, 900))
     tab.page.get_by_text("Review", exact=True).first.click()
     tab.page.keyboard.press("k")
-    expect(tab.page.get_by_text("from 001 to 008")).to_be_visible()
+    expect(tab.page.get_by_text("from 001 to 016")).to_be_visible()
     app.mailbox.put(ask.MoveFrame(1))
-    expect(tab.page.get_by_text("7 to solve, 1 kept")).to_be_visible()
+    expect(tab.page.get_by_text("15 to solve, 1 kept")).to_be_visible()
     tab.button("Solve between")
     stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
     expect(stop).to_be_visible()
@@ -225,10 +225,10 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     # Another tab goes on browsing meanwhile.
     other.page.keyboard.press("n")
     eventually(lambda: app.state.index, lambda index: index == 2)
-    expect(tab.page.get_by_text("7 frames solved")).to_be_visible(timeout=60_000)
+    expect(tab.page.get_by_text("15 frames solved")).to_be_visible(timeout=60_000)
     expect(stop).to_be_hidden()
-    assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 7
-    assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 8))
+    assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 15
+    assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 16))
     steps = app.state.undoable
     # The same again would be no step.
     tab.page.keyboard.press("Control+z")
