@@ -76,14 +76,15 @@ def _warm_seconds(data: Measurements, *, gpu: bool) -> list[float]:
 
 def _sequence_seconds(data: Measurements) -> Target:
     seconds, every = _warm_seconds(data, gpu=False), _sequence_frames(data, gpu=False)
+    whole = ""
+    if every:
+        average = mean(m.final.seconds for m in every)
+        whole = f"; the mean of all frames, with what finds where to begin, is {average:.2f} s"
     return make_target(
         "sequence mode, seconds per warm frame, two arms, 640x480, CPU",
         0.3,
         median(seconds) if seconds else None,
-        f"median over {counted(len(seconds), 'frame')}, reading the image included; the mean of all frames, with "
-        f"what finds where to begin, is {mean(m.final.seconds for m in every):.2f} s"
-        if every
-        else "",
+        f"median over {counted(len(seconds), 'frame')}, reading the image included{whole}",
         at_least=False,
         text=lambda value: f"{value:.2f} s",
     )
