@@ -10,6 +10,7 @@ import yourdfpy
 from jaxtyping import Float, Int
 
 from .errors import RobotError
+from .mesh_files import mesh_path
 
 SHARP_EDGE = np.deg2rad(38.0)
 """Faces that meet at a larger angle [rad] do not share a smooth normal."""
@@ -85,9 +86,7 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[trimesh.Trimesh
         return [trimesh.creation.icosphere(radius=geometry.sphere.radius)]
     if geometry.mesh is None:
         return []
-    path = Path(yourdfpy.filename_handler_magic(geometry.mesh.filename, dir=str(folder)))
-    if not path.is_absolute():
-        path = folder / path
+    path = mesh_path(folder, geometry.mesh.filename)
     if not path.is_file():
         raise RobotError(
             f"mesh {path} is missing; the URDF in {folder} names it as {geometry.mesh.filename!r}. "

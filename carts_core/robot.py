@@ -11,6 +11,7 @@ from torch import Tensor
 from . import mesh_cache
 from .errors import RobotError
 from .kinematics import Kinematics, exact_right_angles
+from .mesh_files import mesh_path
 from .meshes import LinkMesh, build_link_meshes, load_visual
 
 
@@ -64,7 +65,8 @@ class Robot:
         Raises:
             RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.
         """
-        urdf = Path(urdf)
+        # Resolved once, here: what is found beside the URDF stays found when the working directory changes.
+        urdf = Path(urdf).absolute()
         report = progress or (lambda line: None)
         if not urdf.is_file():
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.")
@@ -120,14 +122,12 @@ def _load_meshes(
     model: yourdfpy.URDF, urdf: Path, link_names: tuple[str, ...], max_faces: int, report: Callable[[str], None]
 ) -> tuple[LinkMesh, ...]:
     mesh_files = [
-        urdf.parent / visual.geometry.mesh.filename
+        mesh_path(urdf.parent, visual.geometry.mesh.filename)
         for link in model.robot.links
         for visual in link.visuals
-        if visual.geometry is not None
-        and visual.geometry.mesh is not None
-        and (urdf.parent / visual.geometry.mesh.filename).is_file()
+        if visual.geometry is not None and visual.geometry.mesh is not None
     ]
-    key = mesh_cache.fingerprint([urdf, *mesh_files], max_faces)
+    key = mesh_cache.fingerprint([urdf, *filter(Path.is_file, mesh_files)], max_faces)
     if (cached := mesh_cache.read(key)) is not None:
         return cached
     report(f"{model.robot.name}: preparing meshes (once)")

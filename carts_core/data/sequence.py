@@ -91,7 +91,8 @@ class Sequence:
             SequenceError: the file or something it points at is missing or wrong.
             RobotError: a robot or one of its meshes is missing or wrong.
         """
-        return Sequence(read_description(Path(path), progress))
+        # Resolved once, here: images that are decoded later are found from any working directory.
+        return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
         """The same images with the joint positions of another time; the sequence file stays as it is.
