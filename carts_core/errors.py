@@ -26,3 +26,7 @@ class SettingsError(CartsError):
 
 class ProjectError(CartsError):
     """A project file cannot be opened or written to, or an edit does not fit the sequence."""
+
+
+class OutputError(CartsError):
+    """A file or folder cannot be written, or a name cannot be part of its path."""

@@ -17,7 +17,7 @@ from .frame_list import FrameList
 from .joints import take_joints
 from .matching import JointSamples, TimeMatching
 from .rows import Rows, take_rows
-from .toml_table import TomlTable, read_toml
+from .toml_table import TomlTable, check_file_name, read_toml
 
 FORMAT = "carts-sequence/1"
 """Value of the key `format`."""
@@ -70,6 +70,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     root = read_toml(path)
     root.take_choice("format", (FORMAT,), "(none)")
     name = root.take("name", str, path.stem)
+    check_file_name(root, "name", "is", name)
     root.take("description", str, "")
     domains = _take_domains(root)
     frames_section = root.take_table("frames") if "frames" in root else None
@@ -98,6 +99,8 @@ def _take_domains(root: TomlTable) -> tuple[str, ...]:
         raise root.error("domains", f'is {domains!r}. Give names, say domains = ["regular", "smoke"].')
     if len(set(domains)) < len(domains):
         raise root.error("domains", f"names one twice: {', '.join(domains)}.")
+    for domain in domains:
+        check_file_name(root, "domains", "has", domain)
     return tuple(domains)
 
 

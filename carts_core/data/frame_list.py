@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import SequenceError
+from ..files import allowed_names, name_fault
 from ..wording import counted
 from .patterns import FrameId, expand
 from .table import Table, read_table
-from .toml_table import TomlTable
+from .toml_table import TomlTable, check_file_name
 from .video_index import index_video
 
 
@@ -53,6 +54,10 @@ class FrameNames:
                 raise SequenceError(
                     f"{key}: frame {frame_id!r} is in line {lines[frame_id]} and again in line {line}. "
                     "Remove one of them, or number the frames anew."
+                )
+            if fault := name_fault(frame_id):
+                raise SequenceError(
+                    f"{key}, line {line}: the frame is called {frame_id!r}, {fault}. {allowed_names()}."
                 )
             lines[frame_id] = line
         return ids
@@ -134,6 +139,8 @@ def _frames_of_video(section: TomlTable) -> FrameList:
         )
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
+    for frame_id in ids:
+        check_file_name(section, "frame_id", "makes", frame_id)
     return FrameList(ids, index.timestamps, numbers, f"{path} has {counted(index.count, 'frame')}")
 
 

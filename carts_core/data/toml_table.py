@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SequenceError
+from ..files import allowed_names, name_fault
 
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
@@ -115,6 +116,7 @@ class TomlTable:
             if name in names:
                 raise self.error(f"[[{key}]]", f"has the name {name!r} twice. Every one needs a name of its own.")
             names.append(name)
+            check_file_name(self, f"[[{key}]]", "has the name", name)
             table = TomlTable(value, self.file, f"[[{key}]] {name!r}", f"{key}.")
             table.take("name", str)
             tables.append(table)
@@ -139,6 +141,16 @@ class TomlTable:
             if key not in self._known:
                 known = list(dict.fromkeys(self._known))
                 raise self.error(key, f"is not a key of the format.{closest(key, known)} Known here: {_list(known)}.")
+
+
+def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
+    """See that a name can be part of the names of files.
+
+    Raises:
+        SequenceError: it cannot.
+    """
+    if fault := name_fault(name):
+        raise table.error(key, f"{verb} {name!r}, {fault}. {allowed_names()}.")
 
 
 def _typo(key: str, given: list[str]) -> str:

@@ -278,3 +278,20 @@ def test_unknown_frames_domains_and_cameras_are_named_with_those_that_exist(tiny
         sequence.frame(0, cameras=["lift"])
     with pytest.raises(SequenceError, match="no camera 'right'"):
         sequence.background("right")
+
+
+@pytest.mark.parametrize("name", ["/tmp/x", "../../x", ".ssh", "a\\u0000b", "a\\u001b[2Jb", "x" * 201])
+@pytest.mark.parametrize("what", ["sequence", "camera", "domain", "arm", "frame"])
+def test_a_name_that_cannot_be_part_of_a_file_name_is_refused_where_it_enters(
+    tiny_sequence: Callable[..., Path], what: str, name: str
+) -> None:
+    before, after = {
+        "sequence": ('name = "tiny"', f'name = "{name}"'),
+        "camera": ('name = "left"', f'name = "{name}"'),
+        "domain": ("['regular']", f'["{name}"]'),
+        "arm": ('name = "PSM1"', f'name = "{name}"'),
+        "frame": ('frame_id = "{frame:03d}"', f'frame_id = "{name}{{frame}}"'),
+    }[what]
+    path = tiny_sequence(edit=lambda text: text.replace(before, after))
+    with pytest.raises(SequenceError, match=r"which (begins|contains|is 2\d\d bytes).* A name is part of"):
+        Sequence.open(path)

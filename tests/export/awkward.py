@@ -5,7 +5,7 @@ import numpy as np
 from carts_core.export import Dataset, Monitor
 from carts_core.export.dataset import View
 
-CAMERA = "linke Kamera/ü"
+CAMERA = "linke Kamera: ü"
 ARMS = ("PSM 1", 'PSM "2" & <ü>')
 SOURCES = ("measured", "rejected by Zoë", "hand, adam 4e-3")
 
@@ -14,13 +14,13 @@ Masks = dict[tuple[str, str], np.ndarray]
 
 
 def awkward(text: str) -> str:
-    """The tiny sequence with a second arm beside the first one, and names with spaces, slashes and umlauts."""
+    """The tiny sequence with a second arm beside the first one, and names with spaces, colons and umlauts."""
     head, camera = text.split("[[cameras]]")
     head, arm = head.split("[[arms]]")
     second = arm.replace('"PSM1"', f"'{ARMS[1]}'").replace(
         "[arms.joints]", f"T_world_base = {_beside().tolist()}\n[arms.joints]"
     )
-    head = head.replace('frame_id = "{frame:03d}"', 'frame_id = "Bild {frame}/ä"')
+    head = head.replace('frame_id = "{frame:03d}"', 'frame_id = "Bild {frame}: ä"')
     camera = camera.replace('name = "left"', f'name = "{CAMERA}"').replace(
         '"{domain}/{camera}/{frame}.png"', '"regular/left/*.png"'
     )

@@ -55,7 +55,7 @@ def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
     assert (summary["format"], summary["sequence"], summary["domain"]) == ("coco", "tiny", "regular")
     assert summary["views"][2] == {
         "name": dataset.steps[2][0],
-        "frame": "Bild 3/ä",
+        "frame": "Bild 3: ä",
         "index": 2,
         "camera": CAMERA,
         "source": SOURCES[2],

@@ -2,19 +2,16 @@
 
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
 
 from carts_core.errors import CartsError
-from carts_core.export import FORMATS, Dataset, ExportCancelled, FormatName, Monitor, export
-from carts_core.export.publish import MARKER, published
+from carts_core.files import MARKER, OutputPath, published, write_text
 
 
-def _make(folder: Path, text: str) -> None:
-    folder.mkdir()
-    (folder / MARKER).write_text(text)
+def _make(folder: Path | OutputPath, text: str) -> None:
+    write_text(OutputPath(Path(folder)) / MARKER, text)
 
 
 def _names(folder: Path) -> list[str]:
@@ -26,7 +23,7 @@ def test_a_folder_and_a_file_appear_when_the_block_ends(tmp_path: Path) -> None:
         _make(path, "new")
         assert not (tmp_path / "deep" / "out dir").exists()
     with published(tmp_path / "deep" / "ü.csv") as path:
-        path.write_text("new")
+        write_text(path, "new")
     assert _names(tmp_path / "deep") == ["out dir", "ü.csv"]
     assert (tmp_path / "deep" / "ü.csv").read_text() == (tmp_path / "deep" / "out dir" / MARKER).read_text() == "new"
 
@@ -52,7 +49,7 @@ def test_what_exists_is_replaced_on_request_only(tmp_path: Path) -> None:
     with published(tmp_path / "out", overwrite=True) as path:
         _make(path, "new")
     with published(tmp_path / "out.csv", overwrite=True) as path:
-        path.write_text("new")
+        write_text(path, "new")
     assert (tmp_path / "out" / MARKER).read_text() == (tmp_path / "out.csv").read_text() == "new"
     assert _names(tmp_path) == ["out", "out.csv"]
 
@@ -67,9 +64,28 @@ def test_a_folder_is_replaced_also_where_two_cannot_change_places(
     assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "new"
 
 
+_KILLED_BETWEEN_RENAMES = """
+import os, signal, sys
+from pathlib import Path
+from carts_core.files import MARKER, published, write_text
+sys.platform, renames, rename = "darwin", [], os.rename
+def rename_once(*names, **folders):
+    if renames:
+        os.kill(os.getpid(), signal.SIGKILL)
+    renames.append(names)
+    rename(*names, **folders)
+os.rename = rename_once
+with published(Path(sys.argv[1]), overwrite=True) as path:
+    write_text(path / MARKER, "new")
+"""
+
+
 def test_what_a_kill_between_two_renames_took_away_comes_back(tmp_path: Path) -> None:
-    (tmp_path / ".out.part").mkdir()
-    _make(tmp_path / ".out.part" / "out.old", "old")
+    _make(tmp_path / "out", "old")
+    assert (
+        subprocess.run([sys.executable, "-c", _KILLED_BETWEEN_RENAMES, tmp_path / "out"], check=False).returncode == -9
+    )
+    assert "out" not in _names(tmp_path)
     with pytest.raises(CartsError, match="out exists"), published(tmp_path / "out"):
         pass
     assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "old"
@@ -93,7 +109,7 @@ def test_an_empty_folder_counts_as_absent(tmp_path: Path) -> None:
 
 def test_what_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(CartsError, match="exists"), published(tmp_path / "out.csv") as path:
-        path.write_text("new")
+        write_text(path, "new")
         (tmp_path / "out.csv").write_text("somebody else's")
     assert (tmp_path / "out.csv").read_text() == "somebody else's" and _names(tmp_path) == ["out.csv"]
 
@@ -119,10 +135,9 @@ def test_two_exports_to_one_place_do_not_meet(tmp_path: Path) -> None:
 _KILLED = """
 import sys, time
 from pathlib import Path
-from carts_core.export.publish import MARKER, published
+from carts_core.files import MARKER, published, write_text
 with published(Path(sys.argv[1]), overwrite=True) as path:
-    path.mkdir()
-    (path / MARKER).write_text("half")
+    write_text(path / MARKER, "half")
     print("writing", flush=True)
     time.sleep(600)
 """
@@ -141,19 +156,3 @@ def test_a_kill_in_the_middle_changes_nothing_and_the_next_export_works(tmp_path
     with published(target, overwrite=True) as path:
         _make(path, "new")
     assert _names(tmp_path) == ["out"] and (target / MARKER).read_text() == "new"
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_cancelled_export_leaves_nothing(dataset: Dataset, name: FormatName, tmp_path: Path) -> None:
-    cancel, steps = threading.Event(), []
-
-    def progress(done: int, total: int) -> None:
-        steps.append((done, total))
-        cancel.set()
-
-    folder = tmp_path / "exports"
-    folder.mkdir()
-    with pytest.raises(ExportCancelled):
-        export(dataset, name, folder / "out", monitor=Monitor(progress, cancel.is_set))
-    assert steps == [(1, len(dataset.scene.arms) if name == "dvrk" else 3)]
-    assert _names(folder) == []

@@ -1,0 +1,26 @@
+"""Everything that is written to disk, and every path that it is written to.
+
+No other module opens a file for writing; `tests/files/test_one_writer.py` sees to it.
+"""
+
+from .locks import BusyError as BusyError
+from .locks import lock_holder as lock_holder
+from .locks import locked_folder as locked_folder
+from .locks import open_lock as open_lock
+from .locks import sign_lock as sign_lock
+from .locks import try_lock as try_lock
+from .paths import OutputPath as OutputPath
+from .paths import allowed_names as allowed_names
+from .paths import check_name as check_name
+from .paths import file_name as file_name
+from .paths import name_fault as name_fault
+from .paths import output_path as output_path
+from .paths import unique_file_names as unique_file_names
+from .publish import MARKER as MARKER
+from .publish import published as published
+from .writing import append_line as append_line
+from .writing import holds_file as holds_file
+from .writing import output_stream as output_stream
+from .writing import remove_file as remove_file
+from .writing import write_bytes as write_bytes
+from .writing import write_text as write_text

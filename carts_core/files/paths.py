@@ -1,0 +1,154 @@
+"""What a name may be, and every path that is written to: a folder that a person named, and names below it."""
+
+import os
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..errors import OutputError
+
+NAME_BYTES = 200
+"""What a name may have where it enters; the rest is for what it is combined with, such as `.png`."""
+_FILE_BYTES = 255
+"""What a file system takes as one component of a path."""
+_REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+"""Separators of paths, control characters, ends of lines, and halves of characters, which no encoding has."""
+
+
+def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
+    """Why a text cannot be the name of a file, in words that follow "is 'TEXT', "; None if it can.
+
+    Letters of any script, spaces and most punctuation are allowed. A path, a hidden name, a control character or a name
+    that is too long is not.
+
+    Args:
+        text: a foreign name: of a sequence, frame, camera, domain or arm.
+        most_bytes: its largest length in UTF-8.
+    """
+    if not text:
+        return "which is empty"
+    if text.startswith("."):
+        return "which begins with a dot"
+    if found := _REFUSED.search(text):
+        what = f"{found[0]!r}, as if it were a path" if found[0] in "/\\" else f"the control character {found[0]!r}"
+        return f"which contains {what}"
+    if (length := len(text.encode())) > most_bytes:
+        return f"which is {length} bytes long"
+    return None
+
+
+def allowed_names(most_bytes: int = NAME_BYTES) -> str:
+    """What `name_fault` allows, for errors."""
+    return (
+        f"A name is part of file names, so it has 1 to {most_bytes} bytes, no / or \\, no control characters, and no "
+        "dot at its beginning. Rename it"
+    )
+
+
+def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
+    """The name itself, seen to be one component of a path that leads nowhere else.
+
+    Args:
+        text: the name.
+        what: what bears it, for the error, such as "camera".
+        most_bytes: its largest length in UTF-8.
+
+    Raises:
+        OutputError: it cannot be the name of a file.
+    """
+    if fault := name_fault(text, most_bytes):
+        shown = text if len(text) <= _FILE_BYTES else f"{text[:60]}…"
+        raise OutputError(f"the name of {what} is {shown!r}, {fault}. {allowed_names(most_bytes)}.")
+    return text
+
+
+@dataclass(frozen=True)
+class OutputPath(os.PathLike[str]):
+    """A file or folder to write. Made by `output_path` and `/`, which check every name.
+
+    What writes to it follows links on the way to `folder`, which a person named, and none below it.
+    """
+
+    folder: Path
+    """What a person named; it need not exist."""
+    names: tuple[str, ...] = ()
+    """The way from there, each the name of one folder or file."""
+    draft: bool = False
+    """Below a new folder that nobody reads before it is whole: files there are written once, and synced together."""
+
+    def __truediv__(self, name: str) -> "OutputPath":
+        check_name(name, f"a file or folder in {self.path}", _FILE_BYTES)
+        return replace(self, names=(*self.names, name))
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def path(self) -> Path:
+        """For reading, and for people."""
+        return self.folder.joinpath(*self.names)
+
+    @property
+    def name(self) -> str:
+        """The last component."""
+        return self.path.name
+
+    @property
+    def parent(self) -> "OutputPath":
+        """The folder that it lies in."""
+        if self.names:
+            return replace(self, names=self.names[:-1])
+        return replace(self, folder=self.folder.parent)
+
+
+def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
+    """The path of a file or folder to write: every such path is made here.
+
+    Args:
+        folder: named by a person, on the command line or in the environment; never by a recording.
+        names: the way from there; each may be foreign.
+        draft: see `OutputPath`.
+
+    Raises:
+        OutputError: a name is no single component of a path, or leads elsewhere.
+    """
+    path = OutputPath(folder, draft=draft)
+    for name in names:
+        path = path / name
+    return path
+
+
+def as_output(path: OutputPath | Path) -> OutputPath:
+    """The last component of a path that a person named as one that no link is followed at."""
+    if isinstance(path, OutputPath) and path.names:
+        return path
+    draft = isinstance(path, OutputPath) and path.draft
+    whole = Path(os.path.abspath(path))
+    return OutputPath(whole.parent, (whole.name,), draft)
+
+
+def file_name(text: str) -> str:
+    """A foreign text as the name of a file, whatever it is; letters of any script stay."""
+    return _cut(re.sub(r"[^\w.-]+", "_", text).lstrip("."), NAME_BYTES) or "_"
+
+
+def unique_file_names(texts: list[str]) -> list[str]:
+    """`file_name` of each text, numbered where two would be the same file (also where case is ignored)."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for text in texts:
+        name = stem = file_name(text)
+        number = 1
+        while name.casefold() in taken:
+            number += 1
+            name = f"{stem}-{number}"
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def _cut(text: str, most_bytes: int) -> str:
+    return text.encode(errors="ignore")[:most_bytes].decode(errors="ignore")

@@ -1,0 +1,145 @@
+"""An output appears under its final name whole or not at all, whatever happens while it is written."""
+
+import ctypes
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from ..errors import OutputError
+from .folders import explained, kind_of, open_below, opened_folder, status
+from .paths import OutputPath, as_output
+from .staging import Staging, leftovers, make_staging
+
+MARKER = "export.json"
+"""Every exported folder holds this file; a folder without it is never replaced."""
+_OLD = "carts-replaced"
+"""Where the earlier output lies between two renames."""
+
+
+@contextmanager
+def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
+    """Where to write an output, which becomes `target` when the block ends without an exception.
+
+    It is written in a hidden folder of a random name beside `target`. When the block fails or is interrupted that
+    folder is removed; when the process is killed it stays, and the next call for the same target removes it.
+
+    Args:
+        target: file or folder to make; no link itself. An empty folder counts as absent.
+        overwrite: replace what is there: a file, or a folder that is an export itself.
+        key: of what the output is made from. With one, what an earlier call with the same key has left is kept, also
+            when the block fails, and the block can go on with it.
+
+    Yields:
+        A path with the target's name, for a file or a folder; without `key` it is not there yet.
+
+    Raises:
+        OutputError: the target exists and may not be replaced, somebody else is writing it, or the disk refuses.
+    """
+    output = as_output(target)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        staging = _take_staging(folder, output, key)
+        try:
+            _check_free(folder, output, overwrite)
+            yield replace(output, names=(*output.names[:-1], staging.name, output.name), draft=key is None)
+            _check_free(folder, output, overwrite)
+            _sync_all(staging.descriptor)
+            _move(staging, folder, output.name)
+            os.fsync(folder)
+            key = None
+        finally:
+            if key is None or status(staging.descriptor, output.name) is None:
+                staging.remove()
+            staging.close()
+
+
+def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
+    """The folder to write in: a new one, or what is left of the same work. What is left of other work is removed."""
+    taken = make_staging(folder, output.name, key)
+    try:
+        for left in leftovers(folder, output.name, taken):
+            if status(left.descriptor, _OLD) is not None and status(folder, output.name) is None:
+                # A kill between the two renames of `_move` took the earlier output away.
+                os.rename(_OLD, output.name, src_dir_fd=left.descriptor, dst_dir_fd=folder)
+            reused = key is not None and left.mark.key == key
+            needless, taken = (taken, left) if reused else (left, taken)
+            needless.remove()
+            needless.close()
+    except BaseException:
+        taken.remove()
+        taken.close()
+        raise
+    return taken
+
+
+def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
+    found = status(folder, output.name)
+    if found is None:
+        return
+    if stat.S_ISDIR(found.st_mode):
+        if not _entries(folder, output.name):
+            return
+        if not _is_export(folder, output.name):
+            raise OutputError(
+                f"{output} is a folder with other files ({MARKER} is not among them), and these are never replaced. "
+                "Name a new folder."
+            )
+    elif not stat.S_ISREG(found.st_mode):
+        raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Name another output.")
+    if not overwrite:
+        raise OutputError(f"{output} exists. Add --overwrite to replace it, or name another output.")
+
+
+def _entries(folder: int, name: str) -> list[str]:
+    descriptor = open_below(folder, name)
+    try:
+        return os.listdir(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _is_export(folder: int, name: str) -> bool:
+    descriptor = open_below(folder, name)
+    try:
+        found = status(descriptor, MARKER)
+        return found is not None and stat.S_ISREG(found.st_mode)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_all(folder: int) -> None:
+    """Have everything in a folder on disk."""
+    for _, _, files, descriptor in os.fwalk(".", dir_fd=folder):
+        for name in files:
+            file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=descriptor)
+            try:
+                os.fsync(file)
+            finally:
+                os.close(file)
+        os.fsync(descriptor)
+
+
+def _move(staging: Staging, folder: int, name: str) -> None:
+    inside = staging.descriptor
+    found = status(folder, name)
+    if found is None or not stat.S_ISDIR(found.st_mode) or not _entries(folder, name):
+        os.replace(name, name, src_dir_fd=inside, dst_dir_fd=folder)
+    elif not _exchanged(inside, folder, name):
+        os.rename(name, _OLD, src_dir_fd=folder, dst_dir_fd=inside)
+        try:
+            os.rename(name, name, src_dir_fd=inside, dst_dir_fd=folder)
+        except OSError:
+            os.rename(_OLD, name, src_dir_fd=inside, dst_dir_fd=folder)
+            raise
+
+
+def _exchanged(one: int, other: int, name: str) -> bool:
+    """Let what has a name in two open folders change places in one step, where the system can."""
+    if not sys.platform.startswith("linux"):
+        return False
+    exchange = 2  # RENAME_EXCHANGE of renameat2(2)
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(one, os.fsencode(name), other, os.fsencode(name), exchange) == 0

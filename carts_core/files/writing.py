@@ -1,0 +1,158 @@
+"""Files that are there whole or not at all, on disk when they are there, and never written through a link."""
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from ..errors import OutputError
+from .folders import explained, kind_of, opened_folder, status
+from .paths import OutputPath, as_output
+
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_MODE = 0o666
+_OWN_DESCRIPTORS = Path("/proc/self/fd")
+_NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
+"""Flag for a file that has no name before it is whole, so that a kill leaves nothing; 0 where the system has none."""
+
+
+def write_bytes(path: OutputPath | Path, content: bytes) -> None:
+    """Write a file, in place of one that is there; folders on the way are made.
+
+    Whoever reads meets the old file or the new one, whole, whenever the process or the machine stops. A link under the
+    file's name is replaced itself; what it points at stays as it is.
+
+    Raises:
+        OutputError: it cannot be written; nothing is changed then.
+    """
+    with output_stream(path) as stream:
+        stream.write(content)
+
+
+def write_text(path: OutputPath | Path, text: str) -> None:
+    """`write_bytes` of a text in UTF-8; line ends stay as they are."""
+    write_bytes(path, text.encode())
+
+
+@contextmanager
+def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
+    """A stream, seekable and readable, which becomes the file when the block ends without an exception.
+
+    Raises:
+        OutputError: as of `write_bytes`.
+    """
+    output = as_output(path)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        if output.draft:
+            with os.fdopen(os.open(output.name, _NEW, _MODE, dir_fd=folder), "w+b") as stream:
+                yield stream
+            return
+        _check_replaceable(folder, output)
+        descriptor, temporary = _new_file(folder)
+        try:
+            with os.fdopen(descriptor, "w+b") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+                if temporary is None:
+                    temporary = _named(stream.fileno(), folder)
+            os.replace(temporary, output.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except BaseException:
+            if temporary is not None:
+                with suppress(FileNotFoundError):
+                    os.unlink(temporary, dir_fd=folder)
+            raise
+        os.fsync(folder)
+
+
+def append_line(path: OutputPath | Path, line: bytes) -> None:
+    """Add a line to a file, made if it is missing, and see it on disk.
+
+    A last line that was not finished, since the process was killed, is ended first.
+
+    Raises:
+        OutputError: it cannot be written, or is a link, has a second name, or is no regular file.
+    """
+    output = as_output(path)
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        check_own(folder, output)
+        with os.fdopen(os.open(output.name, flags, _MODE, dir_fd=folder), "ab") as stream:
+            length = os.fstat(stream.fileno()).st_size
+            torn = length > 0 and os.pread(stream.fileno(), 1, length - 1) != b"\n"
+            stream.write(b"\n" * torn + line + b"\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        if length == 0:
+            os.fsync(folder)
+
+
+def remove_file(path: OutputPath | Path) -> None:
+    """Remove a regular file, if it is there.
+
+    Raises:
+        OutputError: it is a link or no file, or may not be removed.
+    """
+    output = as_output(path)
+    with explained(output):
+        try:
+            with opened_folder(output.parent) as folder:
+                check_own(folder, output)
+                os.unlink(output.name, dir_fd=folder)
+                os.fsync(folder)
+        except FileNotFoundError:
+            return
+
+
+def holds_file(path: OutputPath | Path) -> bool:
+    """Whether a regular file lies there, reached without a link."""
+    output = as_output(path)
+    try:
+        with opened_folder(output.parent) as folder:
+            found = status(folder, output.name)
+    except (OSError, OutputError):
+        return False
+    return found is not None and stat.S_ISREG(found.st_mode)
+
+
+def check_own(folder: int, output: OutputPath) -> None:
+    """See that writing into what bears a name, or removing it, changes nothing that lies elsewhere.
+
+    Raises:
+        OutputError: it is a link, has a second name, or is no regular file.
+    """
+    found = status(folder, output.name)
+    if found is None or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
+        return
+    what = "a file with a second name (a hard link)" if stat.S_ISREG(found.st_mode) else kind_of(found)
+    raise OutputError(f"{output} is {what}, which is not written into. Remove it, or name another output.")
+
+
+def _check_replaceable(folder: int, output: OutputPath) -> None:
+    found = status(folder, output.name)
+    if found is not None and not (stat.S_ISREG(found.st_mode) or stat.S_ISLNK(found.st_mode)):
+        raise OutputError(f"{output} is {kind_of(found)}, where a file is to be. Remove it, or name another output.")
+
+
+def _new_file(folder: int) -> tuple[int, str | None]:
+    """A new empty file in an open folder, and its name; without a name where the system can."""
+    if _NAMELESS:
+        # Where a file system cannot, the attempt with a name succeeds, or says what is wrong.
+        with suppress(OSError):
+            return os.open(".", _NAMELESS | os.O_RDWR | os.O_CLOEXEC, _MODE, dir_fd=folder), None
+    name = _random_name()
+    return os.open(name, _NEW, _MODE, dir_fd=folder), name
+
+
+def _named(descriptor: int, folder: int) -> str:
+    """Give a nameless file a random name."""
+    name = _random_name()
+    os.link(_OWN_DESCRIPTORS / str(descriptor), name, dst_dir_fd=folder, follow_symlinks=True)
+    return name
+
+
+def _random_name() -> str:
+    return f".carts-{secrets.token_hex(16)}.part"

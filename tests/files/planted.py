@@ -1,0 +1,61 @@
+"""Links and special files that an attacker lays where a program writes, and what must be as before afterwards."""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+PRECIOUS = "years of work"
+
+
+def treasure(folder: Path) -> Path:
+    """A folder of somebody's own files, which nothing may change."""
+    (folder / "thesis").mkdir(parents=True)
+    (folder / "thesis" / "thesis.tex").write_text(PRECIOUS)
+    (folder / "bashrc").write_text(PRECIOUS)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Everything below a folder, links not followed: name -> kind, and a file's content or a link's target."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_symlink():
+            what = f"link to {os.readlink(path)}"
+        elif path.is_file():
+            what = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            what = "folder" if path.is_dir() else "special"
+        found[str(path.relative_to(folder))] = what
+    return found
+
+
+def _link(to: str) -> Callable[[Path, Path], None]:
+    return lambda place, home: place.symlink_to(home / to)
+
+
+def _folder_instead(place: Path, home: Path) -> None:
+    place.mkdir()
+    (place / "own.txt").write_text(PRECIOUS)
+
+
+PLANTED: dict[str, Callable[[Path, Path], None]] = {
+    "link to a file": _link("bashrc"),
+    "link to a folder": _link("thesis"),
+    "dangling link": _link("new file"),
+    "hard link": lambda place, home: os.link(home / "bashrc", place),
+    "pipe": lambda place, home: os.mkfifo(place),
+    "folder": _folder_instead,
+}
+"""Kind -> lays it at a place; links lead into the home folder."""
+
+
+def plant(kind: str, place: Path, home: Path) -> None:
+    """Lay something at a place, in place of what lies there."""
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    PLANTED[kind](place, home)

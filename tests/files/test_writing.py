@@ -1,0 +1,153 @@
+"""Single files: whole or not at all, never through a link, never into what is not ours."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from planted import PLANTED, PRECIOUS, contents, plant, treasure
+
+from carts_core.errors import OutputError
+from carts_core.files import (
+    BusyError,
+    append_line,
+    holds_file,
+    lock_holder,
+    locked_folder,
+    open_lock,
+    output_path,
+    output_stream,
+    published,
+    remove_file,
+    sign_lock,
+    try_lock,
+    write_bytes,
+    write_text,
+)
+
+
+def test_a_file_is_written_with_the_folders_on_the_way(tmp_path: Path) -> None:
+    path = output_path(tmp_path, "masks", "left", "001.png")
+    write_bytes(path, b"one")
+    write_bytes(path, b"two")
+    assert path.path.read_bytes() == b"two" and holds_file(path)
+    assert contents(tmp_path).keys() == {"masks", "masks/left", "masks/left/001.png"}
+    allowed = 0o666 & ~_umask()
+    assert stat.S_IMODE(path.path.stat().st_mode) == allowed
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+@pytest.mark.parametrize("nameless", [True, False])
+def test_a_failure_keeps_the_old_file_and_leaves_nothing(
+    tmp_path: Path, nameless: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not nameless:
+        monkeypatch.setattr("carts_core.files.writing._NAMELESS", 0)
+    write_text(tmp_path / "a", "old")
+    with pytest.raises(KeyboardInterrupt), output_stream(tmp_path / "a") as stream:
+        stream.write(b"half")
+        raise KeyboardInterrupt
+    assert (tmp_path / "a").read_text() == "old" and os.listdir(tmp_path) == ["a"]
+    write_text(tmp_path / "a", "new")
+    assert (tmp_path / "a").read_text() == "new" and os.listdir(tmp_path) == ["a"]
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from carts_core.files import output_stream
+with output_stream(Path(sys.argv[1])) as stream:
+    stream.write(b"half" * 100_000)
+    stream.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_kill_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    write_text(tmp_path / "a", "old")
+    assert subprocess.run([sys.executable, "-c", _KILLED, tmp_path / "a"], check=False).returncode == -9
+    assert (tmp_path / "a").read_text() == "old" and os.listdir(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("kind", PLANTED)
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_what_is_planted_below_an_output_folder_is_not_followed(tmp_path: Path, kind: str, depth: int) -> None:
+    home = treasure(tmp_path / "home")
+    before = contents(home)
+    path = output_path(tmp_path / "out", "masks", "left", "001.png")
+    plant(kind, output_path(tmp_path / "out", *path.names[:depth]).path, home)
+    for write in (
+        lambda: write_bytes(path, b"new"),
+        lambda: append_line(path, b"new"),
+        lambda: remove_file(path),
+        lambda: locked_folder(path.parent).__enter__(),
+        lambda: sign_lock(open_lock(path), "me"),
+        lambda: published(path, overwrite=True).__enter__(),
+    ):
+        try:
+            write()
+        except OutputError as error:
+            assert "Remove it" in str(error) or "Name a" in str(error), error
+        except FileNotFoundError:
+            pass
+        assert contents(home) == before
+    if kind == "folder":
+        assert (tmp_path / "out" / Path(*path.names[:depth]) / "own.txt").read_text() == PRECIOUS
+
+
+def test_the_folder_that_a_person_names_may_be_a_link(tmp_path: Path) -> None:
+    (tmp_path / "large disk").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "large disk")
+    write_text(output_path(tmp_path / "out", "a"), "new")
+    assert (tmp_path / "large disk" / "a").read_text() == "new"
+
+
+def test_a_link_under_the_name_of_a_file_is_replaced_and_not_followed(tmp_path: Path) -> None:
+    home = treasure(tmp_path / "home")
+    (tmp_path / "a").symlink_to(home / "bashrc")
+    assert not holds_file(tmp_path / "a")
+    write_text(tmp_path / "a", "new")
+    assert (home / "bashrc").read_text() == PRECIOUS and (tmp_path / "a").read_text() == "new"
+    assert holds_file(tmp_path / "a")
+
+
+def test_lines_are_added_and_a_torn_one_is_ended(tmp_path: Path) -> None:
+    append_line(tmp_path / "results" / "a.jsonl", b"1")
+    with (tmp_path / "results" / "a.jsonl").open("ab") as stream:
+        stream.write(b"to")
+    append_line(tmp_path / "results" / "a.jsonl", b"2")
+    assert (tmp_path / "results" / "a.jsonl").read_bytes() == b"1\nto\n2\n"
+
+
+def test_a_folder_is_locked_for_others_until_the_block_ends(tmp_path: Path) -> None:
+    with locked_folder(tmp_path / "out"):
+        with pytest.raises(BusyError, match=r"another process is writing to .*out"), locked_folder(tmp_path / "out"):
+            pass
+    with locked_folder(tmp_path / "out"):
+        assert os.listdir(tmp_path / "out") == []
+
+
+def test_a_lock_file_names_its_holder_and_never_overwrites_what_is_not_ours(tmp_path: Path) -> None:
+    (tmp_path / "foreign").write_text(PRECIOUS)
+    for name in ("own", "foreign"):
+        first, second = open_lock(tmp_path / name), open_lock(tmp_path / name)
+        assert try_lock(first) and not try_lock(second)
+        sign_lock(first, "process 7")
+        assert lock_holder(second) == ("process 7" if name == "own" else None)
+        os.close(first)
+        assert try_lock(second)
+        os.close(second)
+    assert (tmp_path / "foreign").read_text() == PRECIOUS
+
+
+def test_a_disk_that_refuses_is_told_in_words(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"cannot be written \(Not a directory\).*name a folder you may write to"):
+        write_text(tmp_path / "file" / "out", "new")
