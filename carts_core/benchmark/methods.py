@@ -40,6 +40,7 @@ METHODS = {
     "start": Method("CaRTS without optimization", _start),
     "l1": Method("CaRTS L1 (paper's setting)", lambda _: replace(OptimizerSettings.paper(50), loss="l1")),
     "paper": Method("CaRTS ACS (paper's setting)", OptimizerSettings.paper),
+    "acs": Method("CaRTS ACS, our schedule", lambda _: OptimizerSettings.acs()),
     "ours": Method("CaRTS, ours", _ours),
     "ours_told": Method("ours, occluder given", _ours, told=True),
     "ours_proposed": Method("ours, ignore mask proposed", lambda _: OptimizerSettings(propose_ignore=True)),

@@ -1,24 +1,26 @@
 """Every run of a benchmark, in the order in which it is done."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence as Items
 
 from ..settings import DOMAINS
 from .methods import MAIN, METHODS
 from .occlusion import OCCLUSION
-from .scope import REAL, SYNTHETIC, Run, Scope
+from .scope import REAL, ROOMS, SYNTHETIC, Run, Scope
 from .sources import Source
 
 _UNDER_OCCLUDERS = ("ours", "ours_told", "ours_proposed")
 
 
-def plan(scope: Scope, sources: Iterable[Source]) -> list[Run]:
+def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
     """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
 
-    Frames on which not all methods are evaluated come after that, and frames that are corrected together last.
+    Frames on which not all methods are evaluated come after that, then frames that are corrected together, and other
+    rooms last.
     """
-    sources = list(sources)
+    rooms = [source for source in sources if source.name.startswith(ROOMS)]
+    sources = [source for source in sources if source not in rooms]
     runs: list[Run] = []
-    for turn in range(max(len(source.frames) for source in sources)):
+    for turn in range(max((len(source.frames) for source in sources), default=0)):
         for source in sources:
             if turn < len(source.frames):
                 runs += _runs_of_frame(scope, source, source.frames[turn])
@@ -26,13 +28,23 @@ def plan(scope: Scope, sources: Iterable[Source]) -> list[Run]:
         for frame in source.further:
             runs += _runs_of_further_frame(scope, source, frame)
     together = [name for name, method in METHODS.items() if method.together]
-    return runs + [
+    runs += [
         Run(source.name, domain, frame, method, error)
         for source in sources
         for error in (None, *(scope.consecutive_errors_deg if source.name == SYNTHETIC else ()))
         for domain in scope.consecutive_domains
         for method in together
         for frame in source.consecutive
+    ]
+    return runs + [run for source in rooms for run in _runs_in_rooms(source)]
+
+
+def _runs_in_rooms(source: Source) -> list[Run]:
+    return [
+        Run(source.name, room, frame, method)
+        for room in source.rooms
+        for method, frames in (("ours", source.frames), ("acs", source.frames), ("sequence", source.consecutive))
+        for frame in frames
     ]
 
 

@@ -13,7 +13,7 @@ from . import paper
 from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
 from .frame import TOLERANCE
-from .further_tables import calibration_table, camera_table, occlusion_table, sequence_table
+from .further_tables import calibration_table, camera_table, occlusion_table, room_table, sequence_table
 from .measurement import Measurement
 from .page import PAGE
 from .speed_tables import pair_table, speed_table, stage_table, worse_table
@@ -57,6 +57,7 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         ("Several cameras", _known(camera_table(data))),
         ("Calibration", _known(calibration_table(data))),
         ("Sequence mode", _known(sequence_table(data))),
+        ("Other rooms", _known(room_table(data))),
         ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
     ]

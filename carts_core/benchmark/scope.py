@@ -7,6 +7,8 @@ from ..settings import DOMAINS
 
 SYNTHETIC = "synthetic"
 REAL = "real"
+ROOMS = "rooms"
+"""Real instruments in other rooms; a source of that name and the camera's."""
 PAPERS_STEPS = 50
 """The paper's number of steps."""
 
@@ -16,9 +18,9 @@ class Run:
     """One method on one frame from one start."""
 
     source: str
-    """`synthetic` or `real`."""
+    """`synthetic`, `real`, or `rooms` and a camera."""
     domain: str
-    """One of the synthetic domains, or `occlusion`."""
+    """One of the synthetic domains, `occlusion`, or a room."""
     frame: int
     """Position in the sequence."""
     method: str
@@ -62,6 +64,12 @@ class Scope:
     """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
     calibration_frames: int
     """Frames of a real sequence that are calibrated with, evenly spread."""
+    room_frames: int
+    """Frames of a real sequence that are put into each of the other rooms, evenly spread."""
+    room_consecutive: int
+    """Frames, likewise, that are corrected together there."""
+    room_share: int
+    """Only every so many rooms are measured."""
 
     def steps(self, run: Run) -> int:
         """Steps in the paper's setting for a run."""
@@ -96,6 +104,9 @@ QUICK = Scope(
     consecutive_domains=("regular",),
     consecutive_errors_deg=(2.0,),
     calibration_frames=8,
+    room_frames=1,
+    room_consecutive=0,
+    room_share=8,
 )
 FULL = Scope(
     frames=8,
@@ -112,4 +123,7 @@ FULL = Scope(
     consecutive_domains=DOMAINS,
     consecutive_errors_deg=(1.0, 2.0, 3.0),
     calibration_frames=20,
+    room_frames=2,
+    room_consecutive=8,
+    room_share=1,
 )

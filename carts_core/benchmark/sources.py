@@ -18,15 +18,18 @@ from ..settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisCon
 from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from ..wording import counted
+from .another_room import AnotherRoom
 from .backdrop import backdrop
 from .counterfactual import Counterfactual
 from .fingerprints import code_fingerprint
-from .scope import REAL, SYNTHETIC, Scope
+from .rooms import made_rooms, photographs
+from .scope import REAL, ROOMS, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
 _MOTION_SECONDS = 6.0
 _SYNTHESIS = ("synthesis/*.py", "settings/synthesis.py")
+_ROOMS_CODE = ("benchmark/another_room.py", "benchmark/rooms.py")
 _ALTERING_CODE = ("benchmark/backdrop.py", "benchmark/counterfactual.py", "benchmark/real_surface.py")
 
 
@@ -55,7 +58,7 @@ class Source:
     """Frames to evaluate. Nothing is rendered before `open` is called."""
 
     name: str
-    """`synthetic` or `real`."""
+    """`synthetic`, `real`, or `rooms` and a camera."""
     description: str
     """For people: which frames these are."""
     camera: str
@@ -69,6 +72,8 @@ class Source:
     """All cameras that see the regular domain."""
     consecutive: list[int] = field(default_factory=list)
     """Positions of frames that are corrected together."""
+    rooms: list[str] = field(default_factory=list)
+    """The rooms that these frames are put into, where that is what the source does."""
 
     @property
     def further(self) -> list[int]:
@@ -158,3 +163,47 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         cameras=tuple(camera.name for camera in sequence.scene.cameras),
         consecutive=consecutive,
     )
+
+
+def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
+    """The frames of a real sequence that have a mask, put into other rooms: a source for each camera that has masks.
+
+    Args:
+        path: of the sequence.
+        folder: with photographs, which are rooms beside the made ones; None for no photographs.
+        scope: how much is measured.
+        seed: of light and noise.
+
+    Raises:
+        SequenceError: the sequence is not usable.
+        SettingsError: the folder holds no photograph.
+    """
+    sequence = Sequence.open(path)
+    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
+    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code_fingerprint(_ROOMS_CODE))).encode())
+    for photograph in sorted(folder.glob("*")) if folder else []:
+        fingerprint.update(photograph.name.encode() + photograph.read_bytes())
+    sources = []
+    for camera in (known.name for known in sequence.scene.cameras):
+        masked = [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]
+        if not masked:
+            continue
+        frames = [masked[place] for place in spread(len(masked), scope.room_frames + 2)[1:-1]]
+        together = [masked[place] for place in spread(len(masked), scope.room_consecutive)]
+        for index in sorted({*frames, *together}):
+            frame = sequence.frame(index, cameras=[camera])
+            fingerprint.update(frame.images[camera].tobytes())
+            fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
+        sources.append(
+            Source(
+                f"{ROOMS} {camera}",
+                f"{sequence.name}, camera {camera}, {counted(len(frames), 'frame')} in {counted(len(rooms), 'room')}",
+                camera,
+                frames,
+                fingerprint.hexdigest()[:32],
+                lambda _: AnotherRoom(sequence, rooms, seed),
+                consecutive=together,
+                rooms=[room.domain for room in rooms],
+            )
+        )
+    return sources

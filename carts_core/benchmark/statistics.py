@@ -9,6 +9,8 @@ from ..settings import DOMAINS
 from .measurement import Measurement, Score
 from .methods import MAIN
 from .occlusion import OCCLUSION
+from .rooms import Half
+from .scope import ROOMS
 
 ANY = object()
 """Matches every error at the start."""
@@ -70,8 +72,24 @@ class Measurements:
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self) -> list[str]:
-        """The sources that occur."""
-        return list(dict.fromkeys(measurement.run.source for measurement in self.all))
+        """The sources that occur, without other rooms, whose domains are none of the usual ones."""
+        found = dict.fromkeys(measurement.run.source for measurement in self.all)
+        return [source for source in found if not source.startswith(ROOMS)]
+
+    def in_rooms(self, camera: str, half: Half, method: str) -> list[Measurement]:
+        """Those of a camera's frames in the other rooms of one half."""
+        return [
+            measurement
+            for measurement in self.all
+            if measurement.run.source == f"{ROOMS} {camera}"
+            and measurement.run.domain.startswith(half)
+            and measurement.run.method == method
+        ]
+
+    def room_cameras(self) -> list[str]:
+        """The cameras whose frames were put into other rooms."""
+        found = dict.fromkeys(m.run.source for m in self.all if m.run.source.startswith(ROOMS))
+        return [source.removeprefix(ROOMS).strip() for source in found]
 
 
 def scores(measurements: Iterable[Measurement], iterations: int | None = None) -> list[Score]:

@@ -23,7 +23,9 @@ class Bench:
     quick: bool = False
     """Few frames and steps: some minutes instead of hours."""
     real: Path | None = None
-    """Sequence file with real frames and masks, to be measured too."""
+    """Sequence file with real frames and masks, to be measured too, also with their instruments in other rooms."""
+    rooms: Path | None = None
+    """Folder of photographs to put the real instruments before, besides made rooms."""
     report_only: bool = False
     """Measure nothing; write the report of what is there."""
     frames: int | None = None
@@ -38,7 +40,7 @@ class Bench:
 
         from ..benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
         from ..benchmark.fingerprints import code_fingerprint
-        from ..benchmark.sources import real_source, synthetic_source
+        from ..benchmark.sources import real_source, room_sources, synthetic_source
         from ..benchmark.stages import known_stages, measure_stages
         from ..features.extractor import FeatureExtractor
 
@@ -47,12 +49,14 @@ class Bench:
         if self.frames is not None:
             scope = scope.with_frames(self.frames)
         name = "quick" if self.quick else "full"
+        if self.rooms is not None and self.real is None:
+            raise CartsError("--rooms was given without --real. Say which real frames are to be put into these rooms.")
         folder = self.output or _DEFAULT_FOLDER / name
         seed = TEST_SEED if self.seed is None else self.seed
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         sources = [synthetic_source(scope, seed)]
         if self.real is not None:
-            sources.append(real_source(self.real, scope, seed))
+            sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
         runs = plan(scope, sources)
         results = ResultsFile(folder / "measurements.jsonl")
         benchmark = Benchmark(scope, sources, extractor, results, runs)

@@ -27,6 +27,9 @@ TINY = Scope(
     consecutive_domains=("regular",),
     consecutive_errors_deg=(2.0,),
     calibration_frames=2,
+    room_frames=1,
+    room_consecutive=2,
+    room_share=16,
 )
 
 
