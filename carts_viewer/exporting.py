@@ -33,7 +33,14 @@ FRAME_CHOICES = {
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
 }
 """What people can choose: review states of the frames that are exported."""
-_STEMS = {"csv": "kinematics", "npz": "kinematics", "json": "kinematics", "dvrk": "base_frames"}
+_STEMS = {
+    "csv": "kinematics",
+    "npz": "kinematics",
+    "json": "kinematics",
+    "dvrk": "base_frames",
+    "dvrk-2.3": "base_frames",
+    "dvrk-suj": "suj",
+}
 """How a file is called where the format's own name would say nothing."""
 _SOURCES = {
     Source.MEASURED: "measured",

@@ -1,13 +1,17 @@
-"""Base frames as the dVRK's console reads them.
+"""Base frames as the dVRK reads them.
 
-The console's configuration (`console-*.json`) may give each entry of its list `arms` a fixed `base-frame`, made of
-`reference-frame` (a name) and `transform` (4x4, metres). It is the arm's base seen from the camera, in the dVRK's own
-camera frame: x left, y up, z away from the surgeon, so half a turn about z from OpenCV's.
-Documented in the wiki of jhu-dvrk/sawIntuitiveResearchKit, pages "File Formats" and "Coordinate Systems".
+The system's configuration (`system-*.json`; until 2.3 the console's, `console-*.json`) may give each entry of its list
+`arms` a fixed `base_frame`, made of `reference_frame` (a name) and `transform` (4x4, metres). Until 2.3 the keys had
+hyphens. Where set-up joints (SUJ) are simulated as fixed, their file gives each arm a `measured_cp` instead. All of
+them are the arm's base seen from the camera, in the dVRK's own camera frame: x left, y up, z away from the surgeon, so
+half a turn about z from OpenCV's. The keys are those of jhu-dvrk/sawIntuitiveResearchKit:
+share/schemas/dvrk-system-arm.schema.json and share/suj-fixed.json.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +22,7 @@ from .dataset import Dataset
 from .monitor import Monitor
 
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From OpenCV's camera frame to the dVRK's."""
+"""From OpenCV's camera frame to the dVRK's; its own inverse."""
 
 
 def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:
@@ -27,16 +31,26 @@ def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:
 
 
 def write_dvrk(dataset: Dataset, path: Path, monitor: Monitor) -> None:
-    """Base frames of all arms in the frame of the first exported camera, to be merged into a console's file."""
+    """Base frames of all arms in the frame of the first exported camera, to be merged into a system's file (2.4)."""
+    _write(dataset, path, monitor, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
+
+
+def write_dvrk_2_3(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+    """The same for a console's file of 2.3 and earlier."""
+    _write(dataset, path, monitor, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
+
+
+def write_dvrk_suj(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+    """The same as a file of fixed set-up joints."""
+    _write(dataset, path, monitor, lambda _, T: {"measured_cp": T})
+
+
+def _write(
+    dataset: Dataset, path: Path, monitor: Monitor, entry: Callable[[str, list[list[float]]], dict[str, Any]]
+) -> None:
     camera = dataset.scene.cameras[0]
     arms = [
-        {
-            "name": arm.name,
-            "base-frame": {
-                "reference-frame": camera.name,
-                "transform": base_frame_transform(arm, camera).tolist(),
-            },
-        }
+        {"name": arm.name, **entry(camera.name, base_frame_transform(arm, camera).tolist())}
         for arm in monitor.track(dataset.scene.arms)
     ]
     path.write_text(json.dumps({"arms": arms}, indent=1, ensure_ascii=False), encoding="utf-8")

@@ -10,7 +10,7 @@ from .coco import write_coco
 from .cvat import write_cvat
 from .dataset import Dataset
 from .datumaro import write_datumaro
-from .dvrk import write_dvrk
+from .dvrk import write_dvrk, write_dvrk_2_3, write_dvrk_suj
 from .kinematics_files import write_kinematics_csv, write_kinematics_json, write_kinematics_npz
 from .masks import write_masks
 from .monitor import Monitor
@@ -43,6 +43,8 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
     "dvrk": ExportFormat("Base frames for the dVRK", write_dvrk, ".json"),
+    "dvrk-2.3": ExportFormat("Base frames for the dVRK until 2.3", write_dvrk_2_3, ".json"),
+    "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
 }
 

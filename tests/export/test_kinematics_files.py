@@ -11,9 +11,10 @@ import pytest
 from awkward import ARMS, CAMERA, SOURCES, all_views
 
 from carts_core.errors import SequenceError
-from carts_core.export import Dataset, export, read_kinematics_csv
+from carts_core.export import Dataset, FormatName, export, read_kinematics_csv
 from carts_core.export.kinematics import joint_columns, kinematics_csv
 from carts_core.export.video import frame_rate
+from carts_core.recording import read_base_frames
 
 
 def _positions(dataset: Dataset) -> np.ndarray:
@@ -94,17 +95,34 @@ def test_a_file_gets_the_suffix_of_its_format(dataset: Dataset, tmp_path: Path) 
     assert export(dataset, "json", tmp_path / "OUT.JSON") == tmp_path / "OUT.JSON"
 
 
-def test_base_frames_are_in_the_consoles_axes_of_the_camera(dataset: Dataset, tmp_path: Path) -> None:
-    content = json.loads(export(dataset, "dvrk", tmp_path / "out.json").read_text(encoding="utf-8"))
+@pytest.mark.parametrize(
+    ("name", "frame", "reference", "transform"),
+    [
+        ("dvrk", "base_frame", "reference_frame", "transform"),
+        ("dvrk-2.3", "base-frame", "reference-frame", "transform"),
+        ("dvrk-suj", None, None, "measured_cp"),
+    ],
+)
+def test_base_frames_have_the_keys_of_their_version_and_the_dvrks_axes_of_the_camera(
+    dataset: Dataset, tmp_path: Path, name: FormatName, frame: str | None, reference: str | None, transform: str
+) -> None:
+    path = export(dataset, name, tmp_path / "out.json")
+    content = json.loads(path.read_text(encoding="utf-8"))
     assert [arm["name"] for arm in content["arms"]] == list(ARMS)
     camera = dataset.scene.cameras[0]
     tip = np.array([0.01, 0.02, -0.1, 1.0])
-    for arm, entry in zip(dataset.scene.arms, content["arms"], strict=True):
-        assert entry["base-frame"]["reference-frame"] == CAMERA
-        x, y, z, one = np.array(entry["base-frame"]["transform"]) @ tip
+    read_back = read_base_frames(path)
+    for arm, entry, back in zip(dataset.scene.arms, content["arms"], read_back, strict=True):
+        # The schema of 2.4 allows no other keys.
+        assert set(entry) == {"name", frame or transform}
+        values = entry[frame] if frame else entry
+        if reference:
+            assert set(values) == {reference, transform} and values[reference] == CAMERA
+        x, y, z, one = np.array(values[transform]) @ tip
         seen = camera.T_camera_world @ arm.T_world_base @ tip
         # OpenCV has x right and y down, the dVRK x left and y up; both look along z.
         np.testing.assert_allclose([-x, -y, z, one], seen, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(back.T_camera_base @ tip, seen, rtol=0, atol=1e-6)
 
 
 def test_a_video_shows_every_frame_and_the_arms(dataset: Dataset, tmp_path: Path) -> None:
