@@ -16,6 +16,7 @@ from .commands.evaluate import Evaluate
 from .commands.export import Export
 from .commands.optimize import Optimize
 from .commands.render import Render
+from .commands.robot import RobotCommand
 from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
@@ -35,6 +36,7 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
