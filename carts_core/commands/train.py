@@ -31,7 +31,7 @@ class Train:
 
             def report(progress: TrainingProgress) -> None:
                 text = f"loss {progress.loss:.3f}, {progress.seconds_per_step:.2f} s a step"
-                bar.update(task, completed=progress.step, description=text)
+                bar.update(task, completed=progress.step, total=progress.steps, description=text)
 
             result = train(self.training, self.output, report)
         console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")

@@ -4,14 +4,14 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ..errors import SettingsError
-from ..settings import TrainingConfig
+from ..settings import Architecture, TrainingConfig
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .growth import grow
 from .loader import training_batches, validation_set
@@ -23,7 +23,7 @@ from .weights import read_weights, save_weights
 
 _LOG_EVERY = 10
 _EXAMPLES = 6
-_MAY_CHANGE = ("steps", "workers", "threads", "device", "validation_every", "checkpoint_every")
+_MAY_CHANGE = ("steps", "minutes", "workers", "threads", "device", "validation_every", "checkpoint_every")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class TrainingProgress:
     step: int
     """Steps done."""
     steps: int
-    """Steps in all."""
+    """Steps in all; an estimate in a run of limited time."""
     loss: float
     """Loss, averaged over the last steps."""
     seconds_per_step: float
@@ -71,7 +71,7 @@ def train(
     """
     output.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(config.threads)
-    run = _Run(config, output)
+    run = _Run(_as_large_as_start(config), output)
     return run.finish(progress or (lambda event: None))
 
 
@@ -89,6 +89,7 @@ class _Run:
         self.modules = {"network": self.network, "average": self.average}
         self.step, self.history = 0, History()
         self._resume()
+        self._clock = time.perf_counter()
 
     def _resume(self) -> None:
         checkpoint = load_checkpoint(self.output)
@@ -108,24 +109,25 @@ class _Run:
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
         samples = validation_set(self.config)
         validation = None
-        if self.step < self.config.steps:
+        if self.step < self._planned():
             batches = training_batches(self.config, self.step)
             sums: dict[str, float] = {}
-            count, started = 0, time.perf_counter()
-            while self.step < self.config.steps:
+            count, self._clock = 0, time.perf_counter()
+            last = False
+            while not last:
                 for name, value in self._train_step(next(batches)).items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
-                last = self.step == self.config.steps
+                last = self.step == self._planned()
                 if last or self.step % self.config.validation_every == 0:
                     validation = self._validate(samples)
                 if last or count == _LOG_EVERY:
                     means = {name: value / count for name, value in sums.items()}
                     self.history.losses.append({"step": self.step, **means})
-                    elapsed = time.perf_counter() - started
+                    elapsed = time.perf_counter() - self._clock
                     self.history.seconds += elapsed
-                    progress(TrainingProgress(self.step, self.config.steps, means["loss"], elapsed / count, validation))
-                    sums, count, started = {}, 0, time.perf_counter()
+                    progress(TrainingProgress(self.step, self._planned(), means["loss"], elapsed / count, validation))
+                    sums, count, self._clock = {}, 0, time.perf_counter()
                 if last or self.step % self.config.checkpoint_every == 0:
                     self._checkpoint()
         if validation is None:
@@ -137,9 +139,16 @@ class _Run:
         )
         return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
 
+    def _planned(self) -> int:
+        """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
+        if self.config.minutes is None or self.step == 0:
+            return self.config.steps
+        seconds = self.history.seconds + time.perf_counter() - self._clock
+        return min(self.config.steps, max(self.step, int(self.step * 60 * self.config.minutes / seconds)))
+
     def _train_step(self, batch: Batch) -> dict[str, float]:
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self.config.steps)
+            group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self._planned())
         self.network.train()
         on_device = tuple(part.to(self.config.device) for part in batch)
         loss, terms = self.task.loss(self.config, self.network, on_device)
@@ -197,6 +206,13 @@ def _first_network(config: TrainingConfig) -> UNet:
         ) from error
 
 
+def _as_large_as_start(config: TrainingConfig) -> TrainingConfig:
+    """The settings with the architecture of the weights to start from, if none was asked for."""
+    if config.start is None or config.architecture != Architecture():
+        return config
+    return replace(config, architecture=read_weights(config.start).network.architecture)
+
+
 def weights_file(config: TrainingConfig, output: Path) -> Path:
     """Where a run leaves its weights."""
     return output / f"{config.network}.safetensors"
@@ -214,4 +230,6 @@ def config_json(config: TrainingConfig) -> str:
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
+    folder = config.images.photographs
+    settings["images"]["photographs"] = folder.name if folder else None
     return json.dumps(settings)

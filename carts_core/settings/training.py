@@ -23,10 +23,12 @@ class TrainingConfig:
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots whose images are made."""
     start: Path | None = None
-    """Weights file to start from, for fine-tuning; random weights without it. A network that is smaller
-    than the one that is asked for grows."""
+    """Weights file to start from, for fine-tuning; random weights without it. The network is as large as these,
+    unless another architecture is asked for, into which it then grows."""
     steps: int = 4000
     """Optimizer steps."""
+    minutes: float | None = None
+    """Time for training [min]; a run that would take longer has fewer steps."""
     batch_size: int = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: int = 2
@@ -82,6 +84,8 @@ class TrainingConfig:
                 f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and "
                 "a decay of 0 or more."
             )
+        if self.minutes is not None and not self.minutes > 0:
+            raise SettingsError(f"minutes is {self.minutes}; give a positive time, or leave it out.")
         if not 0 <= self.average < 1:
             raise SettingsError(f"average is {self.average}; give a decay from 0 (no average) to below 1.")
         if not self.robots:

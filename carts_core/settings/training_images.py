@@ -1,9 +1,12 @@
 """What the images look like that networks are trained on."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from ..errors import SettingsError
 from .appearance import AppearanceRanges
+
+_SHARES = ("two_arms", "same_kinematics", "same_background", "occluded", "things", "absent", "from_photographs")
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,14 @@ class ImageSettings:
     """Share of pairs whose mean background is that of the observed image."""
     occluded: float = 0.4
     """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
+    things: float = 0.35
+    """Share of observed images with rods, plates, cables and the like behind the arms."""
+    absent: float = 0.1
+    """Share of observed images in which one arm or all are claimed to be in view and are not."""
+    photographs: Path | None = None
+    """Folder of photographs; `from_photographs` of the backgrounds are parts of them."""
+    from_photographs: float = 0.2
+    """Share of backgrounds that are parts of photographs, if a folder of them is given."""
     coverage: tuple[float, float] = (0.004, 0.5)
     """Allowed share of the image that shows arms."""
     appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
@@ -36,7 +47,7 @@ class ImageSettings:
             )
         if self.field_width < self.width:
             raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
-        for name in ("two_arms", "same_kinematics", "same_background", "occluded"):
+        for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
         if not 0 <= self.coverage[0] < self.coverage[1] <= 1:

@@ -34,7 +34,7 @@ SMALL = {
 
 def small_config(**changes) -> TrainingConfig:
     architecture = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
-    images = ImageSettings(width=64, height=48, field_width=80)
+    images = ImageSettings(width=64, height=48, field_width=80, things=0.0, absent=0.0)
     return TrainingConfig(**({**SMALL, "steps": 30, "architecture": architecture, "images": images} | changes))
 
 
@@ -107,6 +107,18 @@ def test_a_restored_network_is_the_one_that_was_saved(tmp_path: Path):
     assert all(torch.equal(value, again.tensors[name]) for name, value in first.tensors.items())
 
 
+def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(tmp_path: Path):
+    events: list[TrainingProgress] = []
+    config = small_config(steps=100_000, minutes=0.1, validation_every=1_000)
+    result = train(config, tmp_path, events.append)
+    assert 5 <= result.seconds < 30
+    assert 10 < events[-1].step == events[-1].steps < 100_000
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None and checkpoint.step == events[-1].step
+    assert checkpoint.history.losses[-1]["step"] == checkpoint.step
+    assert train(config, tmp_path).seconds == result.seconds
+
+
 def test_the_same_seed_trains_the_same_network(tmp_path: Path):
     for name in ("a", "b"):
         train(small_config(steps=6), tmp_path / name)
@@ -127,6 +139,14 @@ def test_fine_tuning_starts_from_the_given_weights(tmp_path: Path, small_weights
     given = dict(read_weights(small_weights).network.named_parameters())
     for name, value in read_weights(result.weights).network.named_parameters():
         torch.testing.assert_close(value, given[name], atol=1e-6, rtol=1e-4)
+
+
+def test_fine_tuning_takes_the_architecture_of_the_weights(tmp_path: Path, small_weights: Path):
+    for _ in range(2):  # the second time, the run is there already and must count as the same
+        result = train(small_config(start=small_weights, architecture=Architecture(), steps=1), tmp_path)
+    weights = read_weights(result.weights)
+    assert weights.network.architecture == read_weights(small_weights).network.architecture != Architecture()
+    assert weights.training["config"]["architecture"]["widths"] == list(weights.network.architecture.widths)
 
 
 def test_fine_tuning_grows_into_a_larger_architecture(tmp_path: Path, small_weights: Path):
@@ -182,7 +202,16 @@ def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"steps": 0}, {"average": 1.0}, {"learning_rate": 0.0}, {"robots": ()}, {"workers": -1}, {"reuse": 0}]
+    "changes",
+    [
+        {"steps": 0},
+        {"average": 1.0},
+        {"learning_rate": 0.0},
+        {"robots": ()},
+        {"workers": -1},
+        {"reuse": 0},
+        {"minutes": 0},
+    ],
 )
 def test_settings_out_of_range_are_refused(changes: dict):
     with pytest.raises(SettingsError, match="give"):

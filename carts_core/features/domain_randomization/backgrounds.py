@@ -1,8 +1,11 @@
-"""Procedural backgrounds: tissue, cloth, boards, anything smooth or patterned, in display colours."""
+"""Procedural backgrounds: tissue, rooms, cloth, boards, anything smooth or patterned, in display colours."""
 
 import cv2
 import numpy as np
 from jaxtyping import Float
+
+from .noise import grain, smooth_noise
+from .rooms import drape, foil, plain, room
 
 Image = Float[np.ndarray, "h w 3"]
 
@@ -27,16 +30,8 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
 
     Its mean brightness stays above about 0.25: low light is no part of the training data.
     """
-    kind = rng.choice(["tissue", "board", "free", "pattern"], p=[0.55, 0.27, 0.11, 0.07])
-    if kind == "tissue":
-        image = _tissue(rng, width, height)
-    elif kind == "board":
-        image = _board(rng, width, height)
-    elif kind == "free":
-        image = _blend(rng, rng.uniform(0.1, 0.95, (3, 3)).astype(np.float32), width, height)
-        image *= 1 + rng.uniform(0, 0.12) * _grain(rng, width, height)
-    else:
-        image = _pattern(rng, width, height)
+    name = rng.choice(list(_SHARES), p=list(_SHARES.values()))
+    image = MAKERS[name](rng, width, height).astype(np.float32)
     image = np.clip(image, 0, 1)
     mean = image.mean()
     if mean < 0.25:
@@ -44,25 +39,10 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
     return image * _illumination(rng, width, height)
 
 
-def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
-    """Multi-octave noise, zero mean, about unit deviation [height, width]; `cells` are the coarsest cells per width."""
-    noise = np.zeros((height, width), np.float32)
-    amplitude = 1.0
-    for _ in range(octaves):
-        columns = max(int(cells), 2)
-        rows = max(int(cells * height / width), 2)
-        grid = rng.standard_normal((rows, columns), np.float32)
-        noise += amplitude * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
-        cells *= 2.1
-        amplitude *= 0.55
-    return (noise - noise.mean()) / (noise.std() + 1e-6)
-
-
-def _grain(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Fine texture of about unit deviation, some pixels wide [height, width, 1]."""
-    grain = rng.standard_normal((height, width), np.float32)
-    grain = cv2.GaussianBlur(grain, (0, 0), rng.uniform(0.5, 2.0))
-    return (grain / (grain.std() + 1e-6))[..., None]
+def _free(rng: np.random.Generator, width: int, height: int) -> Image:
+    """Clouds of any colours."""
+    image = _blend(rng, rng.uniform(0.1, 0.95, (3, 3)).astype(np.float32), width, height)
+    return image * (1 + rng.uniform(0, 0.12) * grain(rng, width, height))
 
 
 def _blend(rng: np.random.Generator, colors: np.ndarray, width: int, height: int) -> Image:
@@ -81,7 +61,7 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
     image = _blend(rng, colors.astype(np.float32), width, height)
     relief = smooth_noise(rng, width, height, rng.uniform(4, 20), 3)
     image = image * (1 + rng.uniform(0, 0.15) * relief[..., None])
-    image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
+    image = image * (1 + rng.uniform(0, 0.06) * grain(rng, width, height))
     for _ in range(rng.integers(0, 8)):
         image = _vessel(rng, image)
     for _ in range(rng.choice([0, 1, 2, 4], p=[0.35, 0.25, 0.25, 0.15])):
@@ -174,7 +154,7 @@ def _board(rng: np.random.Generator, width: int, height: int) -> Image:
     color = _BOARD[rng.integers(len(_BOARD))] * np.clip(rng.normal(1, 0.12, 3), 0.6, 1.4)
     stain = smooth_noise(rng, width, height, rng.uniform(2, 8), 4)[..., None]
     image = color * (1 + rng.uniform(0, 0.08) * stain)
-    image = image * (1 + rng.uniform(0, 0.06) * _grain(rng, width, height))
+    image = image * (1 + rng.uniform(0, 0.06) * grain(rng, width, height))
     return image.astype(np.float32)
 
 
@@ -188,7 +168,7 @@ def _pattern(rng: np.random.Generator, width: int, height: int) -> Image:
     share = 1 / (1 + np.exp(-wave * rng.uniform(1, 8)))[..., None]
     first = rng.uniform(0.25, 0.9, 3)
     second = np.clip(first + rng.normal(0, 0.2, 3), 0.15, 0.95)
-    return (first + share * (second - first)).astype(np.float32) * (1 + 0.05 * _grain(rng, width, height))
+    return (first + share * (second - first)).astype(np.float32) * (1 + 0.05 * grain(rng, width, height))
 
 
 def _illumination(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
@@ -199,3 +179,22 @@ def _illumination(rng: np.random.Generator, width: int, height: int) -> np.ndarr
     slope = x * rng.normal(0, 0.2) + y * rng.normal(0, 0.2)
     light = 1 - rng.uniform(0, 0.4) * (1 - spot) + slope
     return np.clip(light, 0.6, 1.25)[..., None].astype(np.float32)
+
+
+MAKERS = {
+    "tissue": _tissue,
+    "board": _board,
+    "free": _free,
+    "pattern": _pattern,
+    "room": room,
+    "plain": plain,
+    "drape": drape,
+    "foil": foil,
+}
+"""Kinds of backgrounds by name; each takes random numbers, width and height [px]."""
+
+_SHARES = {
+    "tissue": 0.42, "board": 0.14, "free": 0.06, "pattern": 0.06,
+    "room": 0.18, "plain": 0.05, "drape": 0.05, "foil": 0.04,
+}  # fmt: skip
+"""How often each kind of background is made; they add up to 1."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...rendering import visibility
-from .geometry import Intrinsics, PosedRobot, RobotGeometry
+from .geometry import Body, Intrinsics, PosedRobot
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class GBuffer:
 
 
 def render_gbuffer(
-    geometries: Sequence[RobotGeometry],
+    geometries: Sequence[Body],
     posed: Sequence[PosedRobot],
     intrinsics: Intrinsics,
     width: int,

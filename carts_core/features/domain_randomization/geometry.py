@@ -1,6 +1,7 @@
 """A robot's meshes as flat arrays, posed in front of a camera."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,6 +20,23 @@ class PosedRobot:
 
     vertices: Float[np.ndarray, "V 3"]
     normals: Float[np.ndarray, "V 3"]
+
+
+class Body(Protocol):
+    """Triangles that can be rasterised and shaded; see `RobotGeometry` for the attributes."""
+
+    @property
+    def vertices(self) -> Float[np.ndarray, "V 3"]: ...
+    @property
+    def faces(self) -> Int[np.ndarray, "F 3"]: ...
+    @property
+    def face_part(self) -> Int[np.ndarray, " F"]: ...
+    @property
+    def shaft(self) -> int: ...
+    @property
+    def shaft_axis(self) -> Float[np.ndarray, "3"]: ...
+    @property
+    def shaft_end(self) -> Float[np.ndarray, "3"]: ...
 
 
 class RobotGeometry:

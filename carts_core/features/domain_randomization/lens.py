@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...settings import AppearanceRanges
-from .backgrounds import smooth_noise
+from .noise import smooth_noise
 
 Image = Float[np.ndarray, "h w 3"]
 

@@ -1,7 +1,7 @@
 """Observed training images: random arms in front of a random camera, shaded and photographed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,14 +15,18 @@ from .gbuffer import GBuffer, render_gbuffer
 from .geometry import Intrinsics, RobotGeometry
 from .lens import photograph
 from .occluders import occlude
+from .photographs import Photographs
 from .placement import Placement, random_intrinsics, random_placement
 from .shading import shade
+from .things import add_things
 from .variants import Variant, random_variant
 
 SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 40
 _TRIES = 12
+_FAR = 100.0
+"""How far behind the camera an arm is that is not there [m]."""
 _CONTACT = 0.4
 """Share of images with a crisp shadow beside the arms."""
 
@@ -35,6 +39,9 @@ class Observation:
     """RGB in [0, 1]."""
     variant: Variant
     placements: list[Placement]
+    """Where the arms are."""
+    claimed: list[Placement]
+    """Where arms are said to be: the same, but for arms that are not there."""
     intrinsics: Intrinsics
     view: GBuffer
     """What each pixel's centre sees."""
@@ -61,6 +68,7 @@ class Observer:
         self.rng = np.random.default_rng(seed)
         self.settings = settings
         self._robots = robots
+        self._photographs = Photographs(settings.photographs) if settings.photographs else None
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
     def __call__(self) -> Observation:
@@ -68,13 +76,19 @@ class Observer:
         rng, settings = self.rng, self.settings
         variant = self._variant(1 + int(rng.random() < settings.two_arms))
         size = settings.width, settings.height
-        intrinsics, placements, view = self._visible_placements(variant)
+        intrinsics, claimed, view = self._visible_placements(variant)
+        placements = claimed
+        if rng.random() < settings.absent:
+            placements = self._without_some(claimed)
+            view = look(variant.geometries, placements, intrinsics, *size)
         fine = look(variant.geometries, placements, intrinsics, *size, SUPERSAMPLING)
         coverage = cv2.resize(fine.image(np.ones(len(fine.rows), np.float32)), size, interpolation=cv2.INTER_AREA)
-        background = add_clutter(rng, random_background(rng, *size)).astype(np.float32)
+        background = self._background(intrinsics, *size)
         camera_seed = int(rng.integers(2**63))
         image = self._observe(variant, fine, background, coverage, camera_seed)
-        return Observation(image, variant, placements, intrinsics, view, fine, coverage, background, camera_seed)
+        return Observation(
+            image, variant, placements, claimed, intrinsics, view, fine, coverage, background, camera_seed
+        )
 
     def _variant(self, arms: int) -> Variant:
         """A scene from a small pool, replaced after some use: building one costs as much as several images."""
@@ -99,6 +113,28 @@ class Observer:
             tries += 1
             if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
                 return intrinsics, placements, view
+
+    def _without_some(self, placements: list[Placement]) -> list[Placement]:
+        """One of the arms, or all, moved behind the camera."""
+        gone = self.rng.random(len(placements)) < 0.5
+        if not gone.any():
+            gone[:] = True
+        behind = np.eye(4)
+        behind[2, 3] = -_FAR
+        return [
+            replace(placement, T_camera_base=behind @ placement.T_camera_base) if away else placement
+            for placement, away in zip(placements, gone, strict=True)
+        ]
+
+    def _background(self, intrinsics: Intrinsics, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
+        rng, settings = self.rng, self.settings
+        if self._photographs is not None and rng.random() < settings.from_photographs:
+            image = self._photographs(rng, width, height)
+        else:
+            image = add_clutter(rng, random_background(rng, width, height))
+        if rng.random() < settings.things:
+            image = add_things(rng, image, intrinsics)
+        return image.astype(np.float32)
 
     def _observe(
         self, variant: Variant, fine: GBuffer, background: np.ndarray, coverage: np.ndarray, camera_seed: int

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from .backgrounds import random_background, smooth_noise
+from .backgrounds import random_background
+from .noise import smooth_noise
 
 Image = Float[np.ndarray, "h w 3"]
 
@@ -23,9 +24,14 @@ def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, 
 
 
 def _texture(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Any texture but a red one: blood over an instrument is evaluated, so it must not be trained on."""
+    """Any texture without red in it: blood over an instrument is evaluated, so it must not be trained on."""
     texture = random_background(rng, width, height).astype(np.float32) * rng.uniform(0.6, 1.2)
-    return np.roll(texture, int(rng.integers(1, 3)), axis=2) if texture.mean((0, 1)).argmax() == 0 else texture
+    # Where red is strongest it changes places with the next, which leaves no seam where both are as strong.
+    red, strongest = texture[..., 0].copy(), 1 + texture[..., 1:].argmax(2)[..., None]
+    other = np.take_along_axis(texture, strongest, 2)[..., 0]
+    texture[..., 0] = np.minimum(red, other)
+    np.put_along_axis(texture, strongest, np.maximum(red, other)[..., None], 2)
+    return texture
 
 
 def _shape(rng: np.random.Generator, centre: tuple[float, float], width: int, height: int) -> Float[np.ndarray, "h w"]:

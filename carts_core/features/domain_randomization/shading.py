@@ -3,6 +3,7 @@
 This path is on purpose not the optimizer's Phong: the network must learn what an instrument is, not our shader.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .gbuffer import GBuffer
-from .geometry import RobotGeometry
+from .geometry import Body
 
 _ENVIRONMENT = (24, 48)
 _GAMMA = 1 / 2.2
@@ -26,7 +27,7 @@ class _Surface:
 
 
 def shade(
-    rng: np.random.Generator, gbuffer: GBuffer, geometries: list[RobotGeometry], ambience: Float[np.ndarray, "3"]
+    rng: np.random.Generator, gbuffer: GBuffer, geometries: Sequence[Body], ambience: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Display colours in [0, 1] of the pixels of `gbuffer`, with random materials, lights and environment.
 
@@ -131,7 +132,7 @@ def _look_up(environment: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return found.reshape(-1, 3)[: len(u)]
 
 
-def _random_surface(rng: np.random.Generator, gbuffer: GBuffer, geometries: list[RobotGeometry]) -> _Surface:
+def _random_surface(rng: np.random.Generator, gbuffer: GBuffer, geometries: Sequence[Body]) -> _Surface:
     n = len(gbuffer.rows)
     albedo, roughness, metalness = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
 

@@ -57,7 +57,7 @@ class SurfaceGenerator:
         scale = _LARGEST_ERROR * float(rng.random()) ** 1.5
         believed = [
             perturbed(rng, geometry, placement, scale)
-            for geometry, placement in zip(seen.variant.rendered, seen.placements, strict=True)
+            for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)
         ]
         wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, believed, seen.intrinsics, *size), size)
         if rng.random() < _UNKNOWN:
