@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .settings import Loss
+from .threads import one_thread
 
 _EMPTY = 1e-6
 
@@ -35,6 +36,7 @@ def cosine_similarity(
     return (dot + _EMPTY) / norms
 
 
+@one_thread()
 def attentional_loss(
     similarity: Float[Tensor, "*batch h w"],
     weight: Float[Tensor, "*batch h w"],
@@ -58,6 +60,7 @@ def attentional_loss(
     return ((1.0 - similarity) * weight).sum((-2, -1)) / area
 
 
+@one_thread()
 def smooth_l1(observed: Float[Tensor, "*batch h w"], rendered: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch"]:
     """Smooth L1 between predicted probabilities, over the whole image ("CaRTS L1"), per image."""
     return functional.smooth_l1_loss(rendered, observed, reduction="none", beta=0.1).mean((-2, -1))

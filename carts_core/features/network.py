@@ -12,6 +12,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ..errors import SettingsError
 from ..settings import Architecture
+from ..threads import one_thread
 
 CONTRAST_FLOOR = 0.02
 """Standard deviation [1] below which an image counts as empty and is not amplified any further."""
@@ -127,6 +128,7 @@ def channels_last(network: Network) -> Network:
     return network
 
 
+@one_thread()
 def standardize(
     images: Float[Tensor, "batch 3 h w"], block: int | None, local_contrast: float = 0.0
 ) -> Float[Tensor, "batch 3 h w"]:

@@ -10,6 +10,7 @@ from torch.nn import functional
 from ..parts import PARTS
 from ..settings import Architecture
 from ..surface import SURFACE_CHANNELS
+from ..threads import one_thread
 from .network import UNet
 
 _HIDDEN = 24
@@ -24,6 +25,7 @@ class SurfaceLogits:
     normals: Float[Tensor, "batch 3 h w"]
     """Mean unit normal times coverage."""
 
+    @one_thread()
     def map(self) -> Float[Tensor, "batch 6 h w"]:
         """The surface map."""
         return torch.cat([self.coverage.softmax(1)[:, 1:], self.normals], 1)
@@ -57,5 +59,7 @@ class SurfaceNetwork(UNet):
         """
         fine, coarse = self.decoded(torch.cat([self.standardized(images), believed], 1))
         grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)
-        out = self.out((grown + self.fine(fine)).relu())
+        hidden = (grown + self.fine(fine)).relu()
+        with one_thread():
+            out = self.out(hidden)
         return SurfaceLogits(out[:, : len(PARTS) + 1], out[:, len(PARTS) + 1 :])

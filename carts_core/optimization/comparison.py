@@ -13,6 +13,7 @@ from ..rendering import JacobianBlock, Renderer, SurfaceRendering
 from ..scene import Scene, SceneState
 from ..settings import OptimizerSettings
 from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ..threads import one_thread, total
 from .inputs import kernel_radius, smoothed
 from .parameters import APART
 from .window import Window
@@ -70,7 +71,9 @@ class Stage:
         for first in range(0, len(states.intrinsics), at_once):
             part = states.map(lambda values, first=first: values[first : first + at_once])
             _, squared, ratio = self._difference(self.renderer.surface_maps(part))
-            found.append(0.5 * self.area * (squared * ratio * self.certainty).flatten(1).sum(1))
+            with one_thread():
+                sums = (squared * ratio * self.certainty).flatten(1).sum(1)
+            found.append(0.5 * self.area * sums)
         return torch.cat(found)
 
     def compare(self, state: SceneState, *, gradient: bool) -> "Comparison":
@@ -83,7 +86,7 @@ class Stage:
         rendering = self.renderer.surface(state, APART if gradient else None, margin)
         model, squared, ratio = self._difference(rendering.maps)
         comparison = Comparison(
-            0.5 * self.area * float((squared * ratio * self.certainty).sum()),
+            0.5 * self.area * total(squared * ratio * self.certainty),
             rendering,
             (1.0 - squared[:, 0]).clamp(min=-1.0),
             (ratio.square() * self._weight * self.certainty)[:, 0],

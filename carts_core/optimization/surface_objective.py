@@ -18,6 +18,7 @@ from ..losses import attention
 from ..scene import Scene
 from ..settings import OptimizerSettings
 from ..surface import COVERAGE
+from ..threads import total
 from .comparison import Stage
 from .evaluation import Evaluation
 from .observability import uncertainty
@@ -182,7 +183,7 @@ class SurfaceObjective:
         for arm in range(len(self.scene.arms)):
             here = found == arm
             area, before = int(here.sum()), int((start == arm).sum())
-            if before and (area < _LEFT * before or float(view.coverage[here].mean()) < _SUPPORT):
+            if before and (area < _LEFT * before or total(view.coverage[here]) < _SUPPORT * area):
                 return True
         return False
 
@@ -330,7 +331,7 @@ class SurfaceObjective:
             finer = self._plan[len(blurs)][1]
             shown = Stage(self.scene, scale.size, scale.zoom, window, *seen, finer, self.settings)
         coverage = observed[:, COVERAGE].sum(1)
-        area = float((coverage * (weight * certain)[:, 0]).sum()) / scale.zoom**2
+        area = total(coverage * (weight * certain)[:, 0]) / scale.zoom**2
         self._view = _View(look, scale, window, coverage, seen, area, stages, shown)
 
     def _of(self, blur: float, whole: bool) -> OptimizerSettings:
@@ -362,7 +363,7 @@ class SurfaceObjective:
                 )
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         # Weighted as the cost is, so that losses compare between clear images and veiled ones.
-        rendered = float((coverage * shown.certainty[:, 0]).sum()) * shown.area
+        rendered = total(coverage * shown.certainty[:, 0]) * shown.area
         area = 0.5 * max(rendered + self._viewed.area, 1.0)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from ..threads import one_thread
 from .jacobian import Tangents
 from .points import VisiblePoints
 
@@ -85,7 +86,9 @@ def outline_position(
     reach = torch.arange(-radius, radius + 1, device=pixel.device)
     around = (reach[:, None] * width + reach).flatten()
     near = inverse_depth.flatten()
-    soft, right, down = kernels @ (near[pixel + around[:, None]] >= (1.0 - _BEHIND) * near[pixel]).float()
+    nearer = (near[pixel + around[:, None]] >= (1.0 - _BEHIND) * near[pixel]).float()
+    with one_thread():
+        soft, right, down = kernels @ nearer
     slope = torch.stack([-right, -down])
     steepness = torch.linalg.vector_norm(slope, dim=0).clamp(min=1e-6)
     normal = slope / steepness
