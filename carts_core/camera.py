@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .errors import SettingsError
+from .files.image_size import pixels_problem
 
 HALF_PIXEL = 0.5
 """Our pixel centres are at +0.5, OpenCV's at 0: OpenCV's principal point is ours minus this [px]."""
@@ -18,10 +19,17 @@ DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may be from the identity, in any element."""
+EXACT = 1e-9
+"""A rotation that is nearer to rigid than this is taken as it is; others are made rigid."""
+LAST_ROW_TOLERANCE = 1e-6
+"""How far the last row may be from 0, 0, 0, 1, as matrices in single precision are."""
+
+FARTHEST = 1e6
+"""Largest coordinate of a transform [m], of a focal length and of a principal point [px]."""
 
 
 def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
-    """`value` as a rigid transform in double precision.
+    """`value` as a rigid transform in double precision; the noise of single precision and of rounding is taken out.
 
     Args:
         value: 4x4 numbers, translation in [m].
@@ -37,8 +45,9 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise SettingsError(f"{what} has shape {matrix.shape}. Give 4 rows of 4 finite numbers.")
     rotation = matrix[:3, :3]
-    deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if deviation > RIGID_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not deviation <= RIGID_TOLERANCE:
         raise SettingsError(
             f"{what} is not rigid: R^T R is off the identity by {deviation:.2g}, allowed is {RIGID_TOLERANCE:g}. "
             "Its upper left 3x3 block must be a rotation, written with at least 5 digits and without scale."
@@ -48,8 +57,15 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
             f"{what} mirrors: the determinant of its rotation is -1, it must be +1. "
             "Check the axes; the camera has x right, y down, z forward."
         )
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
         raise SettingsError(f"the last row of {what} is {matrix[3].tolist()}, it must be [0, 0, 0, 1].")
+    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+        raise SettingsError(f"the translation of {what} is {matrix[:3, 3].tolist()}. Give it in metres.")
+    matrix[3] = (0, 0, 0, 1)
+    if deviation > EXACT:
+        # The nearest rotation, by singular values.
+        left, _, right = np.linalg.svd(rotation)
+        matrix[:3, :3] = left @ right
     return matrix
 
 
@@ -77,6 +93,8 @@ class Camera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise SettingsError(f"the image size is {self.width} x {self.height}. Both must be at least 1 pixel.")
+        if (problem := pixels_problem(self.width, self.height)) is not None:
+            raise SettingsError(f"the image {problem}. Reduce the images.")
         if len(self.intrinsics) != 4 or not np.isfinite(self.intrinsics).all():
             raise SettingsError(f"the intrinsics are {self.intrinsics}. Give four finite numbers fx, fy, cx, cy [px].")
         if min(self.intrinsics[:2]) <= 0:
@@ -84,6 +102,8 @@ class Camera:
                 f"the focal lengths are fx = {self.intrinsics[0]:g}, fy = {self.intrinsics[1]:g}. "
                 "Both must be positive, in pixels."
             )
+        if max(map(abs, self.intrinsics)) > FARTHEST or min(self.intrinsics[:2]) < 1 / FARTHEST:
+            raise SettingsError(f"the intrinsics are {self.intrinsics}. Give fx, fy, cx, cy [px] within {FARTHEST:g}.")
         if len(self.distortion) not in DISTORTION_LENGTHS or not np.isfinite(self.distortion).all():
             raise SettingsError(
                 f"there are {len(self.distortion)} distortion coefficients. Give 0, 4, 5, 8, 12 or 14 finite numbers, "

@@ -1,6 +1,27 @@
 """Words of messages and reports."""
 
+from collections.abc import Iterable
+from itertools import islice
+
 
 def counted(number: int, what: str) -> str:
     """A number of things, such as `1 run` and `2 runs`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def listed(names: Iterable[str], most: int = 40) -> str:
+    """Names for an error: joined by commas, the first ones where there are many."""
+    names = iter(names)
+    text = ", ".join(shortened(name) for name in islice(names, most))
+    rest = sum(1 for _ in names)
+    return f"{text} and {rest} more" if rest else text
+
+
+def shortened(text: str, length: int = 200) -> str:
+    """A text without its middle where it is longer than `length`."""
+    return text if len(text) <= length else f"{text[: length - 40]} ... {text[-35:]}"
+
+
+def shown(value: object, length: int = 200) -> str:
+    """A value that somebody gave, as it is quoted in an error: like `repr`, shortened in its middle."""
+    return shortened(repr(value), length)

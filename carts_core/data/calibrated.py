@@ -8,6 +8,7 @@ import numpy as np
 import tomlkit
 
 from ..camera import HALF_PIXEL
+from ..files.reading import SEQUENCE, read_text
 from ..scene import Scene
 
 _BUILTIN = "builtin:"
@@ -25,7 +26,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
     """
-    document: dict[str, Any] = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
+    document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
 
     def moved(value: str) -> str:

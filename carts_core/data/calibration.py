@@ -1,6 +1,5 @@
 """Calibration values, written in the sequence file or taken out of a JSON file beside it."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,8 @@ import numpy as np
 
 from ..camera import HALF_PIXEL, Camera, rigid_transform
 from ..errors import SequenceError, SettingsError
+from ..files.reading import VALUES, parse_json, read_text
+from ..wording import listed, shown
 from .toml_table import TomlTable, closest
 
 
@@ -22,10 +23,12 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
         return value
     file_name, mark, pointer = value.partition("#")
     if not mark or not pointer:
-        raise table.error(key, f'is {value!r}. Write the numbers here, or "file.json#name" to take them from a file.')
+        raise table.error(
+            key, f'is {shown(value)}. Write the numbers here, or "file.json#name" to take them from a file.'
+        )
     path = table.path(file_name)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = parse_json(read_text(path, VALUES))
     except FileNotFoundError as error:
         raise table.error(key, f"points at {path}, which is missing. Correct the path.") from error
     except (OSError, ValueError) as error:
@@ -40,7 +43,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
             raise table.error(
                 key,
                 f"points at {name!r}, which {path} does not have.{closest(name, names)} "
-                f"It has: {', '.join(names) or 'no names at this place'}.",
+                f"It has: {listed(names) or 'no names at this place'}.",
             )
     return found
 
@@ -70,7 +73,7 @@ def take_camera(table: TomlTable) -> Camera:
     distortion = take_value(table, "distortion", [])
     if not isinstance(distortion, list) or not all(_is_number(value) for value in distortion):
         raise table.error(
-            "distortion", f"is {distortion!r}. Give a list of 0, 4, 5, 8, 12 or 14 numbers: k1 k2 p1 p2 k3 ..."
+            "distortion", f"is {shown(distortion)}. Give a list of 0, 4, 5, 8, 12 or 14 numbers: k1 k2 p1 p2 k3 ..."
         )
     T_camera_world = take_transform(table, "T_camera_world", np.eye(4).tolist())
     try:
@@ -82,7 +85,7 @@ def take_camera(table: TomlTable) -> Camera:
 def _take_size(table: TomlTable) -> tuple[int, int]:
     size = take_value(table, "size", [])
     if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
-        raise table.error("size", f"is {size!r}. Give [width, height] in whole pixels, say size = [640, 480].")
+        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, say size = [640, 480].")
     return size[0], size[1]
 
 
@@ -97,13 +100,13 @@ def _take_intrinsics(table: TomlTable) -> tuple[float, float, float, float]:
             matrix = np.empty(0)
         if matrix.shape != (3, 3):
             raise table.error(
-                "K", f"is {K!r}. Give 3 rows of 3 numbers, or {{ fx = ..., fy = ..., cx = ..., cy = ... }}."
+                "K", f"is {shown(K)}. Give 3 rows of 3 numbers, or {{ fx = ..., fy = ..., cx = ..., cy = ... }}."
             )
         fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
         if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * abs(fx)):
             raise table.error(
                 "K",
-                f"is {K!r}. It must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported, "
+                f"is {shown(K)}. It must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported, "
                 "and rows must not be swapped with columns.",
             )
     center = table.take("pixel_center", float, HALF_PIXEL)
@@ -129,7 +132,7 @@ def resolve_robot(table: TomlTable, shipped: dict[str, Path]) -> Path:
     if mark and scheme == "builtin":
         if name not in shipped:
             raise table.error(
-                "robot", f"is {value!r}. Shipped are: {', '.join(f'builtin:{known}' for known in shipped)}."
+                "robot", f"is {shown(value)}. Shipped are: {', '.join(f'builtin:{known}' for known in shipped)}."
             )
         return shipped[name]
     return table.path(value)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..camera import Camera
+from ..files.reading import is_regular
 from .calibration import take_camera
 from .frame_files import check_present, frame_files
 from .frame_list import FrameList
@@ -44,7 +45,7 @@ def take_camera_input(table: TomlTable, frames: FrameList, domains: tuple[str, .
     background: dict[str, Path] = {}
     for domain, pattern in _by_domain(table, "background", domains).items():
         path = table.path(expand(pattern, table.name("background"), domain=domain, camera=camera.name))
-        if not path.is_file():
+        if not is_regular(path):
             raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
         background[domain] = path
     table.finish()
@@ -99,7 +100,7 @@ def _masks(
     if not is_per_frame(pattern) and not is_glob(pattern):
         raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it.")
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
-    if sparse and any(file.is_file() for file in files):
-        return tuple(file if file.is_file() else None for file in files)
+    if sparse and any(is_regular(file) for file in files):
+        return tuple(file if is_regular(file) else None for file in files)
     check_present(key, files, frames, " If only some frames have masks, set sparse_masks = true.")
     return files

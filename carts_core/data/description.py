@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..camera import FARTHEST
 from ..resources import shipped_robot
 from ..robot import Robot
 from ..scene import Arm, Light, Scene
+from ..wording import shown
 from .calibration import resolve_robot, take_transform
 from .camera_input import CameraInput, take_camera_input
 from .frame_list import FrameList
@@ -21,6 +23,9 @@ from .toml_table import TomlTable, check_file_name, read_toml
 
 FORMAT = "carts-sequence/1"
 """Value of the key `format`."""
+
+_BRIGHTEST = 1e3
+"""Largest value of the keys of `[light]` that are numbers."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
 def _take_domains(root: TomlTable) -> tuple[str, ...]:
     domains = root.take("domains", list, ["regular"])
     if not domains or not all(isinstance(domain, str) and domain for domain in domains):
-        raise root.error("domains", f'is {domains!r}. Give names, say domains = ["regular", "smoke"].')
+        raise root.error("domains", f'is {shown(domains)}. Give names, say domains = ["regular", "smoke"].')
     if len(set(domains)) < len(domains):
         raise root.error("domains", f"names one twice: {', '.join(domains)}.")
     for domain in domains:
@@ -114,8 +119,11 @@ def _take_light(table: TomlTable) -> Light:
             table.take(setting.name, object, None)
     table.finish()
     position = values.get("position", (0.0, 0.0, 0.0))
-    if len(position) != 3 or not all(isinstance(value, int | float) for value in position):
-        raise table.error("position", "must be three numbers [m], in the camera's frame.")
+    if len(position) != 3 or not all(isinstance(value, int | float) and abs(value) <= FARTHEST for value in position):
+        raise table.error("position", f"must be three numbers [m] within {FARTHEST:g}, in the camera's frame.")
+    for key, value in values.items():
+        if key != "position" and not 0.0 <= value <= _BRIGHTEST:
+            raise table.error(key, f"is {value:g}, but must be 0 to {_BRIGHTEST:g}.")
     return Light(**values)
 
 

@@ -4,11 +4,13 @@ import re
 from pathlib import Path
 
 from ..errors import SequenceError
+from ..files.reading import is_regular
 from ..wording import counted
 from .frame_list import FrameList
 from .patterns import EXAMPLES, FrameId, expand, is_glob, is_per_frame
 
 _SHOWN_MISSING = 3
+_MOST_WILD_PARTS = 2
 
 
 def frame_files(
@@ -25,9 +27,7 @@ def frame_files(
             for row, frame_id in enumerate(frames.frame_ids)
         )
     filled = expand(pattern, key, domain=domain, camera=camera)
-    base = folder / filled
-    fixed = next(parent for parent in base.parents if not is_glob(str(parent)))
-    found = sorted((path for path in fixed.glob(str(base.relative_to(fixed))) if path.is_file()), key=_natural)
+    fixed, found = _matching(folder / filled, key)
     if len(found) != len(frames.frame_ids):
         raise SequenceError(
             f"{key}: {filled!r} matches {counted(len(found), 'file')} in {fixed}, but {frames.counted}. "
@@ -37,13 +37,28 @@ def frame_files(
     return tuple(found)
 
 
+def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
+    """The folder above the first wildcard, and the files below it that match, in natural order."""
+    fixed = next(parent for parent in base.parents if not is_glob(str(parent)))
+    wild = base.relative_to(fixed)
+    if "**" in wild.parts or len(wild.parts) > _MOST_WILD_PARTS:
+        raise SequenceError(
+            f"{key}: {str(wild)!r} would search whole trees of folders. Wildcards are allowed from the last "
+            f"{_MOST_WILD_PARTS} parts of the path on, and ** is not; name the folder."
+        )
+    try:
+        return fixed, sorted(filter(is_regular, fixed.glob(str(wild))), key=_natural)
+    except (ValueError, OSError) as error:
+        raise SequenceError(f"{key}: {str(wild)!r} cannot be searched for: {error}. Examples: {EXAMPLES}.") from error
+
+
 def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: str = "") -> None:
     """Check that every frame's file is there.
 
     Raises:
         SequenceError: some are not.
     """
-    missing = [(file, frame_id) for file, frame_id in zip(files, frames.frame_ids, strict=True) if not file.is_file()]
+    missing = [(file, frame_id) for file, frame_id in zip(files, frames.frame_ids, strict=True) if not is_regular(file)]
     if missing:
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
         rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
@@ -55,4 +70,4 @@ def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: st
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key by which `frame9` comes before `frame10`."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -13,6 +13,9 @@ from .table import Table, read_table
 from .toml_table import TomlTable, check_file_name
 from .video_index import index_video
 
+MOST_FRAMES = 1_000_000
+"""Longest sequence; nine hours at 30 frames per second."""
+
 
 @dataclass(frozen=True)
 class FrameList:
@@ -25,6 +28,10 @@ class FrameList:
     """Number of every frame in its video, from 0."""
     counted: str
     """How errors say how many there are, say "the kinematics table has 3 rows"."""
+
+    def __post_init__(self) -> None:
+        if len(self.frame_ids) > MOST_FRAMES:
+            raise SequenceError(f"{self.counted}; a sequence may have {MOST_FRAMES:,} frames. Divide the recording.")
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
+from ..files.image_size import JPEG, PNG, size_problem
+from ..files.reading import IMAGE, read_bytes
 
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8"
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 _REMEDY = "Copy or export it again."
 
@@ -76,7 +76,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
 
 def _decode(path: Path, flags: int) -> np.ndarray:
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, IMAGE)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(
             f"image {path} is missing. Put it back, or correct the path in the sequence file."
@@ -85,9 +85,14 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         raise SequenceError(f"image {path} cannot be read: {error}.") from error
     if (damage := find_damage(content)) is not None:
         raise SequenceError(f"image {path} is damaged: {damage}. {_REMEDY}")
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if (problem := size_problem(content)) is not None:
+        raise SequenceError(f"image {path} {problem}. {_REMEDY}")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        image = None
     if image is None:
-        raise SequenceError(f"image {path} cannot be decoded; it must be a JPEG, PNG or TIFF image. {_REMEDY}")
+        raise SequenceError(f"image {path} cannot be decoded; its content is damaged. {_REMEDY}")
     return image
 
 
@@ -98,17 +103,17 @@ def find_damage(content: bytes) -> str | None:
     """
     if not content:
         return "the file is empty"
-    if content.startswith(_JPEG):
+    if content.startswith(JPEG):
         # In compressed data a byte 0xff is never followed by 0xd9, so this marker after the last scan is the end.
         scan = content.rfind(_START_OF_SCAN)
         return None if content.find(_END_OF_IMAGE, scan + 2) > scan >= 0 else "the JPEG ends before its last pixel"
-    if content.startswith(_PNG):
+    if content.startswith(PNG):
         return _png_damage(content)
     return None
 
 
 def _png_damage(content: bytes) -> str | None:
-    position = len(_PNG)
+    position = len(PNG)
     while position + 12 <= len(content):
         length = int.from_bytes(content[position : position + 4], "big")
         kind = content[position + 4 : position + 8]

@@ -57,9 +57,10 @@ class JointColumns:
         positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
         for column in self.columns:
             index = names.index(column.joint)
-            values = table.numbers(column.column, f"{self.key} {column.joint}") * column.scale + column.offset
+            with np.errstate(over="ignore", invalid="ignore"):
+                values = table.numbers(column.column, f"{self.key} {column.joint}") * column.scale + column.offset
             kind = self.robot.joint_types[index]
-            if (worst := np.abs(values).max()) > PLAUSIBLE[kind]:
+            if not (worst := np.abs(values).max()) <= PLAUSIBLE[kind]:
                 symbol, other = ("rad", "deg") if kind == "revolute" else ("m", "mm")
                 raise SequenceError(
                     f"{table.path}, line {table.lines[int(np.abs(values).argmax())]}, column {column.column!r}: read "
@@ -87,6 +88,8 @@ def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
     for joint in defaults.items():
         _joint_type(defaults, joint, robot)
         values[joint] = float(defaults.take(joint, float))
+        if abs(values[joint]) > (largest := PLAUSIBLE[_joint_type(defaults, joint, robot)]):
+            raise defaults.error(joint, f"is {values[joint]:g}; allowed is up to {largest:.3g} [rad or m].")
         if joint in mapping:
             raise defaults.error(
                 joint, "is given, but the joint has a column in [arms.joints] too. Remove one of them."

@@ -1,10 +1,15 @@
 """Names of files per frame: `left/{frame}.jpg`, `{domain}/{index:06d}.png`, `left/*.jpg`."""
 
 import re
+from functools import lru_cache
+from string import Formatter
 
 from ..errors import SequenceError
+from ..files.reading import LARGEST_NAME, check_name
+from ..wording import shown
 from .toml_table import closest
 
+_WIDTH_DIGITS = 6
 _PLACEHOLDERS = ("frame", "index", "domain", "camera")
 EXAMPLES = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jpg"'
 
@@ -28,16 +33,38 @@ def expand(pattern: str, key: str, **values: object) -> str:
         SequenceError: an unknown placeholder, or a number format for an id that is no number.
     """
     try:
-        return pattern.format(**values)
-    except (KeyError, IndexError) as error:
+        _check_format(pattern)
+        filled = pattern.format(**values)
+        check_name(filled)
+    except KeyError as error:
         raise SequenceError(
-            f"{key}: {pattern!r} has the unknown placeholder {error}.{closest(str(error.args[0]), _PLACEHOLDERS)} "
+            f"{key}: {shown(pattern)} has the unknown placeholder {error}.{closest(str(error.args[0]), _PLACEHOLDERS)} "
             f"Examples: {EXAMPLES}."
         ) from error
-    except (ValueError, AttributeError) as error:
+    except ValueError as error:
         raise SequenceError(
-            f"{key}: {pattern!r} cannot be filled in with {values}: {error}. Examples: {EXAMPLES}."
+            f"{key}: {shown(pattern)} cannot be filled in with {shown(values)}: {error}. Examples: {EXAMPLES}."
         ) from error
+    return filled
+
+
+@lru_cache(maxsize=64)
+def _check_format(pattern: str) -> None:
+    """Check that a pattern has nothing but placeholders, padded to a width that a file's name can have.
+
+    Raises:
+        KeyError: a placeholder is unknown, or asks for a part of a value.
+        ValueError: a format is malformed, nested or too wide.
+    """
+    for _, name, form, conversion in Formatter().parse(pattern):
+        if name is None:
+            continue
+        if name not in _PLACEHOLDERS:
+            raise KeyError(name)
+        if conversion or "{" in (form or ""):
+            raise ValueError("a placeholder takes a width such as 06d, and nothing else")
+        if any(len(width) > _WIDTH_DIGITS or int(width) > LARGEST_NAME for width in re.findall(r"[0-9]+", form or "")):
+            raise ValueError(f"a name is longer than {LARGEST_NAME} characters")
 
 
 def is_per_frame(pattern: str) -> bool:

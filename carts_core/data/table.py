@@ -1,15 +1,23 @@
 """Kinematics tables: CSV files with a header, a row per frame and columns called by name."""
 
 import csv
+import io
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import SequenceError
+from ..files.reading import TABLE, open_regular
+from ..wording import listed, shown
 from .toml_table import closest
+
+MOST_CELLS = 10_000_000
+"""Largest table; an hour at 100 rows per second has room for 27 columns."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,7 @@ class Table:
         if column not in self.header:
             raise SequenceError(
                 f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
-                f"Its columns are: {', '.join(self.header)}."
+                f"Its columns are: {listed(self.header)}."
             )
         index = self.header.index(column)
         return [row[index].strip() for row in self.rows]
@@ -58,7 +66,7 @@ class Table:
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
             row = wrong[0]
             raise SequenceError(
-                f"{self.path}, line {self.lines[row]}, column {column!r}: {cells[row]!r} is not a finite number. "
+                f"{self.path}, line {self.lines[row]}, column {column!r}: {shown(cells[row])} is not a finite number. "
                 "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
             )
         return values
@@ -71,12 +79,12 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
         SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as handle:
+        with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8-sig", newline="") as handle:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
-            filled = [(reader.line_num, tuple(row)) for row in reader if any(row)]
+            filled = _filled_rows(reader, path, what)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
     if len(filled) < 2:
         raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
@@ -86,15 +94,28 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
             f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
             f"Set `delimiter = {found!r}` in [kinematics] (decimal points are points)."
         )
-    repeated = sorted({name for name in header if name and header.count(name) > 1})
+    repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:
-        raise SequenceError(f"{path} has several columns called {', '.join(map(repr, repeated))}. Rename all but one.")
+        raise SequenceError(f"{path} has several columns called {listed(map(repr, repeated))}. Rename all but one.")
     for line, row in filled[1:]:
         if len(row) != len(header):
             raise SequenceError(
                 f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
             )
     return Table(path, header, tuple(row for _, row in filled[1:]), tuple(line for line, _ in filled[1:]))
+
+
+def _filled_rows(reader: Any, path: Path, what: str) -> list[tuple[int, tuple[str, ...]]]:
+    """Number of the last line, and cells, of every row that is not empty."""
+    filled: list[tuple[int, tuple[str, ...]]] = []
+    cells = 0
+    for row in reader:
+        if any(row):
+            filled.append((reader.line_num, tuple(row)))
+            cells += len(row)
+            if cells > MOST_CELLS:
+                raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
+    return filled
 
 
 def _number(cell: str) -> float:

@@ -1,21 +1,30 @@
 """A TOML table that is read key by key, and says so when a key is wrong, missing or left over."""
 
 import difflib
-import tomllib
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from ..errors import SequenceError
+<<<<<<< HEAD
 from ..files import allowed_names, name_fault
+=======
+from ..files.reading import SEQUENCE, all_finite, parse_toml, read_text
+from ..wording import listed, shown
+>>>>>>> 57e4b55 (files.reading: one module decides what may be read; sequence files, tables and images go through it)
 
+_LONGEST_COMPARED, _MOST_COMPARED = 100, 200
+"""Misspellings are looked for in names up to this length, and in so many: comparing takes the product of lengths."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
 
 
 def closest(name: str, known: Iterable[str]) -> str:
     """' Did you mean ...?' when one of `known` resembles `name`, else nothing."""
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    if len(name) > _LONGEST_COMPARED:
+        return ""
+    matches = difflib.get_close_matches(name, list(islice(known, _MOST_COMPARED)), n=1, cutoff=0.5)
     return f" Did you mean {matches[0]!r}?" if matches else ""
 
 
@@ -26,12 +35,12 @@ def read_toml(path: Path) -> "TomlTable":
         SequenceError: the file is missing or not TOML.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = parse_toml(read_text(path, SEQUENCE))
     except FileNotFoundError as error:
         raise SequenceError(f"sequence file {path} is missing. Give the path of a .toml file.") from error
     except IsADirectoryError as error:
         raise SequenceError(f"{path} is a folder. Give the .toml file inside it.") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise SequenceError(
             f"sequence file {path} is not readable TOML: {error}. Compare it with docs/sequence_format.md."
         ) from error
@@ -81,7 +90,10 @@ class TomlTable:
         accepted = tuple(extra for one in kinds for extra in ((int, float) if one is float else (one,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
             wanted = " or ".join(_KINDS[one] for one in kinds)
-            raise self.error(key, f"is {value!r}, but must be {wanted}.")
+            raise self.error(key, f"is {shown(value)}, but must be {wanted}.")
+        # Numbers in tables are checked when they are taken from there, so that the error names their key.
+        if not (isinstance(value, dict) or all_finite(value)):
+            raise self.error(key, f"is {shown(value)}, but must be a finite number.")
         return value
 
     def take_choice(self, key: str, choices: tuple[str, ...], default: str) -> str:
@@ -92,7 +104,9 @@ class TomlTable:
         """
         value = self.take(key, str, default)
         if value not in choices:
-            raise self.error(key, f"is {value!r}, but must be one of: {', '.join(choices)}.{closest(value, choices)}")
+            raise self.error(
+                key, f"is {shown(value)}, but must be one of: {', '.join(choices)}.{closest(value, choices)}"
+            )
         return value
 
     def take_table(self, key: str) -> "TomlTable":
@@ -154,9 +168,9 @@ def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
 
 
 def _typo(key: str, given: list[str]) -> str:
-    matches = difflib.get_close_matches(key, given, n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(key, given[:_MOST_COMPARED], n=1, cutoff=0.5)
     return f" Is {matches[0]!r} a misspelling of it?" if matches else ""
 
 
 def _list(names: Iterable[str]) -> str:
-    return ", ".join(names) or "none"
+    return listed(names) or "none"

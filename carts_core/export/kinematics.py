@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SequenceError
+from ..files.reading import TABLE, open_regular
 from ..scene import Scene
+from ..wording import shortened
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
     """
     try:
         return _read(path, scene)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise SequenceError(f"{path} is not a readable kinematics table: {error}.") from error
 
 
@@ -82,13 +84,13 @@ def _header(scene: Scene, with_std: bool) -> list[str]:
 
 
 def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
-    with path.open(newline="", encoding="utf-8") as file:
+    with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8", newline="") as file:
         table = csv.reader(file)
         header = next(table, [])
         with_std = header == _header(scene, True)
         if not with_std and header != _header(scene, False):
             found, wanted = ", ".join(header), ", ".join(_header(scene, False))
-            raise SequenceError(f"{path} has columns {found}; expected are {wanted}. Remove it.")
+            raise SequenceError(f"{path} has columns {shortened(found, 1000)}; expected are {wanted}. Remove it.")
         rows = []
         for line, cells in enumerate(table, start=2):
             try:
@@ -97,6 +99,8 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
                 values = np.empty(0)
             if len(cells) != len(header) or len(values) != len(header) - 2:
                 raise SequenceError(f"{path}, line {line}: not {len(header) - 2} numbers. Remove the line.")
+            if not np.isfinite(values[: len(joint_columns(scene))]).all():
+                raise SequenceError(f"{path}, line {line}: a joint position is not finite. Remove the line.")
             positions, std = np.split(values, [len(joint_columns(scene))])
             rows.append(
                 KinematicsRow(cells[0], cells[1], _by_arm(scene, positions), _by_arm(scene, std) if with_std else None)

@@ -1,4 +1,4 @@
-"""Everything that is written to disk, and every path that it is written to.
+"""What is read from files that others made (`reading`), and everything that is written, with its path.
 
 No other module opens a file for writing; `tests/files/test_one_writer.py` sees to it.
 """

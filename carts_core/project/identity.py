@@ -2,12 +2,12 @@
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..files.reading import SEQUENCE, TABLE, parse_toml, read_text
 from ..wording import counted
 
 if TYPE_CHECKING:
@@ -80,10 +80,10 @@ def _list(parts: Mapping[str, tuple]) -> str:
 
 
 def _kinematics_sha256(sequence_file: Path) -> str:
-    root = tomllib.loads(sequence_file.read_text(encoding="utf-8-sig"))
+    root = parse_toml(read_text(sequence_file, SEQUENCE))
     tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
     digest = hashlib.sha256()
     for table in tables:
-        text = (sequence_file.parent / table).read_text(encoding="utf-8-sig")
+        text = read_text(sequence_file.parent / table, TABLE)
         digest.update("\n".join([*text.splitlines(), ""]).encode())
     return digest.hexdigest()

@@ -1,0 +1,206 @@
+"""What may be read of files that others made: regular files of a bounded size, and nothing nested without end.
+
+A recording, a robot and weights come from anywhere. Every read of one goes through this module. Links are followed,
+since people link their data; devices, pipes and sockets are refused, and no file is read further than its kind's limit.
+"""
+
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ..errors import CartsError
+
+MIB = 2**20
+LARGEST_DEPTH = 32
+"""How deeply tables and lists may be nested in TOML and JSON."""
+LARGEST_NAME = 255
+"""Longest name of a file or folder [bytes]."""
+LARGEST_PATH = 4096
+"""Longest path [bytes]."""
+LARGEST_WHOLE_NUMBER = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file and how large one may be."""
+
+    name: str
+    limit: int
+    """[bytes]"""
+
+
+SEQUENCE = Kind("sequence file", MIB)
+VALUES = Kind("JSON file", 64 * MIB)
+TABLE = Kind("table", 256 * MIB)
+IMAGE = Kind("image", 256 * MIB)
+ROBOT = Kind("URDF", 16 * MIB)
+MESH = Kind("mesh", 128 * MIB)
+WEIGHTS = Kind("weights file", 512 * MIB)
+CACHED = Kind("cached mesh", 256 * MIB)
+
+
+class RefusedFileError(CartsError, OSError):
+    """A file is there, and is not one that is read: special, too large, or nested too deeply.
+
+    It is an OSError too, so that who reads a file names it in an error of their own, as for a file that is missing.
+    """
+
+
+def is_regular(path: Path) -> bool:
+    """Whether there is a regular file, directly or by links; False for names that no file can have."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def open_regular(path: Path, kind: Kind) -> BinaryIO:
+    """A regular file for reading; opening a pipe or a device neither waits nor has an effect.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, OSError: as the system says.
+        RefusedFileError: it is no regular file, is too large, or has a name that no file can have.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except ValueError as error:  # A name with a null character.
+        raise RefusedFileError(f"no file can have this name ({error})") from error
+    try:
+        status = os.fstat(descriptor)
+        if stat.S_ISDIR(status.st_mode):
+            raise IsADirectoryError(f"{path} is a folder")
+        if not stat.S_ISREG(status.st_mode):
+            raise RefusedFileError("it is no regular file but a pipe, socket or device; only files are read")
+        if status.st_size > kind.limit:
+            raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def check_regular(path: Path, kind: Kind) -> None:
+    """As `open_regular`, for a library that opens the file by its name.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as there.
+    """
+    open_regular(path, kind).close()
+
+
+def read_bytes(path: Path, kind: Kind) -> bytes:
+    """The content of a file.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
+    """
+    with open_regular(path, kind) as file:
+        content = file.read(kind.limit + 1)
+    if len(content) > kind.limit:
+        raise _too_large(kind, "grows while it is read")
+    return content
+
+
+def read_text(path: Path, kind: Kind) -> str:
+    """The content of a UTF-8 file, without the mark that some programs put at its beginning; line ends are `\\n`.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_bytes(path, kind).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """TOML as dictionaries and lists.
+
+    Raises:
+        ValueError: it is not TOML, or is beyond the limits of this module.
+    """
+    # The parser's time and memory grow with the square of a key's parts, so long keys never reach it.
+    if _LONG_KEY.search(text):
+        raise ValueError(f"a key has more than {LARGEST_DEPTH} parts")
+    try:
+        values = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep") from error
+    _check_values(values)
+    return values
+
+
+def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
+    """JSON as dictionaries and lists.
+
+    Args:
+        text: of the file.
+        finite: refuse `NaN` and `Infinity`.
+
+    Raises:
+        ValueError: it is not JSON, or is beyond the limits of this module.
+    """
+    try:
+        values = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep") from error
+    _check_values(values)
+    if finite and not all_finite(values):
+        raise ValueError("a number in it is not finite")
+    return values
+
+
+def all_finite(root: Any) -> bool:
+    """Whether every number in what `parse_toml` or `parse_json` gave is finite."""
+    if isinstance(root, dict):
+        return all(map(all_finite, root.values()))
+    if isinstance(root, list):
+        return all(map(all_finite, root))
+    return not isinstance(root, float) or math.isfinite(root)
+
+
+def check_name(path: str | Path) -> None:
+    """Check that a file can be called so.
+
+    Raises:
+        ValueError: a part of the path, or the path, is too long, or has a null character.
+    """
+    data = os.fsencode(path)
+    if b"\0" in data:
+        raise ValueError("a name has a null character")
+    if len(data) > LARGEST_PATH or any(len(part) > LARGEST_NAME for part in data.split(b"/")):
+        raise ValueError(f"a name is longer than {LARGEST_NAME} bytes, or the path longer than {LARGEST_PATH}")
+
+
+_KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{LARGEST_DEPTH}}}")
+
+
+def _check_values(root: Any) -> None:
+    """Check depth, whole numbers and text; goes level by level, so depth costs no stack."""
+    level = [root]
+    for _ in range(LARGEST_DEPTH + 1):
+        deeper: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                deeper += value.keys()
+                deeper += value.values()
+            elif isinstance(value, list):
+                deeper += value
+            elif isinstance(value, str):
+                if "\0" in value:
+                    raise ValueError("a text has a null character")
+            elif isinstance(value, int) and abs(value) > LARGEST_WHOLE_NUMBER:
+                raise ValueError("a whole number has more than 64 bits")
+        if not deeper:
+            return
+        level = deeper
+    raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep")
+
+
+def _too_large(kind: Kind, what: str) -> RefusedFileError:
+    return RefusedFileError(f"it {what}; a {kind.name} may have {kind.limit // MIB} MiB at most")
