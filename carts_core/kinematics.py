@@ -1,8 +1,10 @@
 """Forward kinematics of a URDF tree, differentiable and batched (pytorch-kinematics)."""
 
 import copy
+import math
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import pytorch_kinematics
@@ -13,23 +15,23 @@ from torch import Tensor
 
 from .errors import RobotError
 
+NO_LIMIT = 1e3
+"""A larger joint limit [rad], [m] means none."""
 ROUND_OFF = 1e-5
 """Angles this close [rad] to a multiple of 90 degrees mean that multiple: URDF exporters print 1.5708 for pi/2."""
 
 
-def exact_right_angles(urdf_text: str) -> str:
-    """The URDF with every `rpy` angle that is a rounded multiple of pi/2 put back to the exact one.
+def exact_right_angles(root: Element) -> None:
+    """Put every `rpy` angle of a URDF that is a rounded multiple of pi/2 back to the exact one.
 
     At an instrument's length the 3.7e-6 rad of "1.5708" are more than a micrometre at the tip.
     """
-    root = ElementTree.fromstring(urdf_text)
     for origin in root.iter("origin"):
         if rpy := origin.get("rpy"):
             angles = np.array([float(value) for value in rpy.split()])
             right = np.round(angles / (np.pi / 2)) * (np.pi / 2)
             angles = np.where(np.abs(angles - right) < ROUND_OFF, right, angles)
             origin.set("rpy", " ".join(repr(float(angle)) for angle in angles))
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _skeleton(urdf_text: str) -> str:
@@ -113,7 +115,12 @@ def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return -np.inf, np.inf
-    return float(limit.lower), float(limit.upper)
+    # Some robots write a huge number for no limit.
+    lower, upper = (
+        math.copysign(math.inf, value) if abs(value) > NO_LIMIT else float(value)
+        for value in (limit.lower, limit.upper)
+    )
+    return lower, upper
 
 
 def _mimic_matrix(model: yourdfpy.URDF, parameters: list[str]) -> tuple[Tensor, Tensor]:

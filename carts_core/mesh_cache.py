@@ -4,11 +4,13 @@ import hashlib
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from .files.reading import CACHED, MESH, open_regular, read_bytes
 from .meshes import LinkMesh
 
 _VERSION = 1
@@ -26,14 +28,17 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
     digest = hashlib.sha256(repr((_VERSION, settings)).encode())
     for file in files:
         digest.update(str(file.name).encode())
-        digest.update(file.read_bytes())
+        digest.update(read_bytes(file, MESH))
     return digest.hexdigest()[:32]
 
 
 def read(key: str) -> tuple[LinkMesh, ...] | None:
     """Meshes stored under `key`, or None when there are none (or the file is damaged)."""
     try:
-        with np.load(cache_dir() / f"{key}.npz", allow_pickle=False) as stored:
+        with (
+            open_regular(cache_dir() / f"{key}.npz", CACHED) as file,
+            np.load(file, allow_pickle=False) as stored,
+        ):
             return tuple(
                 LinkMesh(
                     int(stored[f"{i}_link"]),
@@ -44,7 +49,7 @@ def read(key: str) -> tuple[LinkMesh, ...] | None:
                 )
                 for i in range(int(stored["count"]))
             )
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return None
 
 

@@ -9,14 +9,18 @@ import trimesh
 import yourdfpy
 from jaxtyping import Float, Int
 
+from .decimation import DecimationError, decimated
 from .errors import RobotError
-from .mesh_files import mesh_path
+from .mesh_files import MOST_FACES, check_mesh, mesh_path, read_mesh
+from .wording import shown
 
 SHARP_EDGE = np.deg2rad(38.0)
 """Faces that meet at a larger angle [rad] do not share a smooth normal."""
 
 _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
 _OPAQUE = 0.99
+_MOST_KEPT = 10
+"""Times as many triangles as asked for are too many."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[
     for mesh in _geometry(visual.geometry, folder):
         if visual.origin is not None:
             mesh.apply_transform(visual.origin)
+            check_mesh(mesh, "a mesh at its <origin>")
         parts.append((mesh, color if color is not None else _mesh_color(mesh)))
     return parts
 
@@ -86,25 +91,9 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[trimesh.Trimesh
         return [trimesh.creation.icosphere(radius=geometry.sphere.radius)]
     if geometry.mesh is None:
         return []
-    path = mesh_path(folder, geometry.mesh.filename)
-    if not path.is_file():
-        raise RobotError(
-            f"mesh {path} is missing; the URDF in {folder} names it as {geometry.mesh.filename!r}. "
-            "Put the file there, or correct the path in the URDF."
-        )
-    try:
-        loaded = trimesh.load_scene(path)
-        meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    except Exception as error:  # trimesh raises whatever its format readers raise
-        allowed = "OBJ, STL, PLY, GLB and DAE files"
-        raise RobotError(f"mesh {path} cannot be read ({error}). Allowed are {allowed}.") from error
-    if not meshes:
-        raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
-    if geometry.mesh.scale is not None:
-        scale = np.ones(3) * np.asarray(geometry.mesh.scale)
-        for mesh in meshes:
-            mesh.apply_transform(np.diag([*scale, 1.0]))
-    return meshes
+    scale = np.ones(3) if geometry.mesh.scale is None else np.ones(3) * np.asarray(geometry.mesh.scale)
+    named = f"the URDF in {folder} names it as {shown(geometry.mesh.filename)}"
+    return read_mesh(mesh_path(folder, geometry.mesh.filename), scale, named)
 
 
 def _mesh_color(mesh: trimesh.Trimesh) -> np.ndarray:
@@ -130,28 +119,52 @@ def face_budget(counts: Sequence[int], max_faces: int) -> list[int]:
 
 
 def simplify(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices [V, 3], vertex normals [V, 3] and faces [F, 3] of `mesh` with at most about `faces` triangles."""
+    """Vertices [V, 3], vertex normals [V, 3] and faces [F, 3] of `mesh` with at most about `faces` triangles.
+
+    Raises:
+        DecimationError: the mesh is degenerate, or so irregular that it takes too long.
+    """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices(digits_vertex=7)
     mesh.update_faces(mesh.nondegenerate_faces())
     if len(mesh.faces) > faces:
-        mesh = mesh.simplify_quadric_decimation(face_count=max(faces, 4))
+        mesh = trimesh.Trimesh(*decimated(np.array(mesh.vertices), np.array(mesh.faces), max(faces, 4)))
         mesh.update_faces(mesh.nondegenerate_faces())
+    if not len(mesh.faces):
+        raise DecimationError("all its triangles are without area")
     smooth = trimesh.graph.smooth_shade(mesh, angle=SHARP_EDGE)
     normals = np.array(smooth.vertex_normals)
+    if not np.isfinite(normals).all():
+        raise DecimationError("its normals are not finite")
     return np.array(smooth.vertices), normals, np.array(smooth.faces)
 
 
 def build_link_meshes(
     parts: Sequence[tuple[int, trimesh.Trimesh, np.ndarray]], max_faces: int, progress: Callable[[str], None]
 ) -> tuple[LinkMesh, ...]:
-    """Decimate `parts` (link index, mesh, colour) to at most about `max_faces` triangles in all."""
+    """Decimate `parts` (link index, mesh, colour) to at most about `max_faces` triangles in all.
+
+    Raises:
+        RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
+    """
+    if sum(len(mesh.faces) for _, mesh, _ in parts) > MOST_FACES:
+        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler ones.")
     budgets = face_budget([len(mesh.faces) for _, mesh, _ in parts], max_faces)
     result = []
     for number, ((link, mesh, color), budget) in enumerate(zip(parts, budgets, strict=True), start=1):
         progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {min(len(mesh.faces), budget)} triangles")
-        vertices, normals, faces = simplify(mesh, budget)
+        try:
+            vertices, normals, faces = simplify(mesh, budget)
+        except DecimationError as error:
+            raise RobotError(
+                f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
+                "Export it again as a clean triangle mesh."
+            ) from error
         result.append(
             LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
+        )
+    if sum(len(mesh.faces) for mesh in result) > _MOST_KEPT * max_faces:
+        raise RobotError(
+            f"the meshes cannot be simplified to about {max_faces} triangles. Export them as clean triangle meshes."
         )
     return tuple(result)

@@ -3,6 +3,7 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import yourdfpy
 from jaxtyping import Float
@@ -10,9 +11,11 @@ from torch import Tensor
 
 from . import mesh_cache
 from .errors import RobotError
+from .files.reading import ROBOT, is_regular, read_text
 from .kinematics import Kinematics, exact_right_angles
 from .mesh_files import mesh_path
 from .meshes import LinkMesh, build_link_meshes, load_visual
+from .urdf_check import parsed_urdf
 
 
 class Robot:
@@ -68,16 +71,18 @@ class Robot:
         # Resolved once, here: what is found beside the URDF stays found when the working directory changes.
         urdf = Path(urdf).absolute()
         report = progress or (lambda line: None)
-        if not urdf.is_file():
-            raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.")
         try:
-            text = exact_right_angles(urdf.read_text())
+            root = parsed_urdf(read_text(urdf, ROBOT), urdf)
+            exact_right_angles(root)
+            text = ElementTree.tostring(root, encoding="unicode")
             model = yourdfpy.URDF.load(
                 io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
             )
+        except FileNotFoundError as error:
+            raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
             raise
-        except Exception as error:  # the XML and URDF parsers raise many kinds
+        except Exception as error:  # the URDF parser raises many kinds
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         kinematics = Kinematics(model, text, base_link, urdf)
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
@@ -127,7 +132,7 @@ def _load_meshes(
         for visual in link.visuals
         if visual.geometry is not None and visual.geometry.mesh is not None
     ]
-    key = mesh_cache.fingerprint([urdf, *filter(Path.is_file, mesh_files)], max_faces)
+    key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], max_faces)
     if (cached := mesh_cache.read(key)) is not None:
         return cached
     report(f"{model.robot.name}: preparing meshes (once)")

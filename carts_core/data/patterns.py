@@ -5,7 +5,7 @@ from functools import lru_cache
 from string import Formatter
 
 from ..errors import SequenceError
-from ..files.reading import LARGEST_NAME, check_name
+from ..files.reading import LARGEST_NAME, check_path
 from ..wording import shown
 from .toml_table import closest
 
@@ -35,7 +35,7 @@ def expand(pattern: str, key: str, **values: object) -> str:
     try:
         _check_format(pattern)
         filled = pattern.format(**values)
-        check_name(filled)
+        check_path(filled)
     except KeyError as error:
         raise SequenceError(
             f"{key}: {shown(pattern)} has the unknown placeholder {error}.{closest(str(error.args[0]), _PLACEHOLDERS)} "

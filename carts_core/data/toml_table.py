@@ -7,12 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SequenceError
-<<<<<<< HEAD
 from ..files import allowed_names, name_fault
-=======
-from ..files.reading import SEQUENCE, all_finite, parse_toml, read_text
+from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_text
 from ..wording import listed, shown
->>>>>>> 57e4b55 (files.reading: one module decides what may be read; sequence files, tables and images go through it)
 
 _LONGEST_COMPARED, _MOST_COMPARED = 100, 200
 """Misspellings are looked for in names up to this length, and in so many: comparing takes the product of lengths."""
@@ -142,7 +139,17 @@ class TomlTable:
         return dict(self._values)
 
     def path(self, value: str) -> Path:
-        """A path in the file, which is relative to the file's folder."""
+        """A path in the file, which is relative to the file's folder.
+
+        Raises:
+            SequenceError: no file can be called so.
+        """
+        try:
+            check_path(value)
+            if "\0" in value:
+                raise ValueError("it has a null character")
+        except ValueError as error:
+            raise SequenceError(f"{self.file}: {shown(value)} is no path of a file: {error}.") from error
         return self.file.parent / value
 
     def finish(self) -> None:

@@ -18,10 +18,21 @@ from av.video.stream import VideoStream
 from jaxtyping import Float
 
 from ..errors import SequenceError
+from ..files.image_size import LARGEST_IMAGE, pixels_problem
+from ..files.reading import MIB, is_regular
 
 _EXACT = ("mp4", "matroska")
 """Containers that give every frame its presentation time and find it again."""
 _REMEMBERED = 32
+_OPTIONS = {
+    "protocol_whitelist": "file",
+    "format_whitelist": "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,asf,ogg",
+    "probesize": str(32 * MIB),
+    "max_streams": "32",
+}
+"""What FFmpeg may open: videos and no playlists, which would make it fetch other files."""
+_SECONDS = 10.0
+"""Longest wait for opening a file, and for a read of it."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +62,12 @@ def index_video(path: Path) -> VideoIndex:
     """
     try:
         status = path.stat()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise SequenceError(
             f"video {path} is missing. Put it back, or correct the path in the sequence file."
         ) from error
+    if not is_regular(path):
+        raise SequenceError(f"video {path} is a folder, pipe or device. Name a video file.")
     return _index(path.resolve(), status.st_mtime_ns, status.st_size)
 
 
@@ -73,14 +86,18 @@ def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 def open_video(path: Path) -> tuple[InputContainer, VideoStream]:
     """As `opened`; the caller closes the container."""
     try:
-        # A file that claims to be a playlist must not make FFmpeg fetch anything.
-        container = av.open(str(path.absolute()), container_options={"protocol_whitelist": "file"})
-    except (FFmpegError, OSError) as error:
+        container = av.open(str(path.absolute()), container_options=_OPTIONS, timeout=_SECONDS)
+    except (FFmpegError, OSError, ValueError) as error:
         raise SequenceError(f"video {path} cannot be decoded ({error}). {_remedy(path)}") from error
     stream = container.streams.best("video")
     if not isinstance(stream, VideoStream):
         container.close()
         raise SequenceError(f"video {path} cannot be decoded (it has no video stream). {_remedy(path)}")
+    if (problem := pixels_problem(stream.width, stream.height)) is not None:
+        container.close()
+        raise SequenceError(f"video {path} {problem}. {_remedy(path)}")
+    # The size can change within a stream.
+    stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
     stream.thread_type = "AUTO"
     return container, stream
 

@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ..errors import WeightsError
+from ..files.reading import WEIGHTS, check_regular, parse_json
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 
@@ -85,13 +86,14 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
         WeightsError: the file is there and cannot be read.
     """
     path = folder / CHECKPOINT_FILE
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
+        check_regular(path, WEIGHTS)
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata()
+            metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-        history = History(**json.loads(metadata["history"]))
+        history = History(**parse_json(metadata["history"], finite=False))
         return Checkpoint(int(metadata["step"]), metadata["config"], history, tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
         raise WeightsError(

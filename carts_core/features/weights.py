@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ..errors import SettingsError, WeightsError
+from ..files.reading import WEIGHTS, check_regular, parse_json, read_bytes
 from ..settings import Architecture
+from ..wording import shortened
 from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
 
@@ -21,6 +24,8 @@ WORKING_SIZE = (320, 240)
 _NETWORKS: dict[str, Callable[[Architecture], UNet]] = {
     f"carts-{network.kind}-network": network for network in (FeatureNetwork, SurfaceNetwork)
 }
+_TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
+_LARGEST_SIDE = 4096
 _REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipped ones back."
 
 
@@ -68,17 +73,15 @@ def read_weights(path: Path) -> Weights:
         WeightsError: the file is missing, is not safetensors, was not written by `carts train`, or its tensors do not
             fit the architecture it names.
     """
-    if not path.is_file():
-        raise WeightsError(f"weights file {path} is missing. {_REMEDY}")
     try:
+        check_regular(path, WEIGHTS)
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(
-            f"weights file {path} is not a readable safetensors file ({error}). Allowed is what `carts train` writes. "
-            f"{_REMEDY}"
-        ) from error
+            shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
+    except (FileNotFoundError, IsADirectoryError) as error:
+        raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
     if metadata.get("format") not in _NETWORKS or metadata.get("version") != VERSION:
         raise WeightsError(
             f"weights file {path} says format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed "
@@ -86,26 +89,48 @@ def read_weights(path: Path) -> Weights:
         )
     try:
         architecture = Architecture.from_json(metadata["architecture"])
-        working_size = tuple(int(n) for n in json.loads(metadata["working_size"]))
-        training = json.loads(metadata["training"])
-    except (KeyError, ValueError, TypeError, AttributeError, SettingsError) as error:
+        working_size = tuple(int(n) for n in parse_json(metadata["working_size"]))
+        training = parse_json(metadata["training"], finite=False)
+        if not isinstance(training, dict):
+            raise TypeError("the training settings are no table")
+    except (KeyError, ValueError, TypeError, AttributeError, OverflowError, SettingsError) as error:
         raise WeightsError(
-            f"weights file {path} has unreadable metadata ({error}). Allowed are an architecture with widths, "
-            f"encoder_convolutions and decoder_convolutions, a working size and the training settings. {_REMEDY}"
+            f"weights file {path} has unreadable metadata ({shortened(str(error))}). Allowed are an architecture with "
+            "widths, encoder_convolutions and decoder_convolutions, a working size and the training settings. "
+            f"{_REMEDY}"
         ) from error
-    network = _NETWORKS[metadata["format"]](architecture)
+    make_network = _NETWORKS[metadata["format"]]
+    # Without memory for its values: what does not fit the file is never allocated.
+    with torch.device("meta"):
+        wanted = {name: tuple(value.shape) for name, value in make_network(architecture).state_dict().items()}
+    if wanted != shapes:
+        differing = [name for name in sorted(wanted.keys() | shapes.keys()) if wanted.get(name) != shapes.get(name)]
+        first = differing[0]
+        raise WeightsError(
+            f"weights file {path} does not fit its architecture of widths {architecture.widths}: {shortened(first)} is "
+            f"{shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}. {_REMEDY}"
+        )
     try:
+        with safe_open(path, framework="pt") as file:
+            state = {name: file.get_tensor(name) for name in wanted}
+        network = make_network(architecture)
         network.load_state_dict(state)
-    except RuntimeError as error:
-        reason = "; ".join(line.strip() for line in str(error).splitlines()[1:4])
-        raise WeightsError(
-            f"weights file {path} does not fit its architecture of widths {architecture.widths}: {reason}. {_REMEDY}"
-        ) from error
+    except (SafetensorError, OSError, RuntimeError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if any(value.dtype not in _TYPES for value in state.values()):
+        raise WeightsError(f"weights file {path} holds tensors of an unknown type. {_REMEDY}")
     if not all(bool(value.isfinite().all()) for value in state.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite. {_REMEDY}")
-    if len(working_size) != 2 or any(n <= 0 or n % architecture.stride for n in working_size):
+    if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
             f"weights file {path} gives the working size {working_size}; allowed are two positive multiples of "
             f"{architecture.stride}. {_REMEDY}"
         )
-    return Weights(network.eval(), working_size, training, hashlib.sha256(path.read_bytes()).hexdigest())
+    return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
+
+
+def _unreadable(path: Path, error: Exception) -> WeightsError:
+    return WeightsError(
+        f"weights file {path} is not a readable safetensors file ({shortened(str(error))}). Allowed is what "
+        f"`carts train` writes. {_REMEDY}"
+    )

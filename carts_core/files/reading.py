@@ -163,15 +163,13 @@ def all_finite(root: Any) -> bool:
     return not isinstance(root, float) or math.isfinite(root)
 
 
-def check_name(path: str | Path) -> None:
-    """Check that a file can be called so.
+def check_path(path: str | Path) -> None:
+    """Check that no name in a path is longer than a file's can be.
 
     Raises:
-        ValueError: a part of the path, or the path, is too long, or has a null character.
+        ValueError: a part of the path, or the path, is too long.
     """
     data = os.fsencode(path)
-    if b"\0" in data:
-        raise ValueError("a name has a null character")
     if len(data) > LARGEST_PATH or any(len(part) > LARGEST_NAME for part in data.split(b"/")):
         raise ValueError(f"a name is longer than {LARGEST_NAME} bytes, or the path longer than {LARGEST_PATH}")
 
@@ -181,7 +179,7 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{
 
 
 def _check_values(root: Any) -> None:
-    """Check depth, whole numbers and text; goes level by level, so depth costs no stack."""
+    """Check depth and whole numbers; goes level by level, so depth costs no stack."""
     level = [root]
     for _ in range(LARGEST_DEPTH + 1):
         deeper: list[Any] = []
@@ -191,9 +189,6 @@ def _check_values(root: Any) -> None:
                 deeper += value.values()
             elif isinstance(value, list):
                 deeper += value
-            elif isinstance(value, str):
-                if "\0" in value:
-                    raise ValueError("a text has a null character")
             elif isinstance(value, int) and abs(value) > LARGEST_WHOLE_NUMBER:
                 raise ValueError("a whole number has more than 64 bits")
         if not deeper:

@@ -4,6 +4,9 @@ import json
 from dataclasses import asdict, dataclass
 
 from ..errors import SettingsError
+from ..files.reading import parse_json
+
+_MOST_LEVELS, _MOST_CHANNELS, _MOST_CONVOLUTIONS = 8, 1024, 16
 
 
 @dataclass(frozen=True)
@@ -24,16 +27,14 @@ class Architecture:
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
-        if levels < 2 or any(width < 1 for width in self.widths):
-            raise SettingsError(f"widths are {self.widths}; give at least two positive channel counts.")
-        if len(self.encoder_convolutions) != levels or any(n < 1 for n in self.encoder_convolutions):
+        if not 2 <= levels <= _MOST_LEVELS or any(not 1 <= width <= _MOST_CHANNELS for width in self.widths):
             raise SettingsError(
-                f"encoder_convolutions are {self.encoder_convolutions}; give {levels} counts of 1 or more."
+                f"widths are {self.widths}; give 2 to {_MOST_LEVELS} channel counts of 1 to {_MOST_CHANNELS}."
             )
-        if len(self.decoder_convolutions) != levels - 1 or any(n < 1 for n in self.decoder_convolutions):
-            raise SettingsError(
-                f"decoder_convolutions are {self.decoder_convolutions}; give {levels - 1} counts of 1 or more."
-            )
+        for name, count in (("encoder_convolutions", levels), ("decoder_convolutions", levels - 1)):
+            values = getattr(self, name)
+            if len(values) != count or any(not 1 <= n <= _MOST_CONVOLUTIONS for n in values):
+                raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MOST_CONVOLUTIONS}.")
         if not 0 <= self.local_contrast <= float(self.local_mean):
             raise SettingsError(
                 f"local_contrast is {self.local_contrast}; give 0 to 1, and 0 without local_mean, which is "
@@ -57,7 +58,7 @@ class Architecture:
             ValueError, TypeError, KeyError, AttributeError: the text is not an architecture.
             SettingsError: it is one that cannot exist.
         """
-        values = json.loads(text)
+        values = parse_json(text)
         local_mean, local_contrast = bool(values.pop("local_mean")), float(values.pop("local_contrast", 0.0))
         return Architecture(
             **{name: tuple(int(n) for n in counts) for name, counts in values.items()},
