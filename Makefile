@@ -10,7 +10,7 @@ BIN := .venv/bin
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help view test lint format bench pictures wheel setup setup-dev clean
+.PHONY: help view test lint docs format bench pictures wheel setup setup-dev clean
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -18,8 +18,7 @@ help: ## List these targets
 view: setup ## Open the shipped sequence in the browser (or SEQUENCE=path/to/sequence.toml)
 	@$(BIN)/carts view $(SEQUENCE) $(ARGS)
 
-test: setup-dev ## Check the style and run the tests, browser included
-	$(BIN)/ruff check
+test: lint docs ## Check style and types, build the documentation, and run the tests, browser included
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
 	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not gpu" $(ARGS)
 
@@ -27,6 +26,10 @@ lint: setup-dev ## Check style, formatting and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+
+docs: setup-dev ## Build the documentation into docs/_build/html, with warnings as errors
+	$(BIN)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
 
 format: setup-dev ## Format the code and fix what can be fixed
 	$(BIN)/ruff format
@@ -40,8 +43,9 @@ bench: setup-dev ## Run the slow tests and print the measurements
 	$(BIN)/python -m carts_viewer.bench
 	$(BIN)/carts bench --quick
 
-pictures: setup-dev ## Take the pictures of the README and the tutorial again
+pictures: setup-dev ## Take the pictures of the README, the tutorial and the examples again
 	chromium=$$($(BIN)/python .ci/chromium.py) && CARTS_CHROMIUM=$$chromium $(BIN)/python docs/pictures.py
+	$(BIN)/python docs/example_pictures.py
 
 wheel: setup-dev ## Build the sdist and the wheel into dist/
 	$(BIN)/python -m hatchling build -t sdist -t wheel
@@ -53,4 +57,4 @@ setup-dev: ## The same with the development tools
 	@$(PYTHON) .ci/setup.py --dev
 
 clean: ## Remove built packages and tool caches (.venv stays)
-	rm -rf dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf dist docs/_build .pytest_cache .ruff_cache .hypothesis

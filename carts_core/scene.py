@@ -120,7 +120,7 @@ class Scene:
         """The scene's state at the given joint positions, with the calibration as given.
 
         Args:
-            joint_positions: arm name -> values [*batch, dofs] in the order of `Robot.joint_names`.
+            joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
             device: where the tensors live.
 
         Raises:

@@ -1,6 +1,6 @@
-"""Every key, in one table: the page's shortcuts and palette, its help and the README are made from it.
+"""Every key, in one table: the page's shortcuts and palette, its help and the page of keys are made from it.
 
-    python -m carts_viewer.keys README.md
+    python -m carts_viewer.keys docs/reference/keys.md
 
 brings the table in a text file up to date, between the lines that say where it begins and ends.
 """

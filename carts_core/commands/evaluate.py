@@ -28,7 +28,7 @@ class Evaluate:
     json: Path | None = None
     """Write the scores of all frames and their means to this file; folders on the way to it are made."""
     mode: Mode = "frame"
-    """Optimize each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+    """Optimize each frame alone, or all together, each knowing what the others found (docs: sequences)."""
     together: bool = False
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)

@@ -16,7 +16,7 @@ from .selection import Selection, SequencePath
 
 @dataclass(frozen=True)
 class Export:
-    """Write masks, kinematics, base frames or a video of frames; see docs/exports.md for the formats."""
+    """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats."""
 
     sequence: SequencePath
     """Sequence file."""

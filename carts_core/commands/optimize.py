@@ -22,7 +22,7 @@ class Optimize:
     overwrite: bool = False
     """Start over, although the folder holds results of other settings."""
     mode: Mode = "frame"
-    """Correct each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+    """Correct each frame alone, or all together, each knowing what the others found (docs: sequences)."""
     together: bool = False
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     keyframes: Path | None = None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 ALL = "all"
 
 Mode = Literal["frame", "sequence"]
-"""Each frame alone, or all together, each knowing what the others found (docs/sequences.md)."""
+"""Each frame alone, or all together, each knowing what the others found (docs: sequences)."""
 
 
 @dataclass(frozen=True)

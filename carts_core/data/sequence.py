@@ -81,7 +81,7 @@ class Sequence:
 
     @staticmethod
     def open(path: Path | str, *, progress: Callable[[str], None] | None = None) -> "Sequence":
-        """Read a sequence file (`docs/sequence_format.md`); images are decoded later, when asked for.
+        """Read a sequence file (`docs/reference/sequence_format.md`); images are decoded later, when asked for.
 
         Args:
             path: the TOML file.
@@ -106,7 +106,7 @@ class Sequence:
         if self.matching is None:
             raise SequenceError(
                 f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
-                "Describe the images' times under [frames] (docs/sequence_format.md)."
+                "Describe the images' times under [frames] (docs/reference/sequence_format.md)."
             )
         matching = replace(self.matching, time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))

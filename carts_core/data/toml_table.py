@@ -39,7 +39,7 @@ def read_toml(path: Path) -> "TomlTable":
         raise SequenceError(f"{path} is a folder. Give the .toml file inside it.") from error
     except (OSError, ValueError) as error:
         raise SequenceError(
-            f"sequence file {path} is not readable TOML: {error}. Compare it with docs/sequence_format.md."
+            f"sequence file {path} is not readable TOML: {error}. Compare it with docs/reference/sequence_format.md."
         ) from error
     return TomlTable(values, path, "")
 
@@ -80,7 +80,7 @@ class TomlTable:
         if key not in self._values:
             if default is _REQUIRED:
                 given = [name for name in self._values if name not in self._known]
-                raise self.error(key, f"is missing. Add it (docs/sequence_format.md).{_typo(key, given)}")
+                raise self.error(key, f"is missing. Add it (docs/reference/sequence_format.md).{_typo(key, given)}")
             return default
         value = self._values[key]
         kinds = kind if isinstance(kind, tuple) else (kind,)

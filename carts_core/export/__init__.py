@@ -17,6 +17,7 @@ from .kinematics import read_kinematics_csv as read_kinematics_csv
 from .monitor import ExportCancelled as ExportCancelled
 from .monitor import Monitor as Monitor
 from .overlay import image_and_mask as image_and_mask
+from .overlay import outlined as outlined
 from .overlay import overlay as overlay
 from .png import image_png as image_png
 from .png import mask_png as mask_png

@@ -243,7 +243,7 @@ class FrameOptimizer:
     def base_frame_gain(self) -> float | None:
         """Share of what the images still hold against the best iterate that free base frames would explain [1].
 
-        By the linear model, so it costs one more comparison and no run; see docs/calibration.md for what it is where
+        By the linear model, so it costs one more comparison and no run; see docs/experiments for what it is where
         base frames are right and where they are wrong. Pixels that are ignored, on a proposal too, do not count.
         Several cameras count together, so a single one with a wrong pose shows less.
 

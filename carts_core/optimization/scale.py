@@ -64,7 +64,7 @@ def scaled(
         size=size,
         images=unveiled(stacked, through),
         weight=pixel_weights(scene, ignore, size).to(device),
-        # Smoke, which the network has not seen, misleads it by more than noise does: measured, docs/architecture.md.
+        # Smoke, which the network has not seen, misleads it by more than noise does: measured, see docs/experiments.
         certainty=certainty(through).square(),
         whole=Renderer(scene, width=size[0], height=size[1], device=device),
     )

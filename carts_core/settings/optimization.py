@@ -75,7 +75,7 @@ class OptimizerSettings:
     steps are longer for it; never less than `robust` [1]."""
     propose_ignore: bool = False
     """`surface`: solve a frame again, from its start and in as many steps, without areas at the arms that contradicted
-    the first solution. Only where each frame is alone. It does not always help: see docs/benchmark.md."""
+    the first solution. Only where each frame is alone. It does not always help: see docs/experiments."""
     parts_weight: float = 0.1
     """`surface`: weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05

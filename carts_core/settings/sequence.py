@@ -11,7 +11,8 @@ Direction = Literal["forward", "backward"]
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Model of the measurement error and the way through the frames; defaults are measured (docs/sequences.md)."""
+    """Model of the measurement error and the way through the frames; defaults are measured
+    (docs/explanation/sequences.md)."""
 
     constant_deg: float = 2.0
     """Deviation of the constant part of the error [deg]; `lever` turns it into metres."""

@@ -1,4 +1,4 @@
-"""The examples of docs/sequence_format.md are sequences that open."""
+"""The examples of docs/reference/sequence_format.md are sequences that open."""
 
 import json
 import re
@@ -14,7 +14,7 @@ from carts_core.data import Sequence
 from carts_core.data.matching import TimeMatching
 from carts_core.resources import shipped_robot
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "sequence_format.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "sequence_format.md"
 ARMS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 FRAMES = 2
 IMAGE = np.full((720, 1280, 3), 90, np.uint8)

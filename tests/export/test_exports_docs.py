@@ -1,4 +1,4 @@
-"""What docs/exports.md says is so."""
+"""What docs/reference/exports.md says is so."""
 
 import re
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from pycocotools.coco import COCO
 
 from carts_core.export import FORMATS
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "exports.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "exports.md").read_text(encoding="utf-8")
 
 
 def test_the_page_lists_every_format() -> None:

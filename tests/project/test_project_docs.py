@@ -1,4 +1,4 @@
-"""The examples of docs/project_file.md run."""
+"""The examples of docs/reference/project_file.md run."""
 
 import re
 import sqlite3
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "project_file.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "project_file.md"
 
 
 def test_the_examples_of_the_page_run(tiny_sequence: Callable[..., Path]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from carts_viewer.keys import key_table, shortcuts, with_keys
 from carts_viewer.layers import Layer
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "keys.md"
 
 
 def test_no_two_shortcuts_share_a_key_and_none_flies_the_camera() -> None:
@@ -16,8 +16,8 @@ def test_no_two_shortcuts_share_a_key_and_none_flies_the_camera() -> None:
     assert not {hotkey for hotkey, _ in keys} & set("WASDQE")
 
 
-def test_the_readme_lists_the_keys_as_they_are() -> None:
-    text = README.read_text(encoding="utf-8")
+def test_the_page_of_keys_lists_them_as_they_are() -> None:
+    text = PAGE.read_text(encoding="utf-8")
     assert with_keys(text) == text and key_table(Layer) in text
 
 

@@ -1,0 +1,46 @@
+"""A page for each public package and module of `carts_core`, with the docstrings of its public names."""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+from types import ModuleType
+
+import carts_core
+
+_ELSEWHERE = {"settings", "commands", "cli", "bench", "benchmark", "wording", "process", "mesh_cache", "parts"}
+"""Settings and commands have pages of their own; the others are for us."""
+
+
+def api_pages() -> dict[str, str]:
+    """File name -> Markdown."""
+    pages = {}
+    for info in pkgutil.iter_modules(carts_core.__path__):
+        if info.name in _ELSEWHERE or info.name.startswith("_"):
+            continue
+        module = importlib.import_module(f"carts_core.{info.name}")
+        names = list(_public_names(module, package=info.ispkg))
+        if names:
+            pages[f"api_{info.name}.md"] = _page(module, names)
+    return pages
+
+
+def _public_names(module: ModuleType, package: bool) -> Iterator[str]:
+    """Classes and functions that are defined in a module, or that a package makes public, in their order."""
+    declared = getattr(module, "__all__", None) or vars(module)
+    for name in declared:
+        value = getattr(module, name)
+        if name.startswith("_") or not (inspect.isclass(value) or inspect.isfunction(value)):
+            continue
+        home = value.__module__
+        if home == module.__name__ or (package and home.startswith(module.__name__ + ".")):
+            yield name
+
+
+def _page(module: ModuleType, names: list[str]) -> str:
+    directives = []
+    for name in names:
+        kind = "autoclass" if inspect.isclass(getattr(module, name)) else "autofunction"
+        directives.append(f".. {kind}:: {module.__name__}.{name}\n")
+    summary = inspect.cleandoc(module.__doc__ or "")
+    return f"# {module.__name__}\n\n{summary}\n\n```{{eval-rst}}\n" + "\n".join(directives) + "```\n"

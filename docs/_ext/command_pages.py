@@ -1,0 +1,46 @@
+"""A page for each subcommand of `carts`: what it says of itself with `--help`."""
+
+import contextlib
+import io
+import os
+import typing
+
+import tyro
+
+from carts_core import cli
+
+WIDTH = 100
+"""Columns of the help text."""
+
+
+def subcommands() -> dict[str, type]:
+    """Name of each subcommand -> its dataclass, in the order of `carts --help`."""
+    found = {}
+    for member in typing.get_args(cli.Command):
+        command, *annotations = typing.get_args(member)
+        found[next(note.name for note in annotations if hasattr(note, "name"))] = command
+    return found
+
+
+def help_text(*arguments: str) -> str:
+    """What `carts ARGUMENTS --help` prints, without colours."""
+    printed = io.StringIO()
+    before = dict(os.environ)
+    os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1")
+    os.environ.pop("FORCE_COLOR", None)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            tyro.cli(cli.Command, prog="carts", args=[*arguments, "--help"])  # pyright: ignore
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+    return "\n".join(line.rstrip() for line in printed.getvalue().splitlines())
+
+
+def command_pages() -> dict[str, str]:
+    """File name -> Markdown."""
+    pages = {}
+    for name, command in subcommands().items():
+        summary = (command.__doc__ or "").strip()
+        pages[f"command_{name}.md"] = f"# `carts {name}`\n\n{summary}\n\n```text\n{help_text(name)}\n```\n"
+    return pages

@@ -1,0 +1,51 @@
+"""How Sphinx builds this site: `make docs`. What is generated from the code is in `_ext/`."""
+
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
+
+project = "CaRTS"
+author = "The CaRTS developers"
+copyright = f"2026, {author}"
+release = installed_version("carts")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "generated_pages",
+]
+source_suffix = {".md": "markdown"}
+exclude_patterns = ["_build", "_ext", "requirements*"]
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 3
+# Pages of the guide link to sources and to the README, which are no pages of the site.
+myst_url_schemes = ["http", "https", "mailto"]
+suppress_warnings = ["misc.highlighting_failure"]
+
+# Docstrings are written with `code` in single backticks.
+default_role = "literal"
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+autodoc_default_options = {"members": True, "show-inheritance": False}
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 88
+
+copybutton_exclude = ".linenos, .gp, .go"
+
+html_theme = "furo"
+html_title = f"CaRTS {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_favicon = "../static/icon.svg"
+html_show_sourcelink = False
+html_copy_source = False
