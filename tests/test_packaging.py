@@ -140,7 +140,7 @@ for path in (*modules, sample_sequence(), shipped_robot(), *shipped_weights(), s
 
 def test_the_command_starts_without_the_extras(environment: Path, tmp_path: Path) -> None:
     """`make view` installs no extras, so nothing that only they bring may be needed to start."""
-    hidden = [name for extra in ("synthesis", "import", "docs", "dev") for name in PROJECT["optional-dependencies"][extra]]
+    hidden = [name for names in PROJECT["optional-dependencies"].values() for name in names]
     modules = {Requirement(name).name.replace("-", "_") for name in hidden} - {PROJECT["name"], "packaging"}
     program = f"""
 import sys
