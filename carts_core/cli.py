@@ -14,6 +14,7 @@ from .commands.bench import Bench
 from .commands.calibrate import Calibrate
 from .commands.evaluate import Evaluate
 from .commands.export import Export
+from .commands.import_ import Import
 from .commands.optimize import Optimize
 from .commands.render import Render
 from .commands.robot import RobotCommand
@@ -31,6 +32,7 @@ BAD_INPUT = 2
 
 Command = (
     Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]

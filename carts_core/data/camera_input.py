@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..camera import Camera
+from ..errors import SequenceError
 from ..files.reading import is_regular
 from .calibration import take_camera
 from .frame_files import check_present, frame_files
-from .frame_list import FrameList
+from .frame_list import FrameList, numbers_of_frames
+from .image_sources import BagImages, Cropped
 from .images import ImageFiles, ImageSource
 from .patterns import expand, is_glob, is_per_frame
 from .toml_table import TomlTable, closest
@@ -78,7 +80,26 @@ def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: b
 
 
 def _images(table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str) -> ImageSource:
+    source = _whole_images(table, pattern, frames, domain, camera)
+    crop = table.take("crop", list, [])
+    if not crop:
+        return source
+    if len(crop) != 4 or not all(isinstance(value, int) and value >= 0 for value in crop) or min(crop[2:]) < 1:
+        raise table.error("crop", f"is {crop!r}. Give [left, top, width, height] in whole pixels.")
+    return Cropped(source, (crop[0], crop[1], crop[2], crop[3]))
+
+
+def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str) -> ImageSource:
     key = table.name("images")
+    topic, numbers = table.take("topic", str, ""), frames.video_frames
+    message_time, video_frame = table.take("message_time", str, ""), table.take("video_frame", str, "")
+    if topic:
+        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        return BagImages(path, topic, _message_times(table, message_time, frames))
+    if video_frame:
+        if frames.table is None:
+            raise table.error("video_frame", "names a column, but [frames] has no table. Name the frames in a table.")
+        numbers = numbers_of_frames(frames.table, video_frame, table.name("video_frame"))
     if not is_per_frame(pattern) and not is_glob(pattern):
         path = table.path(expand(pattern, key, domain=domain, camera=camera))
         if path.suffix.lower() not in SUFFIXES:
@@ -87,10 +108,20 @@ def _images(table: TomlTable, pattern: str, frames: FrameList, domain: str, came
                 f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
                 f"or name a video ({', '.join(SUFFIXES)}).",
             )
-        return Video(path, frames.video_frames)
+        return Video(path, numbers)
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
     check_present(key, files, frames)
     return ImageFiles(files)
+
+
+def _message_times(table: TomlTable, column: str, frames: FrameList) -> tuple[int, ...]:
+    if frames.table is None or not column:
+        raise table.error("message_time", "is missing: with `topic`, name the column of the table with times [ns].")
+    cells = frames.table.text(column, table.name("message_time"))
+    for cell, line in zip(cells, frames.table.lines, strict=True):
+        if not cell.isdecimal():
+            raise SequenceError(f"{frames.table.path}, line {line}, column {column!r}: {cell!r} is no time [ns].")
+    return tuple(map(int, cells))
 
 
 def _masks(

@@ -28,6 +28,8 @@ class FrameList:
     """Number of every frame in its video, from 0."""
     counted: str
     """How errors say how many there are, say "the kinematics table has 3 rows"."""
+    table: Table | None = None
+    """The table whose rows they are; None for all frames of a video."""
 
     def __post_init__(self) -> None:
         if len(self.frame_ids) > MOST_FRAMES:
@@ -116,8 +118,8 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
     frame_ids = names.of(table)
     times = table.numbers(timestamp, section.name("timestamp")) if timestamp else None
     column = section.take("video_frame", str, "")
-    video_frames = _video_frames(table, column, section) if column else tuple(range(len(table)))
-    return FrameList(frame_ids, times, video_frames, counted)
+    video_frames = numbers_of_frames(table, column, section.name("video_frame")) if column else tuple(range(len(table)))
+    return FrameList(frame_ids, times, video_frames, counted, table)
 
 
 def take_delimiter(section: TomlTable) -> str:
@@ -158,8 +160,13 @@ def _take_pattern(section: TomlTable) -> str:
     return pattern
 
 
-def _video_frames(table: Table, column: str, section: TomlTable) -> tuple[int, ...]:
-    numbers = table.numbers(column, section.name("video_frame"))
+def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ...]:
+    """The column of a table that says which frames of a video its rows are.
+
+    Raises:
+        SequenceError: there is no such column, or a cell is no whole number from 0.
+    """
+    numbers = table.numbers(column, asked_by)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
         raise SequenceError(
             f"{table.path}, line {table.lines[wrong[0]]}, column {column!r}: {numbers[wrong[0]]:g} is not a frame "

@@ -1,7 +1,7 @@
 """Two logs of the same motion whose rows have times of their own."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 SAME_CYCLE = 2e-3
 """[s] Rows of two topics this near to each other were written in the same cycle of a controller."""
@@ -14,7 +14,7 @@ def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " o
     is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between topics
     of different rates.
     """
-    difference = times - other[_nearest(times, other)]
+    difference = times - other[nearest(times, other)]
     same = np.abs(difference) <= SAME_CYCLE
     return float(np.median(difference[same])) if 2 * same.sum() >= len(times) else 0.0
 
@@ -27,7 +27,8 @@ def at_times(
     return np.stack(columns, axis=1)
 
 
-def _nearest(times: np.ndarray, other: np.ndarray) -> np.ndarray:
+def nearest(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> Int[np.ndarray, " rows"]:
+    """For each of `times`, the row of `other` (increasing) that is nearest to it."""
     after = np.searchsorted(other, times).clip(1, max(len(other) - 1, 1))
     before = after - 1
     after = after.clip(0, len(other) - 1)

@@ -12,7 +12,7 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,9 +20,7 @@ from jaxtyping import Float
 from ..camera import rigid_transform
 from ..errors import SequenceError, SettingsError
 from ..export.dvrk import T_DVRK_OPENCV
-
-Axes = Literal["opencv", "dvrk"]
-"""Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
+from ..settings.importing import Axes
 
 _KINDS = (
     'a registration ({"base-frame": {"transform"}}), a configuration ({"arms": [{"name", "base_frame"}]}) or fixed '

@@ -1,0 +1,156 @@
+"""Images that lie in a part of a picture, or inside a ROS bag."""
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ..errors import SequenceError
+from ..extras import needs_extra
+from .images import ImageSource, find_damage
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+"""File names that are taken for ROS bags; a folder with `metadata.yaml` is one, too."""
+
+_CHANNELS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
+_BAYER = {
+    # ROS names the first two pixels of the first row, OpenCV those of the second.
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+}
+_ONE_CHANNEL = {"mono8": cv2.COLOR_GRAY2RGB, **_BAYER}
+
+
+@dataclass(frozen=True)
+class Cropped:
+    """A rectangle of every image of another source."""
+
+    source: ImageSource
+    crop: tuple[int, int, int, int]
+    """Left, top, width and height [px]."""
+
+    def name(self, index: int) -> str:
+        """What errors call the image of frame `index`."""
+        return self.source.name(index)
+
+    def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The rectangle, RGB.
+
+        Raises:
+            SequenceError: the image cannot be read, or the rectangle leaves it.
+        """
+        image = self.source.read(index)
+        left, top, width, height = self.crop
+        if left + width > image.shape[1] or top + height > image.shape[0]:
+            raise SequenceError(
+                f"{self.name(index)} is {image.shape[1]} x {image.shape[0]} pixels, but `crop` reaches to "
+                f"{left + width} x {top + height}. Correct crop = [left, top, width, height] in the sequence file."
+            )
+        return np.ascontiguousarray(image[top : top + height, left : left + width])
+
+
+class BagImages:
+    """Images of one topic of a ROS bag, each found by the time at which it was recorded; safe to use from threads.
+
+    Args:
+        path: ROS 1 bag, MCAP file or ROS 2 bag folder.
+        topic: of `sensor_msgs/Image` or `sensor_msgs/CompressedImage`.
+        times: record time of every frame's message [ns].
+
+    Raises:
+        SequenceError: the bag cannot be opened, or has no such topic.
+    """
+
+    def __init__(self, path: Path, topic: str, times: tuple[int, ...]) -> None:
+        needs_extra("rosbags", "import")
+        self.path = path
+        self.topic = topic
+        self._times = times
+        self._lock = threading.Lock()
+        self._reader = open_bag(path)
+        self._connections = [entry for entry in self._reader.connections if entry.topic == topic]
+        if not self._connections:
+            known = ", ".join(sorted(entry.topic for entry in self._reader.connections))
+            raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {known}.")
+
+    def name(self, index: int) -> str:
+        """What errors call the image of frame `index`."""
+        return f"{self.path}, {self.topic} at {self._times[index]} ns"
+
+    def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The image of the sequence's frame `index`, RGB.
+
+        Raises:
+            SequenceError: there is none at that time, or it is damaged.
+        """
+        time = self._times[index]
+        with self._lock:
+            try:
+                found = next(iter(self._reader.messages(self._connections, start=time, stop=time + 1)), None)
+                message: Any = None if found is None else self._reader.deserialize(found[2], found[0].msgtype)
+            except Exception as error:  # rosbags raises whatever its storage formats raise
+                raise SequenceError(f"{self.name(index)} cannot be read ({error}). Copy the bag again.") from error
+        if message is None:
+            raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
+        return decode_message(message, self.name(index))
+
+
+def open_bag(path: Path) -> Any:
+    """An opened `rosbags` reader.
+
+    Raises:
+        SequenceError: the bag is missing, damaged or of an unknown kind.
+    """
+    needs_extra("rosbags", "import")
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    if not path.exists():
+        raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
+    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    try:
+        reader.open()
+    except Exception as error:  # rosbags raises whatever its storage formats raise
+        raise SequenceError(
+            f"bag {path} cannot be opened ({error}). It is damaged, was cut off, or is no ROS bag: copy it again, "
+            "or have ROS index it anew (rosbag reindex, ros2 bag reindex)."
+        ) from error
+    return reader
+
+
+def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:
+    """The pixels of a `sensor_msgs` image message, RGB.
+
+    Args:
+        message: an `Image` or `CompressedImage`.
+        what: how errors call it.
+
+    Raises:
+        SequenceError: it is damaged or of an encoding that is not known.
+    """
+    if not hasattr(message, "encoding"):
+        content = np.asarray(message.data, np.uint8)
+        damage = find_damage(content.tobytes())
+        image = None if damage else cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise SequenceError(f"{what} is damaged: {damage or f'no {message.format} image'}. Copy the bag again.")
+        return np.ascontiguousarray(image[..., ::-1])
+    encoding = message.encoding.lower()
+    channels = 1 if encoding in _ONE_CHANNEL else 4 if encoding in ("rgba8", "bgra8") else 3
+    if encoding not in _ONE_CHANNEL and encoding not in _CHANNELS:
+        known = ", ".join([*_CHANNELS, *_ONE_CHANNEL])
+        raise SequenceError(f"{what} has the encoding {message.encoding!r}. Known are: {known}. Convert the bag.")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.asarray(message.data, np.uint8)
+    if step < width * channels or len(data) < step * height or not height or not width:
+        raise SequenceError(f"{what} has {len(data)} bytes, too few for {width} x {height} pixels of {encoding}.")
+    pixels = data[: step * height].reshape(height, step)[:, : width * channels]
+    pixels = np.ascontiguousarray(pixels.reshape(height, width, *([channels] if channels > 1 else [])))
+    conversion = _ONE_CHANNEL.get(encoding, _CHANNELS.get(encoding))
+    return pixels if conversion is None else cv2.cvtColor(pixels, conversion)

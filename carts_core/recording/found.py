@@ -1,0 +1,89 @@
+"""What an importer finds in a foreign recording, before a sequence file is written."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+NoteKind = Literal["found", "guessed", "missing", "warning"]
+
+
+@dataclass(frozen=True)
+class Note:
+    """A line of the report."""
+
+    kind: NoteKind
+    text: str
+    """A sentence for people; guesses and what is missing say how to change it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCamera:
+    """A camera and where its images lie."""
+
+    name: str
+    size: tuple[int, int]
+    """Width and height of its images [px]."""
+    images: Path
+    """Folder, video or bag; absolute."""
+    pattern: str = ""
+    """Name of every frame's image below `images`; empty for a video or bag."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy [px], None where not known."""
+    pixel_center: float = 0.0
+    """Where the first pixel's centre is in these: 0 in OpenCV's convention, 0.5 in ours."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients."""
+    T_camera_world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """[m]"""
+    masks: str = ""
+    """Pattern of its masks, below `images.parent` or absolute; empty without masks."""
+    sparse_masks: bool = False
+    crop: tuple[int, int, int, int] | None = None
+    """Left, top, width, height of its part of each image [px]."""
+    topic: str = ""
+    """In a bag."""
+    numbers: Int[np.ndarray, " frames"] | None = None
+    """Frame of its video, or record time of its message [ns], for every frame; None where frames are counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundArm:
+    """An arm and its joint positions."""
+
+    name: str
+    columns: tuple[str, ...] = ()
+    """Joints of the robot that are measured."""
+    values: Float[np.ndarray, "rows columns"] | None = None
+    """[rad], [m]; None without kinematics."""
+    times: Float[np.ndarray, " rows"] | None = None
+    """In the recording's seconds, increasing; None where row n belongs to frame n."""
+    robot: str = "builtin:psm_lnd"
+    T_world_base: Float[np.ndarray, "4 4"] | None = None
+    """[m]; None where not known."""
+    base_from: str = ""
+    """What it was taken from, for people."""
+    fixed: tuple[str, ...] = ()
+    """Further joints of the robot, which stay at 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundRecording:
+    """All that a source holds."""
+
+    kind: str
+    """The source's name for people."""
+    name: str
+    cameras: tuple[FoundCamera, ...]
+    arms: tuple[FoundArm, ...]
+    frame_ids: tuple[str, ...]
+    frame_times: Float[np.ndarray, " frames"] | None
+    """In the recording's seconds; None where rows of the tables are frames."""
+    notes: tuple[Note, ...] = ()
+    time_offset: float = 0.0
+    """Time in the kinematics minus time of the image [s]."""
+    domains: Mapping[str, str] = field(default_factory=dict)
+    """Domain -> what stands for {domain} in patterns; empty for one domain."""

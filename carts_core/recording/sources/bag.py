@@ -1,0 +1,292 @@
+"""ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that speak CRTK."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...data.image_sources import BAG_SUFFIXES, decode_message, open_bag
+from ...errors import SequenceError
+from ...settings.importing import ImportOptions
+from ..alignment import nearest
+from ..cameras import calibration_of, camera_from_info, side_of
+from ..found import FoundCamera, FoundRecording, Note
+from ..logs import ArmLog, arm_from_log, track
+from .protocol import Source
+
+_ARM_TOPIC = re.compile(r"^(?P<prefix>/|.*/)(?P<arm>PSM\d?)/(?P<rest>.+)$", re.IGNORECASE)
+_ROLES = {
+    "measured_js": "joints",
+    "state_joint_current": "joints",
+    "jaw/measured_js": "jaw",
+    "state_jaw_current": "jaw",
+    "measured_cp": "poses",
+    "position_cartesian_current": "poses",
+    "local/measured_cp": "local_poses",
+    "position_cartesian_local_current": "local_poses",
+    "tool_type": "tool",
+}
+_IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+_EXACT_BYTES = 2**30
+"""In bags up to this size every image message is read for the time in its header."""
+_SAMPLED = 20
+_PREFERRED = ("rect", "compressed", "")
+
+
+def _detect(path: Path) -> bool:
+    return (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
+
+
+@dataclass
+class _Rows:
+    """Rows of one arm, as they come out of the bag."""
+
+    joints: list[tuple[float, ...]] = field(default_factory=list)
+    jaw: list[tuple[float, ...]] = field(default_factory=list)
+    poses: list[tuple[float, ...]] = field(default_factory=list)
+    local_poses: list[tuple[float, ...]] = field(default_factory=list)
+    setup: list[tuple[float, ...]] = field(default_factory=list)
+    tool: str = ""
+
+
+def read_arm_logs(reader: Any, path: Path, options: ImportOptions) -> list[ArmLog]:
+    """What a bag has logged of its arms, by the arms' names.
+
+    Raises:
+        SequenceError: a message is damaged, or an arm that was asked for is not there.
+    """
+    wanted: dict[int, tuple[str, str]] = {}
+    names = {recorded.casefold(): name for name, recorded in options.arms.items()}
+    seen: set[str] = set()
+    for connection in reader.connections:
+        match = _ARM_TOPIC.match(connection.topic)
+        role = _role(match) if match else None
+        if match is None or role is None:
+            continue
+        recorded = match["arm"]
+        seen.add(recorded)
+        if options.arms and recorded.casefold() not in names:
+            continue
+        wanted[connection.id] = (names.get(recorded.casefold(), recorded.upper()), role)
+    if missing := [
+        recorded for recorded in options.arms.values() if recorded.casefold() not in map(str.casefold, seen)
+    ]:
+        raise SequenceError(f"{path} has no arm {missing[0]!r}. It has: {', '.join(sorted(seen)) or 'none'}.")
+    rows: dict[str, _Rows] = {}
+    connections = [connection for connection in reader.connections if connection.id in wanted]
+    for connection, bag_time, message in _messages(reader, connections, path) if connections else ():
+        arm, role = wanted[connection.id]
+        entry = rows.setdefault(arm, _Rows())
+        if role == "tool":
+            entry.tool = str(message.data)
+        elif (values := _values(message, role)) is not None:
+            getattr(entry, role).append((_stamp(message, bag_time), *values))
+    return [
+        ArmLog(
+            arm,
+            track(entry.joints),
+            track(entry.jaw),
+            track(entry.poses),
+            track(entry.local_poses),
+            track(entry.setup),
+            entry.tool,
+        )
+        for arm, entry in sorted(rows.items())
+    ]
+
+
+def _role(match: re.Match[str]) -> str | None:
+    if match["prefix"].rstrip("/").endswith("SUJ"):
+        return "setup" if match["rest"] == "measured_cp" else None
+    return _ROLES.get(match["rest"])
+
+
+def _messages(reader: Any, connections: list[Any], path: Path) -> Iterator[tuple[Any, int, Any]]:
+    """Decoded messages; what rosbags raises becomes a sentence."""
+    messages = reader.messages(connections)
+    while True:
+        try:
+            entry = next(messages, None)
+            if entry is None:
+                return
+            connection, time, raw = entry
+            message = reader.deserialize(raw, connection.msgtype)
+        except Exception as error:  # rosbags raises whatever its storage formats raise
+            raise SequenceError(
+                f"bag {path} is damaged or was cut off ({error}). Copy it again, or reindex it."
+            ) from error
+        yield connection, time, message
+
+
+def _stamp(message: Any, bag_time: int) -> float:
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    nanoseconds = bag_time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
+    return nanoseconds * 1e-9
+
+
+def _values(message: Any, role: str) -> tuple[float, ...] | None:
+    if role in ("joints", "jaw"):
+        positions = np.asarray(message.position, np.float64)
+        count = 6 if role == "joints" else 1
+        return tuple(positions[:count]) if len(positions) >= count else None
+    pose = getattr(message, "pose", None) or getattr(message, "transform", None)
+    if pose is None:
+        return None
+    p = getattr(pose, "position", None) or pose.translation
+    q = getattr(pose, "orientation", None) or pose.rotation
+    return (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+
+
+def _image_topics(reader: Any, path: Path, options: ImportOptions) -> dict[str, str]:
+    """Camera -> topic."""
+    topics = [connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES]
+    topics = list(dict.fromkeys(topics))
+    if options.images:
+        for topic in options.images.values():
+            if topic not in topics:
+                raise SequenceError(f"{path} has no image topic {topic!r}. It has: {', '.join(topics) or 'none'}.")
+        return dict(options.images)
+    chosen: dict[str, list[str]] = {}
+    for topic in topics:
+        chosen.setdefault(side_of(topic) or ("camera" if len(topics) == 1 else topic), []).append(topic)
+    unknown = [name for name in chosen if name.startswith("/")]
+    if unknown and len(unknown) < len(chosen):
+        chosen = {name: found for name, found in chosen.items() if name not in unknown}
+    elif len(unknown) > 1:
+        raise SequenceError(
+            f"{path} has {len(topics)} image topics, whose names do not say which camera they are: "
+            f"{', '.join(topics)}. Choose: --images left TOPIC right TOPIC."
+        )
+    return {name: min(found, key=_preference) for name, found in chosen.items()}
+
+
+def _preference(topic: str) -> int:
+    return next(rank for rank, word in enumerate(_PREFERRED) if word in topic)
+
+
+def _image_times(reader: Any, path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Record times [ns] and times [s] of a topic's images; without reading them where the bag has an index."""
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    indexes = [getattr(one, "indexes", None) for one in reader.readers]
+    size = sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
+    record: list[int] = []
+    stamps: list[int] = []
+    if size > _EXACT_BYTES and all(indexes):
+        record = sorted(
+            entry.time for index in indexes if index for connection in connections for entry in index[connection.id]
+        )
+    for count, (connection, time, raw) in enumerate(_raw_messages(reader, connections, path)):
+        if record and count == _SAMPLED:
+            break
+        stamps.append(_header_time(raw, connection, reader, time) - time)
+        if not record or count >= len(record):
+            record.append(time)
+    times = np.array(record, np.int64)
+    late = np.array(stamps, np.int64) if len(stamps) == len(times) else np.int64(np.median(stamps)) if stamps else 0
+    return times, (times + late) * 1e-9
+
+
+def _raw_messages(reader: Any, connections: list[Any], path: Path) -> Iterator[tuple[Any, int, bytes]]:
+    messages = reader.messages(connections)
+    while True:
+        try:
+            entry = next(messages, None)
+        except Exception as error:  # rosbags raises whatever its storage formats raise
+            raise SequenceError(
+                f"bag {path} is damaged or was cut off ({error}). Copy it again, or reindex it."
+            ) from error
+        if entry is None:
+            return
+        yield entry
+
+
+def _header_time(raw: bytes, connection: Any, reader: Any, bag_time: int) -> int:
+    """The stamp of a message that begins with a header, without decoding its pixels."""
+    start = 4  # ROS 1 has the sequence number there, ROS 2 the encapsulation.
+    seconds = int.from_bytes(raw[start : start + 4], "little")
+    nanoseconds = int.from_bytes(raw[start + 4 : start + 8], "little")
+    return seconds * 10**9 + nanoseconds if seconds and nanoseconds < 10**9 else bag_time
+
+
+def _cameras(
+    reader: Any, path: Path, options: ImportOptions, notes: list[Note]
+) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
+    topics = _image_topics(reader, path, options)
+    times = {name: _image_times(reader, path, topic) for name, topic in topics.items()}
+    for name, topic in topics.items():
+        if not len(times[name][0]):
+            raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one: --images {name} TOPIC.")
+    leader = next(iter(sorted(topics, key=lambda name: (name != "left", name))), None)
+    if leader is None:
+        return (), np.empty(0)
+    frame_times = times[leader][1]
+    order = np.argsort(frame_times, kind="stable")
+    frame_times = frame_times[order]
+    cameras = []
+    for name in sorted(topics, key=lambda name: (name != leader, name)):
+        record, stamps = times[name]
+        chosen = order if name == leader else nearest(frame_times, stamps)
+        if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
+            notes.append(Note("warning", f"images of {name} are up to {late:.3f} s from those of {leader}."))
+        info = _camera_info(reader, path, topics[name])
+        size = _size(reader, path, topics[name])
+        numbers = record[chosen]
+        found = camera_from_info(name, size, path, info, rectified="rect" in topics[name])
+        cameras.append(calibration_of(found, options, notes, topic=topics[name], numbers=numbers))
+        notes.append(Note("found", f"camera {name}: {topics[name]}, {len(record)} images, {size[0]} x {size[1]}."))
+    return tuple(cameras), frame_times
+
+
+def _size(reader: Any, path: Path, topic: str) -> tuple[int, int]:
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    for _, _, message in _messages(reader, connections, path):
+        image = decode_message(message, f"{path}, {topic}")
+        return image.shape[1], image.shape[0]
+    raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one with --images.")
+
+
+def _camera_info(reader: Any, path: Path, topic: str) -> Any:
+    """The camera_info that belongs to an image topic: beside it, or of the same side; None without one."""
+    infos = [connection for connection in reader.connections if connection.msgtype == _INFO_TYPE]
+    parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3)]
+    chosen = [info for parent in parents for info in infos if info.topic.rsplit("/", 1)[0] == parent]
+    side = side_of(topic)
+    chosen += [info for info in infos if side is not None and side_of(info.topic) == side]
+    for _, _, message in _messages(reader, chosen[:1], path) if chosen else ():
+        return message
+    return None
+
+
+def _read(path: Path, options: ImportOptions) -> FoundRecording:
+    reader = open_bag(path)
+    try:
+        if not reader.connections:
+            raise SequenceError(f"bag {path} has no messages. Record again, or copy it again.")
+        notes: list[Note] = []
+        cameras, frame_times = _cameras(reader, path, options, notes)
+        logs = read_arm_logs(reader, path, options)
+        if not logs:
+            known = ", ".join(sorted(connection.topic for connection in reader.connections))
+            raise SequenceError(
+                f"bag {path} has no kinematics of an arm (looked for /PSM1/measured_js, /PSM1/measured_cp and the "
+                f"names of dVRK 1.x). Its topics are: {known}."
+            )
+        arms = tuple(arm_from_log(log, options, notes.append) for log in logs)
+    finally:
+        reader.close()
+    ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
+    offset = options.time_offset or 0.0
+    return FoundRecording("a ROS bag", path.stem, cameras, arms, ids, frame_times, tuple(notes), offset)
+
+
+SOURCE = Source(
+    "bag",
+    "ROS 1 or ROS 2 bag",
+    "a file .bag or .mcap, or a folder with metadata.yaml",
+    _detect,
+    _read,
+)

@@ -1,0 +1,58 @@
+"""What a person can say about a recording; everything else is found or guessed, and each guess is shown."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ..errors import SettingsError
+
+Clock = Literal["s", "ms", "us", "ns"]
+Axes = Literal["opencv", "dvrk"]
+"""Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
+
+SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Answers to what a recording does not say."""
+
+    source: str | None = None
+    """Kind of source (`carts import` lists them); by default it is detected."""
+    images: Mapping[str, str] = field(default_factory=dict)
+    """Camera -> its images: a folder, pattern or video, or a topic of the bag."""
+    calibration: Mapping[str, Path] = field(default_factory=dict)
+    """Camera -> its calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
+    kinematics: Path | None = None
+    """Table of joint positions or tip poses (CSV, Parquet, NPY)."""
+    columns: Mapping[str, str] = field(default_factory=dict)
+    """Joint, or `time` or `frame` -> column of that table."""
+    angle_unit: Literal["rad", "deg"] | None = None
+    """Of the table's angles."""
+    length_unit: Literal["m", "mm"] | None = None
+    """Of the table's lengths."""
+    clock: Clock | None = None
+    """Unit of the table's times."""
+    time_offset: float | None = None
+    """Time in the kinematics minus time of the image [s]."""
+    frame_rate: float | None = None
+    """Of images without times [1/s]."""
+    arms: Mapping[str, str] = field(default_factory=dict)
+    """Arm -> what the recording calls it; only these are imported."""
+    robot: Mapping[str, str] = field(default_factory=dict)
+    """Arm -> its robot: a URDF, or `builtin:psm_lnd`, which is the default."""
+    wrist_length: float | None = None
+    """From wrist pitch to wrist yaw [m], for inverse kinematics; by default that of the instrument, else 0.0091."""
+    base: Mapping[str, Path] = field(default_factory=dict)
+    """Arm -> registration, configuration or set-up joint file of the dVRK with its base frame."""
+    axes: Axes | None = None
+    """Axes of the camera in these files, where the file does not say."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate)):
+            if value is not None and not math.isfinite(value):
+                raise SettingsError(f"{name} is {value}; give a finite number.")
+        if self.frame_rate is not None and not 0.01 <= self.frame_rate <= 1000:
+            raise SettingsError(f"frame_rate is {self.frame_rate:g}; allowed is 0.01 to 1000 frames per second.")

@@ -1,0 +1,185 @@
+"""Recordings of the shipped robot in foreign formats, each written by its owners' own writer where there is one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.psm_kinematics import forward
+
+SIZE = (96, 72)
+START = 1_700_000_000_000_000_000
+"""[ns]"""
+T_CAMERA_BASE = np.eye(4)
+T_CAMERA_BASE[:3, :3] = Rotation.from_rotvec([2.6, 0.4, 0.2]).as_matrix()
+T_CAMERA_BASE[:3, 3] = 0.02, -0.03, 0.02
+K = np.array([[110.0, 0, 47.5], [0, 110.0, 35.5], [0, 0, 1]])
+BASELINE = 0.005
+
+
+def joints_at(time: np.ndarray | float) -> np.ndarray:
+    """Six joints [rad, m] at times [s]."""
+    phase = np.asarray(time, np.float64)[..., None] * [0.9, 1.1, 0.7, 0.5, 1.7, 1.3]
+    return np.array([0.1, 0.05, 0.12, 0.5, 0.1, -0.2]) + np.array([0.2, 0.15, 0.03, 0.6, 0.5, 0.4]) * np.sin(phase)
+
+
+def jaw_at(time: np.ndarray | float) -> np.ndarray:
+    return 0.3 + 0.2 * np.sin(np.asarray(time, np.float64))
+
+
+def image(number: int, camera: str = "left") -> np.ndarray:
+    """A picture that says which frame and camera it is, RGB."""
+    picture = np.full((SIZE[1], SIZE[0], 3), 60 if camera == "left" else 120, np.uint8)
+    picture[:, : 8 * (number % 10) + 8, 0] = 200
+    return picture
+
+
+def write_images(folder: Path, count: int, name: str = "{:04d}.png", camera: str = "left") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        assert cv2.imwrite(str(folder / name.format(number)), image(number, camera)[..., ::-1])
+
+
+def pose_of(T: np.ndarray) -> list[float]:
+    """x y z and a quaternion x y z w."""
+    return [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+
+
+@dataclass(frozen=True)
+class BagKind:
+    """How a bag is written."""
+
+    ros: int = 2
+    storage: str = "sqlite3"
+    generation: str = "2.2"
+    """Of the dVRK: 1.x, 2.0 or 2.2."""
+    compressed: bool = True
+    joints: bool = True
+    local: bool = True
+    cameras: tuple[str, ...] = ("left", "right")
+    arms: tuple[str, ...] = ("PSM1",)
+    frames: int = 6
+    info: Callable[[dict[str, Any]], None] | None = None
+    """Changes the values of every camera_info."""
+
+
+def write_bag(path: Path, kind: BagKind = BagKind()) -> Path:
+    """A bag of half a second: 12 images/s a camera, 100 rows/s an arm."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind.ros == 1 else Stores.ROS2_HUMBLE)
+    if kind.ros == 1:
+        writer: Any = Writer1(path)
+        encode = store.serialize_ros1
+    else:
+        plugin = StoragePlugin.MCAP if kind.storage == "mcap" else StoragePlugin.SQLITE3
+        writer, encode = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    messages = sorted(_messages(store, kind), key=lambda entry: entry[0])
+    with writer:
+        connections: dict[str, Any] = {}
+        for time, topic, message in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            writer.write(connections[topic], time, encode(message, message.__msgtype__))
+    return path
+
+
+def _messages(store: Any, kind: BagKind):
+    def make(kind_of_message: str, **values: Any) -> Any:
+        return store.types[kind_of_message](**values)
+
+    def header(time: int, frame: str) -> Any:
+        stamp = make("builtin_interfaces/msg/Time", sec=time // 10**9, nanosec=time % 10**9)
+        extra = {"seq": 0} if kind.ros == 1 else {}
+        return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **extra)
+
+    old = kind.generation == "1.x"
+    for arm in kind.arms:
+        prefix = f"/dvrk/{arm}" if old else f"/{arm}"
+        for row in range(-5, 8 * kind.frames + 5):
+            time = START + row * 10_000_000
+            q = joints_at(row / 100)
+            rows = {}
+            if kind.joints:
+                rows["state_joint_current" if old else "measured_js"] = q
+            rows["state_jaw_current" if old else "jaw/measured_js"] = jaw_at(row / 100)[None]
+            for topic, values in rows.items():
+                message = make(
+                    "sensor_msgs/msg/JointState",
+                    header=header(time, ""),
+                    name=["outer_yaw"] * len(values),
+                    position=np.asarray(values, np.float64),
+                    velocity=np.empty(0),
+                    effort=np.empty(0),
+                )
+                yield time + 900_000, f"{prefix}/{topic}", message
+            T = forward(q)
+            poses = {"measured_cp": T_DVRK_OPENCV @ T_CAMERA_BASE @ T}
+            if kind.local:
+                poses["local/measured_cp"] = T
+            if old:
+                poses = {"position_cartesian_current": poses["measured_cp"]}
+            for topic, pose in poses.items():
+                yield time + 950_000, f"{prefix}/{topic}", _pose(make, header(time + 300_000, "ECM"), pose, kind)
+        if kind.generation == "2.2":
+            yield START, f"{prefix}/tool_type", make("std_msgs/msg/String", data="LARGE_NEEDLE_DRIVER:400006[1]")
+    for camera in kind.cameras:
+        for frame in range(kind.frames):
+            time = START + frame * 80_000_000 + (1_000_000 if camera == "right" else 0)
+            yield from _image_messages(make, header(time, camera), time + 5_000_000, frame, camera, kind)
+
+
+def _pose(make: Any, header: Any, T: np.ndarray, kind: BagKind) -> Any:
+    x, y, z, *q = pose_of(T)
+    rotation = make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3])
+    if kind.generation == "2.0":
+        translation = make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        transform = make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+        return make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id="", transform=transform)
+    position = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    pose = make("geometry_msgs/msg/Pose", position=position, orientation=rotation)
+    return make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+
+
+def _image_messages(make: Any, header: Any, time: int, frame: int, camera: str, kind: BagKind):
+    picture = image(frame, camera)
+    if kind.compressed:
+        data = cv2.imencode(".png", picture[..., ::-1])[1].reshape(-1)
+        message = make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=data)
+        yield time, f"/stereo/{camera}/image_raw/compressed", message
+    else:
+        message = make(
+            "sensor_msgs/msg/Image",
+            header=header,
+            height=SIZE[1],
+            width=SIZE[0],
+            encoding="bgr8",
+            is_bigendian=0,
+            step=3 * SIZE[0],
+            data=np.ascontiguousarray(picture[..., ::-1]).reshape(-1),
+        )
+        yield time, f"/stereo/{camera}/image_raw", message
+    P = np.column_stack([K, [-K[0, 0] * BASELINE if camera == "right" else 0.0, 0, 0]])
+    values = {
+        "height": SIZE[1],
+        "width": SIZE[0],
+        "distortion_model": "plumb_bob",
+        "K": K.reshape(-1),
+        "D": np.zeros(5),
+        "R": np.eye(3).reshape(-1),
+        "P": P.reshape(-1),
+    }
+    if kind.info is not None:
+        kind.info(values)
+    if kind.ros == 2:
+        values = {key.lower() if len(key) == 1 else key: value for key, value in values.items()}
+    roi = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    info = make("sensor_msgs/msg/CameraInfo", header=header, binning_x=0, binning_y=0, roi=roi, **values)
+    yield time, f"/stereo/{camera}/camera_info", info

@@ -1,0 +1,166 @@
+"""ROS bags, written by rosbags' own writers, from one command to images with joints and an overlay."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import SIZE, T_CAMERA_BASE, BagKind, K, image, jaw_at, joints_at, write_bag
+
+from carts_core.cli import BAD_INPUT, main
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.recording.importing import find, import_recording
+from carts_core.rendering import Renderer
+from carts_core.settings.importing import ImportOptions
+
+KINDS = {
+    "ROS 2 sqlite3, dVRK 2.2": ("bag", BagKind()),
+    "ROS 2 MCAP, dVRK 2.0, raw images": ("bag", BagKind(storage="mcap", generation="2.0", compressed=False)),
+    "ROS 1, dVRK 2.2, raw images": ("rec.bag", BagKind(ros=1, compressed=False)),
+    "ROS 1, dVRK 1.x": ("rec.bag", BagKind(ros=1, generation="1.x")),
+    "poses only": ("bag", BagKind(joints=False)),
+}
+
+
+def rendered_pixels(sequence: Sequence, index: int, camera: str) -> int:
+    """How much of an image the arms cover in the overlay."""
+    renderer = Renderer(sequence.scene, cameras=[camera])
+    state = sequence.scene.state({arm: rows[index] for arm, rows in sequence.measured.items()})
+    return int((renderer.segment(state)[0] >= 0).sum())
+
+
+@pytest.mark.parametrize(("name", "kind"), KINDS.values(), ids=KINDS)
+def test_one_command_makes_a_sequence_with_images_joints_and_overlay(tmp_path: Path, name: str, kind: BagKind) -> None:
+    path = write_bag(tmp_path / name, kind)
+    main(["import", str(path), "-o", str(tmp_path / "out")])
+    sequence = Sequence.open(tmp_path / "out/sequence.toml")
+    assert len(sequence) == kind.frames
+    assert sequence.timestamps is not None
+    assert np.allclose(np.diff(sequence.timestamps), 0.08, atol=1e-6), "of the headers, not of the bag"
+    for index in (kind.frames - 1, 0, 2):
+        frame = sequence.frame(index)
+        time = 0.08 * index
+        assert np.array_equal(frame.images["left"], image(index)), "the image of this frame"
+        assert np.array_equal(frame.images["right"], image(index, "right"))
+        assert np.abs(frame.measured["PSM1"][:6] - joints_at(time)).max() < 2e-3
+        assert frame.measured["PSM1"][6] == pytest.approx(float(jaw_at(time)), abs=1e-3)
+    left, right = sequence.scene.cameras
+    assert left.intrinsics == pytest.approx((110, 110, K[0, 2] + 0.5, K[1, 2] + 0.5))
+    assert np.allclose(right.T_camera_world[:3, 3], [-0.005, 0, 0])
+    assert np.allclose(sequence.scene.arms[0].T_world_base, T_CAMERA_BASE, atol=2e-3)
+    assert rendered_pixels(sequence, 2, "left") > 50
+
+
+def test_the_report_says_what_was_found_and_what_is_missing(tmp_path, capsys):
+    main(["import", str(write_bag(tmp_path / "bag", BagKind(cameras=("left",)))), "-o", str(tmp_path / "out")])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "6 frames, 0.4 s, 12.5 images/s" in said
+    assert "PSM1: 58 rows, 100.0 rows/s" in said
+    assert "camera left: /stereo/left/image_raw/compressed, 6 images, 96 x 72" in said
+    assert "joints and tip poses agree with a 9.1 mm wrist" in said
+    assert "tool_type is LARGE_NEEDLE_DRIVER:400006[1]" in said
+    assert "wrote" in said and "carts view" in said
+
+
+def test_base_frames_come_from_what_the_bag_knows_of_itself(tmp_path):
+    path = write_bag(tmp_path / "bag", BagKind(generation="1.x", joints=True))
+    recording = find(path)
+    assert any("base frame from" in note.text for note in recording.notes)
+    # A bag with local poses only does not know where the camera is.
+    kind = replace(BagKind(joints=False, cameras=("left",)), local=True)
+    bag = write_bag(tmp_path / "local", kind)
+    (path, found) = import_recording(bag, tmp_path / "out", ImportOptions())
+    assert rendered_pixels(Sequence.open(path), 0, "left") > 50
+    assert found.arms[0].base_from == "measured_cp and local/measured_cp"
+
+
+def test_the_user_chooses_topics_arms_and_the_time_offset(tmp_path):
+    path = write_bag(tmp_path / "bag", BagKind(arms=("PSM1", "PSM2")))
+    options = ImportOptions(
+        images={"eye": "/stereo/right/image_raw/compressed"}, arms={"tool": "PSM2"}, time_offset=0.02
+    )
+    file, _ = import_recording(path, tmp_path / "out", options)
+    sequence = Sequence.open(file)
+    assert [camera.name for camera in sequence.scene.cameras] == ["eye"]
+    assert [arm.name for arm in sequence.scene.arms] == ["tool"]
+    # Images of the right camera are a millisecond later.
+    assert np.abs(sequence.frame(1).measured["tool"][:6] - joints_at(0.101)).max() < 2e-3
+
+
+def _cut(path: Path) -> None:
+    (file,) = [path] if path.is_file() else [each for each in path.iterdir() if each.suffix in (".db3", ".mcap")]
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("rec.bag", BagKind(ros=1)), ("bag", BagKind(storage="mcap")), ("bag", BagKind())],
+    ids=["ROS 1", "MCAP", "sqlite3"],
+)
+def test_a_truncated_bag_is_an_error_in_words_and_leaves_nothing(tmp_path, capsys, name, kind):
+    path = write_bag(tmp_path / name, kind)
+    _cut(path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["import", str(path), "-o", str(tmp_path / "out")])
+    assert stopped.value.code == BAD_INPUT
+    said = capsys.readouterr().err
+    assert "Traceback" not in said and str(path) in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (BagKind(arms=()), {}, "has no kinematics of an arm .*looked for.*Its topics are"),
+        (BagKind(cameras=()), {}, "no images were found.*--images"),
+        (BagKind(), {"arms": {"PSM3": "PSM3"}}, "has no arm 'PSM3'. It has: PSM1"),
+        (BagKind(), {"images": {"left": "/nothing"}}, "has no image topic '/nothing'. It has: /stereo/left"),
+        (BagKind(cameras=("one", "two")), {}, "names do not say which camera.*--images left TOPIC right TOPIC"),
+        (BagKind(), {"time_offset": 100.0}, "no frame has joint positions.*clocks|Clocks"),
+        (
+            BagKind(info=lambda values: values.update(distortion_model="equidistant")),
+            {},
+            "distortion model 'equidistant'",
+        ),
+        (BagKind(info=lambda values: values.update(width=100, height=20)), {}, "another shape"),
+        (BagKind(), {"robot": {"PSM1": "none.urdf"}}, "robot none.urdf of PSM1 is missing"),
+        (BagKind(), {"base": {"PSM1": Path("none.json")}}, "none.json is missing"),
+        (BagKind(), {"calibration": {"left": Path("none.yaml")}}, "none.yaml of left is missing"),
+    ],
+)
+def test_what_contradicts_or_is_missing_is_an_error_in_words(tmp_path, kind, options, message):
+    path = write_bag(tmp_path / "bag", kind)
+    with pytest.raises(CartsError, match=message):
+        import_recording(path, tmp_path / "out", ImportOptions(**options))
+    assert not (tmp_path / "out").exists()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["bag"]
+
+
+def test_frames_without_kinematics_are_left_out_and_said(tmp_path):
+    path = write_bag(tmp_path / "bag", BagKind(frames=8))
+    found = find(path, ImportOptions(time_offset=-0.3))
+    assert 3 <= len(found.frame_ids) < 8
+    assert any("left out: no joint positions within 0.1 s" in note.text for note in found.notes)
+
+
+def test_a_calibration_that_a_camera_lacks_gets_a_stand_in(tmp_path):
+    path = write_bag(tmp_path / "bag", BagKind(info=lambda values: values.update(K=np.zeros(9))))
+    found = find(path)
+    assert found.cameras[0].intrinsics == pytest.approx((1.2 * SIZE[0], 1.2 * SIZE[0], 48, 36))
+    assert any(note.kind == "missing" and "focal length" in note.text for note in found.notes)
+
+
+def test_unknown_sources_get_a_list_of_what_was_looked_for(tmp_path):
+    with pytest.raises(CartsError, match=r"no recording of a known kind. Looked for.*\n  bag: ROS 1 or ROS 2 bag"):
+        find(tmp_path)
+    with pytest.raises(CartsError, match="is missing"):
+        find(tmp_path / "nothing")
+    with pytest.raises(CartsError, match="--source 'rosbag' is not known"):
+        find(tmp_path, ImportOptions(source="rosbag"))
+
+
+def test_the_real_bag_says_itself_what_it_is(shared_dir):
+    path = shared_dir / "data/dvrk_bag/pitch_exp_traj_01_test_cropped.bag"
+    with pytest.raises(CartsError, match="no images were found"):
+        find(path)
