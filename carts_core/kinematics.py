@@ -17,6 +17,8 @@ from .errors import RobotError
 
 NO_LIMIT = 1e3
 """A larger joint limit [rad], [m] means none."""
+_JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
+"""What of a joint moves links; limits and dynamics have required attributes that many URDFs leave out."""
 ROUND_OFF = 1e-5
 """Angles this close [rad] to a multiple of 90 degrees mean that multiple: URDF exporters print 1.5708 for pi/2."""
 
@@ -43,6 +45,10 @@ def _skeleton(urdf_text: str) -> str:
         elif child.tag == "link":
             for part in list(child):
                 child.remove(part)
+        else:
+            for part in list(child):
+                if part.tag not in _JOINT_PARTS:
+                    child.remove(part)
     return ElementTree.tostring(root, encoding="unicode")
 
 

@@ -78,13 +78,13 @@ class Robot:
             model = yourdfpy.URDF.load(
                 io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
             )
+            kinematics = Kinematics(model, text, base_link, urdf)
         except FileNotFoundError as error:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
             raise
         except Exception as error:  # the URDF parser raises many kinds
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
-        kinematics = Kinematics(model, text, base_link, urdf)
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
         meshes = _load_meshes(model, urdf, link_names, max_faces, report)
         if not meshes:

@@ -89,7 +89,8 @@ class TomlTable:
             wanted = " or ".join(_KINDS[one] for one in kinds)
             raise self.error(key, f"is {shown(value)}, but must be {wanted}.")
         # Numbers in tables are checked when they are taken from there, so that the error names their key.
-        if not (isinstance(value, dict) or all_finite(value)):
+        has_tables = isinstance(value, dict) or (isinstance(value, list) and any(isinstance(v, dict) for v in value))
+        if not has_tables and not all_finite(value):
             raise self.error(key, f"is {shown(value)}, but must be a finite number.")
         return value
 

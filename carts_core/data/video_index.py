@@ -90,7 +90,7 @@ def open_video(path: Path) -> tuple[InputContainer, VideoStream]:
     except (FFmpegError, OSError, ValueError) as error:
         raise SequenceError(f"video {path} cannot be decoded ({error}). {_remedy(path)}") from error
     stream = container.streams.best("video")
-    if not isinstance(stream, VideoStream):
+    if not isinstance(stream, VideoStream) or stream.codec_context is None:  # None for a codec that nobody knows.
         container.close()
         raise SequenceError(f"video {path} cannot be decoded (it has no video stream). {_remedy(path)}")
     if (problem := pixels_problem(stream.width, stream.height)) is not None:
