@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
 from rich.table import Table
 
+from .console import Terminal
 from .data import Sequence
 from .evaluation import start_positions
 from .features import FeatureExtractor
@@ -115,7 +115,7 @@ def main() -> None:
         **optimizer_figures(sequence, arguments.runs),
     }.items():
         table.add_row(name, f"{value:.1f}")
-    Console().print(table)
+    Terminal().print(table)
 
 
 if __name__ == "__main__":

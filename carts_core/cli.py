@@ -8,7 +8,6 @@ from importlib.metadata import version
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from .commands.bench import Bench
 from .commands.calibrate import Calibrate
@@ -21,6 +20,7 @@ from .commands.robot import RobotCommand
 from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
+from .console import Terminal, log_to_stderr
 from .errors import CartsError
 
 _DESCRIPTION = (
@@ -56,13 +56,14 @@ def main(arguments: list[str] | None = None) -> None:
             command = tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
         from .process import tune_process
 
+        log_to_stderr()
         tune_process(keep_memory=not isinstance(command, View))
         command.run()
     except CartsError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+        Terminal(stderr=True).print_error(error)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted; what was finished is kept")
+        Terminal(stderr=True).print("interrupted; what was finished is kept")
         sys.exit(130)
 
 

@@ -50,7 +50,7 @@ def _main() -> None:
 
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as given:
-        vertices, faces = fast_simplification.simplify(
+        vertices, faces, *_ = fast_simplification.simplify(
             points=given["vertices"], triangles=given["faces"], target_count=int(given["count"])
         )
     result = io.BytesIO()

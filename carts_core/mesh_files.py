@@ -104,22 +104,30 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[trimesh.Trimesh
     if not meshes:
         raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
     for mesh in meshes:
+        check_mesh(mesh, f"mesh {path}", FARTHEST / min(np.abs(scale)))
         if (scale != 1.0).any():
             mesh.apply_transform(np.diag([*scale, 1.0]))
-        check_mesh(mesh, f"mesh {path}")
+            check_mesh(mesh, f"mesh {path}, scaled,")
     if sum(len(mesh.faces) for mesh in meshes) > MOST_FACES:
         raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
     return meshes
 
 
-def check_mesh(mesh: trimesh.Trimesh, name: str) -> None:
+def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> None:
     """Check that a mesh can be worked on.
+
+    Args:
+        mesh: of triangles.
+        name: how errors call it.
+        farthest: largest coordinate.
 
     Raises:
         RobotError: a coordinate is not finite or too large, or a triangle names a vertex that is not there.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if not np.isfinite(vertices).all() or np.abs(vertices).max(initial=0.0) > FARTHEST:
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise RobotError(f"{name} is not one of triangles in space. Export it again.")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max(initial=0.0) > farthest:
         raise RobotError(
             f"{name} has coordinates beyond {FARTHEST:g} m, or not finite. Give it in metres, or scale it in the URDF."
         )

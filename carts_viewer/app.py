@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+from carts_core.console import log_to_stderr, visible
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.optimization import FreeParameters, OptimizerSettings
@@ -252,14 +253,14 @@ def serve(
     Raises:
         SystemExit: with code 2, after a message on stderr, when the sequence or an option is not usable.
     """
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    log_to_stderr()
     began = time.monotonic()
     try:
         app = ViewerApp.open(
             sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_print_progress
         )
     except CartsError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {visible(str(error))}", file=sys.stderr)
         raise SystemExit(2) from error
     with app:
         try:
@@ -274,4 +275,4 @@ def serve(
 
 
 def _print_progress(line: str) -> None:
-    print(f"  {line} …", flush=True)
+    print(f"  {visible(line)} …", flush=True)

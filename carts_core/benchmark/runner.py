@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ..console import Bar, PlainColumn
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..optimization import FreeParameters
@@ -64,13 +65,13 @@ class Benchmark:
         if not todo:
             return
         columns = (
-            TextColumn("{task.description}"),
+            PlainColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
             bench = {name: _Bench(source, bar) for name, source in self.sources.items()}
             task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
             while todo:
@@ -103,7 +104,7 @@ def _log(console: Console, line: str) -> None:
 class _Bench:
     """One source, opened when its first run comes."""
 
-    def __init__(self, source: Source, bar: Progress) -> None:
+    def __init__(self, source: Source, bar: Bar) -> None:
         self._source, self._bar = source, bar
         self._opened: tuple[Recording, Renderer] | None = None
         self._calibrated: Scene | None = None

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
+from ..console import Terminal
 from ..errors import CartsError
 from ..wording import counted
 from .selection import Network
@@ -44,7 +44,7 @@ class Bench:
         from ..benchmark.stages import known_stages, measure_stages
         from ..features.extractor import FeatureExtractor
 
-        console = Console()
+        console = Terminal()
         scope = QUICK if self.quick else FULL
         if self.frames is not None:
             scope = scope.with_frames(self.frames)

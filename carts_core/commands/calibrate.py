@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
 
+from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
 from .selection import Network, Selection, SequencePath, check_second_order
@@ -57,7 +57,7 @@ class Calibrate:
         from ..optimization import CalibrationOptimizer
         from .hints import print_hints
 
-        console = Console()
+        console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
         indices = frame_indices(self.frames, sequence)
@@ -116,7 +116,7 @@ def frame_indices(text: str, sequence: "Sequence") -> list[int]:
 
 
 def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":
-    with Progress(console=console, transient=True) as bar:
+    with Bar(console=console, transient=True) as bar:
         task = bar.add_task("calibrating", total=None)
         for iterate in optimizer:
             text = f"stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import track
 
+from ..console import Terminal, track
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from ..wording import counted
@@ -55,7 +54,7 @@ class Evaluate:
         from .hints import base_frame_hint, kept_start_hint, print_hints
         from .score_table import score_table
 
-        console = Console()
+        console = Terminal()
         if not console.is_terminal:
             console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
         sequence = Sequence.open(self.sequence, progress=console.print)

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import Progress
 
+from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import FormatName, Parts
 from ..wording import counted
@@ -41,7 +40,7 @@ class Export:
         from ..data import Sequence
         from ..export import Dataset, Monitor, corrected_frames, export, measured_frames, read_kinematics_csv
 
-        console = Console()
+        console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         indices = self.select.frame_indices(sequence)
         if self.kinematics is None:
@@ -60,7 +59,7 @@ class Export:
             images=self.images,
             frame_rate=self.frame_rate,
         )
-        with Progress(console=console) as bar:
+        with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
             path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress, track
 
+from ..console import Bar, Terminal, track
 from ..data import Sequence
 from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
@@ -44,7 +43,7 @@ class Optimizing:
     """
 
     def __init__(self, asked: Optimize) -> None:
-        self._asked, self._console = asked, Console()
+        self._asked, self._console = asked, Terminal()
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
         self._frames = asked.select.frame_indices(self._sequence)
         self._keyframes = self._read_keyframes()
@@ -133,7 +132,7 @@ class Optimizing:
             cameras=cameras,
         )
         try:
-            with Progress(console=self._console) as bar:
+            with Bar(console=self._console) as bar:
                 task = bar.add_task(part.name, total=len(frames))
                 for _ in optimizer:
                     bar.update(task, completed=optimizer.progress[0])

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
-from rich.progress import track
 
+from ..console import Terminal, track
 from .selection import Perturbation, Selection, SequencePath
 
 
@@ -33,7 +32,7 @@ class Render:
         from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
         from ..rendering import Renderer
 
-        console = Console()
+        console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         folder = self.output or Path("runs") / sequence.name / "render"
         frames = self.select.frame_indices(sequence)

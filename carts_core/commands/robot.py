@@ -6,9 +6,9 @@ from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
+from ..console import Terminal
 from ..errors import RobotError
 
 
@@ -31,7 +31,7 @@ class RobotCommand:
         from ..files import write_text
         from ..robot import Robot
 
-        console = Console()
+        console = Terminal()
         if self.instrument is None:
             table = Table("number", "instrument", "arm", "shape")
             for found in list_instruments(self.model).values():

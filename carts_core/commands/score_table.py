@@ -14,7 +14,7 @@ def score_table(scores: list[FrameScore], title: str) -> Table:
         "Dice\nbefore",
         "\nafter",
         "worst\nchange",
-        "MAE \\[deg]\nbefore",
+        "MAE [deg]\nbefore",
         "\nafter",
         "std",
         "steps",

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.progress import Progress
 
+from ..console import Bar
 from ..settings import SynthesisConfig
 
 
@@ -22,7 +22,7 @@ class Synthesize:
         """Write the sequence."""
         from ..synthesis.synthesize import synthesize
 
-        with Progress() as bar:
+        with Bar() as bar:
             task = bar.add_task("synthesizing", total=None)
             path = synthesize(
                 self.synthesis,

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import Progress, TimeRemainingColumn
+from rich.progress import TimeRemainingColumn
 
+from ..console import Bar, Terminal
 from ..settings import TrainingConfig
 from .selection import check_device
 
@@ -25,8 +25,8 @@ class Train:
         from ..features.training import TrainingProgress, train
 
         check_device(self.training.device)
-        console = Console()
-        with Progress(*Progress.get_default_columns()[:-1], TimeRemainingColumn(), console=console) as bar:
+        console = Terminal()
+        with Bar(*Bar.get_default_columns()[:-1], TimeRemainingColumn(), console=console) as bar:
             task = bar.add_task("training", total=self.training.steps)
 
             def report(progress: TrainingProgress) -> None:

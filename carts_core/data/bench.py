@@ -14,9 +14,9 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
+from ..console import Terminal
 from ..process import tune_process
 from .frame_reader import FrameReader
 from .sequence import Sequence
@@ -148,7 +148,7 @@ def main() -> None:
         table.add_row(source, what, *(f"{x:.2f} {unit}" for x in figures), " ".join(f"{x:.0f}" for x in memory))
 
     with tempfile.TemporaryDirectory() as folder:
-        Console().print(f"Writing {frames} images and a video into {folder} ...")
+        Terminal().print(f"Writing {frames} images and a video into {folder} ...")
         for source, path in make_recording(Path(folder), frames).items():
             add_row(source, "open, with the first image", "s", open_seconds(path, arguments.runs))
             sequence = Sequence.open(path)
@@ -156,7 +156,7 @@ def main() -> None:
                 times, memory = browse(sequence, indices)
                 add_row(source, f"frame change, {what}", "ms", times, memory)
             del sequence  # Its cache would count as the next one's.
-    Console().print(table)
+    Terminal().print(table)
 
 
 if __name__ == "__main__":

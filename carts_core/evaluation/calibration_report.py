@@ -8,12 +8,15 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..console import in_markdown
 from ..data import Sequence, calibrated_sequence_file
 from ..optimization import CalibrationResult
 from ..wording import counted
 from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames, remark
 
 matplotlib.use("Agg")
+# Names of frames and cameras are no formulas.
+matplotlib.rcParams["text.parse_math"] = False
 
 
 def write_calibration(
@@ -86,7 +89,7 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
     unchanged = not any(unknown.change for unknown in result.unknowns)
     which = "The calibration, as it was," if unchanged else "The new calibration"
     lines = [
-        f"# Calibration of {sequence.name}",
+        f"# Calibration of {in_markdown(sequence.name)}",
         "",
         f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
         f"{result.stop_reason}. {which} is in `sequence.toml`, all numbers are in `calibration.json`.",
@@ -97,12 +100,12 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
     ]
     for camera in cameras:
         if (means := mean_dice(residuals, camera)) is not None:
-            lines.append(f"| Dice, {camera} | {means[0]:.4f} | {means[1]:.4f} |")
+            lines.append(f"| Dice, {in_markdown(camera)} | {means[0]:.4f} | {means[1]:.4f} |")
     if moved := moved_frames(sequence.scene, result.scene):
         lines += ["", "| what moved | by [deg] | by [mm] |", "|---|---|---|"]
-        lines += [f"| {name} | {angle:.3f} | {distance:.3f} |" for name, angle, distance in moved]
+        lines += [f"| {in_markdown(name)} | {angle:.3f} | {distance:.3f} |" for name, angle, distance in moved]
     if (text := remark(sequence.scene, result)) is not None:
-        lines += ["", f"**{text}**"]
+        lines += ["", f"**{in_markdown(text)}**"]
     lines += [
         "",
         "## Unknowns",
@@ -120,11 +123,11 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
         "|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {unknown.name} | {unknown.change:.3f} | {unknown.deviation:.3f} | {unknown.deviation_between_frames:.3f} | "
-        f"{unknown.prior_deviation:.3f} | {unknown.unit} |"
+        f"| {in_markdown(unknown.name)} | {unknown.change:.3f} | {unknown.deviation:.3f} | "
+        f"{unknown.deviation_between_frames:.3f} | {unknown.prior_deviation:.3f} | {unknown.unit} |"
         for unknown in result.unknowns
     ]
-    dice_columns = [f"Dice {camera} {label}" for camera in cameras for label in ("before", "after")]
+    dice_columns = [f"Dice {in_markdown(camera)} {label}" for camera in cameras for label in ("before", "after")]
     columns = ["frame", "weight", "loss before", "loss after", *dice_columns]
     lines += ["", "## Frames", "", "![frames](frames.png)", ""]
     lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
@@ -135,6 +138,6 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
             for scores in (residual.dice_before, residual.dice_after)
         ]
         values = [f"{residual.weight:.2f}", f"{residual.loss_before:.4f}", f"{residual.loss_after:.4f}", *scores]
-        lines.append(f"| {' | '.join([residual.frame, *values])} |")
+        lines.append(f"| {' | '.join([in_markdown(residual.frame), *values])} |")
     lines += ["", "A frame whose loss stands out from the others' counts less; its weight says how much.", ""]
     return "\n".join(lines)

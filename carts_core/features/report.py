@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..console import in_markdown
 from ..wording import counted
 from .checkpoint import History
 
@@ -67,7 +68,7 @@ def _page(config: dict, history: History, columns: dict[str, str]) -> str:
         "",
         f"{counted(config['steps'], 'step')} of {counted(config['batch_size'], 'sample')}, "
         f"{counted(round(history.seconds / 60), 'minute')}, robots: "
-        f"{', '.join(config['robots'])}.",
+        f"{', '.join(map(in_markdown, config['robots']))}.",
         "",
         "![curves](curves.png)",
         "",
@@ -89,7 +90,7 @@ def _page(config: dict, history: History, columns: dict[str, str]) -> str:
         "## Settings",
         "",
         "```json",
-        json.dumps(config, indent=2),
+        json.dumps(config, indent=2).replace("`", "\\u0060"),
         "```",
         "",
     ]

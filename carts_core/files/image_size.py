@@ -15,6 +15,7 @@ _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
 _MOST_SCANS = 200
 """A progressive JPEG is decoded as often as it has scans."""
 _TIFF_TILE = (322, 323)
+_FAR_TOO_LARGE = (0, LARGEST_IMAGE)
 
 
 def size_problem(content: bytes) -> str | None:
@@ -26,6 +27,8 @@ def size_problem(content: bytes) -> str | None:
     size = _size(content)
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
+    if size == _FAR_TOO_LARGE:
+        return f"is far too large; at most {LARGEST_IMAGE // 10**6} million pixels are read"
     return pixels_problem(*size)
 
 
@@ -74,8 +77,8 @@ def _other_size(content: bytes) -> tuple[int, int] | None:
         image = Image.open(io.BytesIO(content), formats=_OTHERS)
         tags = getattr(image, "tag_v2", {})
         tile_width, tile_height = (int(tags.get(tag, 0)) for tag in _TIFF_TILE)
-    except Image.DecompressionBombError:
-        return LARGEST_IMAGE, 2
+    except Image.DecompressionBombError:  # Pillow does not say how many pixels it has, only that they are far too many.
+        return _FAR_TOO_LARGE
     except Exception:  # Pillow raises whatever its format readers raise.
         return None
     # A tile is decoded whole, however small the image.

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import viser
 
+from carts_core.console import visible
 from carts_viewer.intents import Intent, Refresh
 from carts_viewer.page import on_sent
 from carts_viewer.state import ViewState
@@ -61,7 +62,7 @@ def write(handle: Any, value: Any) -> None:
 
 def escaped(text: str) -> str:
     """Text for use inside HTML."""
-    return html.escape(text, quote=True)
+    return html.escape(visible(text), quote=True)
 
 
 def swatch(color: tuple[int, int, int], name: str) -> str:

@@ -20,9 +20,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-from fuzz.kinds import KINDS, NotFiniteError, make_folder
 
 from carts_core.errors import CartsError
+from fuzz.kinds import KINDS, NotFiniteError, make_folder
 
 SECONDS = 10.0
 MEMORY = 2 * 2**30

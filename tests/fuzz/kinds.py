@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from fuzz.mutations import mutated_bytes, mutated_png, mutated_safetensors, mutated_text
 
 from carts_core.data import Sequence
 from carts_core.data.images import read_image, read_mask
@@ -22,6 +21,7 @@ from carts_core.features.network import FeatureNetwork
 from carts_core.features.weights import read_weights, save_weights
 from carts_core.robot import Robot
 from carts_core.settings import Architecture
+from fuzz.mutations import mutated_bytes, mutated_png, mutated_safetensors, mutated_text
 
 FRAMES = 2
 _URDF = """<robot name="two_links">

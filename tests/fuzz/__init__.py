@@ -1,0 +1,1 @@
+"""Wrong inputs of every kind, by the thousand."""

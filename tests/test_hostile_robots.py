@@ -1,0 +1,129 @@
+"""Robots that are wrong on purpose: refused where they enter, in words, and in good time."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from carts_core import decimation
+from carts_core.decimation import DecimationError, decimated
+from carts_core.errors import RobotError
+from carts_core.robot import Robot
+
+BALL = '<mesh filename="ball.stl" scale="1 1 1"/>'
+URDF = """<robot name="two">
+  <link name="base"><visual><origin xyz="0 0 0" rpy="0 0 0"/><geometry>GEOMETRY</geometry></visual></link>
+  <link name="tip"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>
+  <joint name="yaw" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="0 0 0.1" rpy="0 0 0"/>
+  <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path / "cache"))
+    trimesh.creation.icosphere(subdivisions=1, radius=0.01).export(tmp_path / "ball.stl")
+    path = tmp_path / "two.urdf"
+    path.write_text(URDF.replace("GEOMETRY", BALL))
+    return path
+
+
+def refusal(path: Path, before: str = "", after: str = "") -> str:
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after, 1))
+    start = time.monotonic()
+    with pytest.raises(RobotError) as caught:
+        Robot.load(path)
+    assert time.monotonic() - start < 10.0
+    return str(caught.value)
+
+
+def test_the_right_robot_loads(urdf: Path):
+    robot = Robot.load(urdf)
+    assert bool(robot.forward_kinematics(torch.zeros(1)).isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "part"),
+    [
+        ('lower="-1"', 'lower="nan"', "<limit lower='nan'>"),
+        ('lower="-1"', 'lower="2"', "lower limit 2.0 above the upper one 1.0"),
+        ('xyz="0 0 1"', 'xyz="0 0 0"', "axis of joint 'yaw' has no direction"),
+        ('xyz="0 0 1"', 'xyz="0 1"', "<axis xyz='0 1'>"),
+        ('xyz="0 0 0.1"', 'xyz="nan 0 0"', "<origin xyz='nan 0 0'>"),
+        ('rpy="0 0 0"', 'rpy="inf 0 0"', "<origin rpy='inf 0 0'>"),
+        ('scale="1 1 1"', 'scale="0 0 0"', "<mesh scale='0 0 0'>"),
+        ('scale="1 1 1"', 'scale="nan 1 1"', "<mesh scale='nan 1 1'>"),
+        ('scale="1 1 1"', 'scale="1e30 1e30 1e30"', "<mesh scale='1e30 1e30 1e30'>"),
+        ('scale="1 1 1"', 'scale="1e5 1e5 1e5"', "coordinates beyond 100 m"),
+        ('radius="0.01"', 'radius="-1"', "<sphere radius='-1'>"),
+        ('<parent link="base"/>', '<parent link="none"/>', "parent link 'none', which is not there"),
+        ('<parent link="base"/>', "", "parent link None"),
+        ('<parent link="base"/>', '<parent link="tip"/>', "several links without a parent|loop"),
+        ('<link name="tip">', '<link name="base">', "every link needs a name of its own, but 'base'"),
+        ("</robot>", '<link name="lone"/></robot>', "several links without a parent: base, lone"),
+        ('type="revolute"', 'type="floating"', "is of type 'floating'; allowed are"),
+        ("<axis", '<mimic joint="yaw"/><axis', "mimics, in the end, itself"),
+        ("<axis", '<mimic joint="none"/><axis', "mimics 'none', which does not move"),
+        ('<robot name="two">', '<!DOCTYPE r [<!ENTITY a "b">]><robot name="two">', "entities"),
+        ('<robot name="two">', "<robot>", "must be <robot name"),
+        (
+            '<robot name="two">',
+            '<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="x"/>',
+            "is a xacro file. Expand it first: xacro two.urdf > robot.urdf",
+        ),
+        ("<link", "<a>" * 50_000 + "</a>" * 50_000 + "<link", "nested more than 32 deep"),
+    ],
+)
+def test_a_wrong_urdf_is_refused_in_words(urdf: Path, before: str, after: str, part: str):
+    message = refusal(urdf, before, after)
+    assert any(choice in message for choice in part.split("|")), message
+
+
+def test_a_loop_of_links_is_refused(urdf: Path):
+    loop = "".join(
+        f'<link name="{a}"/><joint name="j{a}" type="fixed"><parent link="{b}"/><child link="{a}"/></joint>'
+        for a, b in (("x", "y"), ("y", "x"))
+    )
+    assert "loop" in refusal(urdf, "</robot>", f"{loop}</robot>")
+
+
+def test_a_huge_limit_means_none(urdf: Path):
+    urdf.write_text(urdf.read_text().replace('lower="-1"', 'lower="-1e16"').replace('upper="1"', 'upper="1e16"'))
+    assert Robot.load(urdf).joint_limits.tolist() == [[-np.inf, np.inf]]
+
+
+def test_a_mesh_without_area_is_refused(urdf: Path):
+    line = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+    trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(urdf.parent / "ball.stl")
+    assert "without area" in refusal(urdf)
+
+
+def test_a_mesh_that_names_a_device_as_its_material_is_not_followed(urdf: Path):
+    (urdf.parent / "zero.mtl").symlink_to("/dev/zero")
+    (urdf.parent / "ball.obj").write_text("mtllib zero.mtl\nusemtl a\nv 0 0 0\nv 0 1 0\nv 1 0 0\nf 1 2 3\n")
+    urdf.write_text(urdf.read_text().replace("ball.stl", "ball.obj"))
+    assert len(Robot.load(urdf).meshes[0].faces) == 1
+
+
+def test_decimation_that_takes_too_long_is_stopped(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(0)
+    vertices, faces = rng.normal(size=(100_000, 3)), rng.integers(0, 100_000, (300_000, 3))
+    monkeypatch.setattr(decimation, "_SECONDS", 1.0)
+    monkeypatch.setattr(decimation, "_SECONDS_PER_FACE", 0.0)
+    start = time.monotonic()
+    with pytest.raises(DecimationError, match="was not simplified within 1 s"):
+        decimated(vertices, faces, 1000)
+    assert time.monotonic() - start < 5.0
+
+
+def test_decimation_in_its_own_process_gives_what_the_library_gives():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    vertices, faces = decimated(np.array(ball.vertices), np.array(ball.faces), 500)
+    wanted = ball.simplify_quadric_decimation(face_count=500)
+    found = trimesh.Trimesh(vertices, faces)
+    assert np.array_equal(found.vertices, wanted.vertices) and np.array_equal(found.faces, wanted.faces)
