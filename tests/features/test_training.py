@@ -142,8 +142,9 @@ def test_fine_tuning_starts_from_the_given_weights(tmp_path: Path, small_weights
 
 
 def test_fine_tuning_takes_the_architecture_of_the_weights(tmp_path: Path, small_weights: Path):
-    for _ in range(2):  # the second time, the run is there already and must count as the same
-        result = train(small_config(start=small_weights, architecture=Architecture(), steps=1), tmp_path)
+    config = small_config(start=small_weights, architecture=Architecture(), steps=1)
+    train(config, tmp_path)
+    result = train(config, tmp_path)  # the run is there already and must count as the same
     weights = read_weights(result.weights)
     assert weights.network.architecture == read_weights(small_weights).network.architecture != Architecture()
     assert weights.training["config"]["architecture"]["widths"] == list(weights.network.architecture.widths)
