@@ -11,16 +11,29 @@ PARTS = ("shaft", "wrist", "jaws")
 
 _PROBE = 0.1
 
+_SLENDER = 0.1
+"""Largest width of a shaft, in lengths."""
+
 
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
-    """Index into `PARTS` of each link with a mesh, told by how many degrees of freedom move it.
+    """Index into `PARTS` of each link with a mesh, by how many degrees of freedom move it.
 
     What all but the last two move is the wrist, what more of them move are the jaws with what they turn on, and
-    everything else belongs to the shaft.
+    everything else belongs to the shaft. An instrument without moving jaws, as a hook, has one degree of freedom less:
+    what moves no more than its shaft does, the longest mesh if that is slender, is no wrist.
     """
     dofs = len(robot.joint_names)
     probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()
     Ts = robot.forward_kinematics(probes)
     movers = ((Ts[1:] - Ts[:1]).abs().amax((-2, -1)) > 1e-9).sum(0).numpy()
     # A robot without a wrist is all shaft.
-    return (movers >= max(movers.max() - 2, 1)).astype(int) + (movers >= max(movers.max() - 1, 2))
+    wrist = max(movers.max() - 2, _shaft_movers(robot, movers) + 1)
+    return (movers >= wrist).astype(int) + (movers >= wrist + 1)
+
+
+def _shaft_movers(robot: Robot, movers: Int[np.ndarray, " links"]) -> int:
+    """How many degrees of freedom move the shaft; 0 for a robot that has none."""
+    extents = [np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in robot.meshes]
+    longest = int(np.argmax([extent[-1] for extent in extents]))
+    slender = extents[longest][-2] < _SLENDER * extents[longest][-1]
+    return int(movers[robot.meshes[longest].link]) if slender else 0

@@ -1,6 +1,7 @@
 """Surface maps against renderings, and of many states at once."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -8,6 +9,7 @@ from carts_core.optimization import FreeParameters
 from carts_core.optimization.parameters import ParameterVector
 from carts_core.parts import PARTS, link_parts
 from carts_core.rendering import Renderer
+from carts_core.resources import shipped_robot
 from carts_core.robot import Robot
 from carts_core.scene import Scene, SceneState
 from carts_core.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
@@ -15,6 +17,18 @@ from carts_core.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 
 def test_parts_are_told_by_what_moves_them(shipped_psm: Robot) -> None:
     named = {name: PARTS[part] for name, part in zip(shipped_psm.link_names, link_parts(shipped_psm), strict=True)}
+    assert named["roll_link"] == "shaft" and named["wrist_pitch_link"] == "wrist" and named["jaw_1_link"] == "jaws"
+
+
+def test_an_instrument_whose_jaws_do_not_move_has_a_shaft_and_a_wrist_all_the_same(tmp_path: Path) -> None:
+    urdf = shipped_robot().read_text()
+    urdf = urdf.replace('filename="', f'filename="{shipped_robot().parent}/')
+    for name in ("jaw", "jaw_1", "jaw_2"):
+        urdf = urdf.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
+    (tmp_path / "hook.urdf").write_text(urdf)
+    robot = Robot.load(tmp_path / "hook.urdf")
+    assert "jaw" not in robot.joint_names
+    named = {name: PARTS[part] for name, part in zip(robot.link_names, link_parts(robot), strict=True)}
     assert named["roll_link"] == "shaft" and named["wrist_pitch_link"] == "wrist" and named["jaw_1_link"] == "jaws"
 
 
