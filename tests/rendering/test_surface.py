@@ -1,5 +1,6 @@
 """Surface maps against renderings, and of many states at once."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ def test_an_instrument_whose_jaws_do_not_move_has_a_shaft_and_a_wrist_all_the_sa
     urdf = urdf.replace('filename="', f'filename="{shipped_robot().parent}/')
     for name in ("jaw", "jaw_1", "jaw_2"):
         urdf = urdf.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
+    urdf = re.sub(r"<mimic [^>]*/>", "", urdf)
     (tmp_path / "hook.urdf").write_text(urdf)
     robot = Robot.load(tmp_path / "hook.urdf")
     assert "jaw" not in robot.joint_names
