@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -10,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .errors import OutputError
+from .files import output_path, output_stream
 from .files.reading import CACHED, MESH, open_regular, read_bytes
 from .meshes import LinkMesh
 
@@ -60,10 +61,7 @@ def write(key: str, meshes: tuple[LinkMesh, ...]) -> None:
         for field in ("link", "vertices", "normals", "faces", "color"):
             arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
     try:
-        folder = cache_dir()
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as handle:
-            np.savez(handle, allow_pickle=False, **arrays)
-        os.replace(handle.name, folder / f"{key}.npz")
-    except OSError:
+        with output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+    except OutputError:
         return

@@ -1,5 +1,6 @@
 """What intents about files do: the shown mask as a download, and frames in any format into the project's folder."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import singledispatchmethod
@@ -10,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, file_name, mask_png
+from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, mask_png
+from carts_core.files import OutputPath, file_name, output_path
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
 from carts_core.scene import SceneState
 from carts_viewer import intents as ask
@@ -210,11 +212,11 @@ def export_frame(
     )
 
 
-def free_path(project: Path, stem: str, intent: ask.Export) -> Path:
+def free_path(project: Path, stem: str, intent: ask.Export) -> OutputPath:
     """Where an export goes: into a folder beside the project, under a name that nothing has yet."""
-    folder, suffix = project.with_name(f"{project.stem}_exports"), FORMATS[intent.format].suffix
+    folder, suffix = output_path(project.parent, f"{project.stem}_exports"), FORMATS[intent.format].suffix
     number, path = 1, folder / f"{stem}{suffix}"
-    while path.exists():
+    while os.path.lexists(path):
         number += 1
         path = folder / f"{stem}-{number}{suffix}"
     return path

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from carts_core.files import write_text
 from carts_core.project import ReviewState
 from carts_viewer import intents as ask
 from carts_viewer.layers import Layer
@@ -112,4 +113,4 @@ def with_keys(text: str) -> str:
 
 if __name__ == "__main__":
     for name in sys.argv[1:]:
-        Path(name).write_text(with_keys(Path(name).read_text(encoding="utf-8")), encoding="utf-8")
+        write_text(Path(name), with_keys(Path(name).read_text(encoding="utf-8")))

@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..data.images import read_image
-from ..export import image_png, write_bytes
+from ..export import image_png
+from ..files import holds_file, output_path, write_bytes
 from ..mesh_cache import cache_dir
 from ..settings import EndoscopeConfig, SynthesisConfig
 from ..synthesis.layout import place_cameras
@@ -19,8 +20,8 @@ def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         CartsError: Mitsuba is not installed.
     """
-    path = cache_dir() / "benchmark" / f"backdrop_{seed}_{width}x{height}.png"
-    if not path.is_file():
+    path = output_path(cache_dir(), "benchmark", f"backdrop_{seed}_{width}x{height}.png")
+    if not holds_file(path):
         config = SynthesisConfig(seed=seed, endoscope=EndoscopeConfig(width=width, height=height))
         rng = config.rng("backdrop")
         size = config.render.tissue_resolution, config.render.texture_resolution
@@ -29,4 +30,4 @@ def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
         radiance = PathTracer(tissue, config.render).radiance([], camera, camera.T_camera_world, seed=0)
         picture = expose(exposure_gain(radiance, config.sensor) * radiance, config.sensor, rng)
         write_bytes(path, image_png(picture))
-    return read_image(path)
+    return read_image(path.path)

@@ -1,7 +1,6 @@
 """The report's plots, as SVG files."""
 
 from collections.abc import Callable, Iterable
-from io import BytesIO
 from pathlib import Path
 
 import matplotlib
@@ -10,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ..export import write_bytes
+from ..files import OutputPath, output_stream
 from ..wording import counted
 from . import paper
 from .accuracy_tables import ROWS
@@ -27,7 +26,7 @@ COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
 _BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
 
 
-def write_figures(data: Measurements, folder: Path) -> dict[str, Path]:
+def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
     """Draw every plot that the measurements allow; returns its caption -> its file."""
     made: dict[str, Path] = {}
     for name, caption, draw in (
@@ -49,11 +48,10 @@ def write_figures(data: Measurements, folder: Path) -> dict[str, Path]:
     ):
         figure = draw(data)
         if figure is not None:
-            buffer = BytesIO()
-            figure.savefig(buffer, format="svg", metadata={"Date": None})
             path = folder / f"{name}.svg"
-            write_bytes(path, buffer.getvalue())
-            made[caption] = path
+            with output_stream(path) as stream:
+                figure.savefig(stream, format="svg", metadata={"Date": None})
+            made[caption] = path.path
     return made
 
 

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from ..export import write_bytes
+from ..files import OutputPath, csv_cell, write_text
 from . import paper
 from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
@@ -40,7 +40,7 @@ class Facts:
     version: str
 
 
-def write_report(folder: Path, measurements: list[Measurement], facts: Facts, stages: dict[str, float]) -> Path:
+def write_report(folder: OutputPath, measurements: list[Measurement], facts: Facts, stages: dict[str, float]) -> Path:
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
 
     Raises:
@@ -80,20 +80,20 @@ def write_report(folder: Path, measurements: list[Measurement], facts: Facts, st
         },
         "runs": rows,
     }
-    write_bytes(folder / "results.json", json.dumps(document, indent=1).encode())
-    write_bytes(folder / "results.csv", _csv(rows).encode())
+    write_text(folder / "results.json", json.dumps(document, indent=1))
+    write_text(folder / "results.csv", _csv(rows))
     page = Template(PAGE).substitute(
         facts=_facts(facts, measurements),
         targets=_targets(verdicts),
         contents="".join(f'<a href="#{_anchor(title)}">{escape(title)}</a> ' for title, _ in sections),
         sections="".join(_section(title, tables) for title, tables in sections),
-        figures="".join(_figure(caption, path.relative_to(folder)) for caption, path in figures.items()),
+        figures="".join(_figure(caption, path.relative_to(folder.path)) for caption, path in figures.items()),
         tolerance=f"{TOLERANCE:g}",
         source=escape(paper.SOURCE),
     )
     path = folder / "report.html"
-    write_bytes(path, page.encode())
-    return path
+    write_text(path, page)
+    return path.path
 
 
 def _known(*tables: Table | None) -> list[Table]:
@@ -127,7 +127,9 @@ def _csv(rows: list[dict[str, object]]) -> str:
     if rows:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(
+            {name: csv_cell(cell) if isinstance(cell, str) else cell for name, cell in row.items()} for row in rows
+        )
     return text.getvalue()
 
 

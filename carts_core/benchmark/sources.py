@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from ..data import Frame, Sequence
 from ..data.background import spread
 from ..errors import SettingsError
+from ..files import holds_file, output_path
 from ..mesh_cache import cache_dir
 from ..scene import Scene
 from ..settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
@@ -102,14 +103,13 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
     )
     code = code_fingerprint(_SYNTHESIS)
     fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
-    folder = cache_dir() / "benchmark" / f"sequence_{seed}_{fingerprint[:8]}"
+    folder = output_path(cache_dir(), "benchmark", f"sequence_{seed}_{fingerprint[:8]}")
 
     def open_(progress: Progress) -> Sequence:
         file = folder / "sequence.toml"
-        if not file.is_file():
-            folder.parent.mkdir(parents=True, exist_ok=True)
+        if not holds_file(file):
             synthesize(config, folder, progress)
-        return Sequence.open(file)
+        return Sequence.open(file.path)
 
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"

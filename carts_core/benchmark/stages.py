@@ -1,14 +1,13 @@
 """Milliseconds of the stages of an iteration, measured on the shipped sequence."""
 
 import json
-from pathlib import Path
 
 import torch
 
 from ..bench import milliseconds, optimizer_figures, render_figures
 from ..data import Sequence
-from ..export import write_bytes
 from ..features.extractor import FeatureExtractor
+from ..files import OutputPath, write_text
 from ..optimization import OptimizerSettings
 from ..optimization.inputs import working_size
 from ..resources import sample_sequence
@@ -19,16 +18,16 @@ from .machine import machine
 _RUNS = 10
 
 
-def known_stages(path: Path, extractor: FeatureExtractor) -> dict[str, float]:
+def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
     """Figures that this machine and this code have written to `path`; none if there are no such."""
     try:
-        stored = json.loads(path.read_bytes())
+        stored = json.loads(path.path.read_bytes())
         return stored["ms"] if stored["of"] == _of(extractor) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
-def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
+def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
     """Measure all stages, on the CPU, and write them to `path`, unless they are there."""
     if known_stages(path, extractor):
         return
@@ -38,7 +37,7 @@ def measure_stages(path: Path, extractor: FeatureExtractor) -> None:
         **network_figures(sequence.scene, extractor),
         **optimizer_figures(sequence, _RUNS),
     }
-    write_bytes(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1).encode())
+    write_text(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1))
 
 
 def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:

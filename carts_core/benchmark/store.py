@@ -1,10 +1,9 @@
 """The results file: one JSON line per run, appended as soon as it is known."""
 
 import json
-import os
-from pathlib import Path
 
 from ..errors import CartsError
+from ..files import OutputPath, append_line
 from .measurement import Measurement
 from .scope import Run
 
@@ -19,13 +18,13 @@ class ResultsFile:
         CartsError: the file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: OutputPath) -> None:
         self.path = path
         self._known: dict[tuple[Run, str], Measurement] = {}
         self.unreadable = 0
         """Lines that are not measurements: torn, or of another version."""
         try:
-            lines = path.read_bytes().splitlines() if path.exists() else []
+            lines = path.path.read_bytes().splitlines() if path.path.exists() else []
         except OSError as error:
             raise CartsError(f"{path} cannot be read ({error.strerror}). Name another output folder.") from error
         for line in lines:
@@ -49,25 +48,10 @@ class ResultsFile:
             also: further facts for the line, for whoever reads the file.
 
         Raises:
-            CartsError: the file cannot be written.
+            OutputError: the file cannot be written.
         """
         entry = measurement.to_json()
         line = json.dumps({"fingerprint": fingerprint, **also, **entry}, separators=(",", ":"))
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("ab") as handle:
-                # A line that an earlier run did not finish must not swallow this one.
-                torn = handle.tell() > 0 and not _ends_with_newline(self.path)
-                handle.write(b"\n" * torn + line.encode() + b"\n")
-                handle.flush()
-                os.fsync(handle.fileno())
-        except OSError as error:
-            raise CartsError(f"{self.path} cannot be written ({error.strerror}). Free some space there.") from error
+        append_line(self.path, line.encode())
         # As it will be read again, so that a report does not depend on when it is written.
         self._known[measurement.run, fingerprint] = Measurement.from_json(entry)
-
-
-def _ends_with_newline(path: Path) -> bool:
-    with path.open("rb") as handle:
-        handle.seek(-1, os.SEEK_END)
-        return handle.read(1) == b"\n"

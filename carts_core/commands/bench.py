@@ -9,9 +9,7 @@ import tyro
 from ..console import Terminal
 from ..errors import CartsError
 from ..wording import counted
-from .selection import Network
-
-_DEFAULT_FOLDER = Path("runs") / "bench"
+from .selection import Network, output_folder
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Bench:
         name = "quick" if self.quick else "full"
         if self.rooms is not None and self.real is None:
             raise CartsError("--rooms was given without --real. Say which real frames are to be put into these rooms.")
-        folder = self.output or _DEFAULT_FOLDER / name
+        folder = output_folder(self.output, "bench", name)
         seed = TEST_SEED if self.seed is None else self.seed
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         sources = [synthetic_source(scope, seed)]

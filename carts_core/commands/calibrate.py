@@ -11,7 +11,7 @@ from rich.console import Console
 from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
-from .selection import Network, Selection, SequencePath, check_second_order
+from .selection import Network, Selection, SequencePath, check_second_order, output_folder
 
 if TYPE_CHECKING:
     from ..data import Sequence
@@ -52,8 +52,8 @@ class Calibrate:
         """Calibrate; on Ctrl-C or an error nothing is written."""
         from ..data import Sequence
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
-        from ..export import MARKER, file_name, published
         from ..features.extractor import FeatureExtractor
+        from ..files import MARKER, published, write_text
         from ..optimization import CalibrationOptimizer
         from .hints import print_hints
 
@@ -61,7 +61,7 @@ class Calibrate:
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
         indices = frame_indices(self.frames, sequence)
-        output = self.output or Path("runs") / file_name(sequence.name) / "calibration"
+        output = output_folder(self.output, sequence.name, "calibration")
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
         with published(output, overwrite=self.overwrite) as folder:
             frames = [sequence.frame(index, self.domain, cameras) for index in indices]
@@ -76,8 +76,8 @@ class Calibrate:
             )
             result = _optimized(optimizer, console)
             residuals = frame_residuals(sequence, frames, result)
-            write_calibration(folder, output, sequence, result, residuals)
-            (folder / MARKER).write_text(json.dumps(self._summary(extractor, indices, cameras), indent=1))
+            write_calibration(folder, output.path, sequence, result, residuals)
+            write_text(folder / MARKER, json.dumps(self._summary(extractor, indices, cameras), indent=1))
         for camera in cameras:
             if (means := mean_dice(residuals, camera)) is not None:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")

@@ -49,8 +49,8 @@ class Evaluate:
         """Print a table of means, and write the JSON file if one is named."""
         from ..data import Sequence
         from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
-        from ..export import write_bytes
         from ..features.extractor import FeatureExtractor
+        from ..files import write_text
         from .hints import base_frame_hint, kept_start_hint, print_hints
         from .score_table import score_table
 
@@ -86,5 +86,5 @@ class Evaluate:
                 base_frame_hint(where, [score.base_frame_gain for score in seen]),
             )
         if self.json is not None:
-            write_bytes(self.json, json.dumps(to_json(scores), indent=1).encode())
+            write_text(self.json, json.dumps(to_json(scores), indent=1))
             console.print(f"wrote {self.json}")

@@ -2,12 +2,12 @@
 
 import json
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from ..data import Sequence
 from ..errors import SettingsError
-from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv, write_bytes
+from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv
+from ..files import OutputPath, holds_file, remove_file, write_bytes, write_text
 from ..rendering import Renderer
 from ..scene import SceneState
 from .selection import check_writable
@@ -33,35 +33,41 @@ class FrameFolder:
     """
 
     def __init__(
-        self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, settings: dict[str, Any], overwrite: bool
+        self,
+        sequence: Sequence,
+        cameras: tuple[str, ...],
+        folder: OutputPath,
+        settings: dict[str, Any],
+        overwrite: bool,
     ) -> None:
-        check_writable(folder)
+        check_writable(folder.path)
         self.folder = folder
         self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
         self._scene = sequence.scene.with_cameras(cameras)
-        self._masks = {camera: folder / "masks" / (camera if len(cameras) > 1 else "") for camera in cameras}
+        masks = folder / "masks"
+        self._masks = {camera: masks / camera if len(cameras) > 1 else masks for camera in cameras}
         self._table, self._settings_file = folder / "kinematics.csv", folder / "settings.json"
         self._settings = json.dumps(settings, indent=1)
-        self._goes_on = self._table.is_file() and not overwrite
+        self._goes_on = holds_file(self._table) and not overwrite
         if self._goes_on and not self._same_settings():
             raise SettingsError(
                 f"{folder} holds results of other settings (see {self._settings_file}). "
                 "Add --overwrite to replace them, or name another folder with --output."
             )
-        self.rows = read_kinematics_csv(self._table, sequence.scene) if self._goes_on else []
+        self.rows = read_kinematics_csv(self._table.path, sequence.scene) if self._goes_on else []
 
     def complete(self) -> set[str]:
         """Frames that are in the table and have all their masks."""
         ids = (row.frame_id for row in self.rows)
-        return {name for name in ids if all((masks / f"{name}.png").is_file() for masks in self._masks.values())}
+        return {name for name in ids if all(holds_file(masks / f"{name}.png") for masks in self._masks.values())}
 
     def write(self, found: list[tuple[KinematicsRow, SceneState]]) -> None:
         """Write masks and rows of frames, in place of earlier ones."""
         if not found:
             return
         if not self._goes_on:
-            self._table.unlink(missing_ok=True)
-            write_bytes(self._settings_file, self._settings.encode())
+            remove_file(self._table)
+            write_text(self._settings_file, self._settings)
             self._goes_on = True
         for row, state in found:
             for camera, renderer in self._renderers.items():
@@ -71,7 +77,7 @@ class FrameFolder:
         rows = {row.frame_id: row for row in self.rows} | new
         self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
         # The table is written after the mask, so a frame in the table always has one.
-        write_bytes(self._table, kinematics_csv(self._scene, self.rows).encode())
+        write_text(self._table, kinematics_csv(self._scene, self.rows))
 
     @cached_property
     def _renderers(self) -> dict[str, Renderer]:
@@ -79,4 +85,4 @@ class FrameFolder:
 
     def _same_settings(self) -> bool:
         file = self._settings_file
-        return file.is_file() and file.read_text(encoding="utf-8") == self._settings
+        return holds_file(file) and file.path.read_text(encoding="utf-8") == self._settings

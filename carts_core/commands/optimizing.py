@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from ..wording import counted
 from .frame_folder import FrameFolder
 from .hints import base_frame_hint, kept_start_hint, print_hints
 from .optimize import Optimize
+from .selection import output_folder
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Optimizing:
         start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
         # Made for its errors: no name of what is free or locked may be wrong.
         ParameterVector(scene, start, asked.free, asked.optimizer.lever)
-        folder = (asked.output or Path("runs") / sequence.name) / domain / "+".join(cameras)
+        folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
         return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
 
     def _run(self, part: _Part) -> None:

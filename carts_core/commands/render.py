@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ..console import Terminal, track
-from .selection import Perturbation, Selection, SequencePath
+from .selection import Perturbation, Selection, SequencePath, output_folder
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,13 @@ class Render:
         """Write one PNG per frame, camera and domain."""
         from ..data import Sequence
         from ..evaluation import start_positions
-        from ..export import image_and_mask, image_png, mask_png, overlay, write_bytes
+        from ..export import image_and_mask, image_png, mask_png, overlay
+        from ..files import write_bytes
         from ..rendering import Renderer
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
-        folder = self.output or Path("runs") / sequence.name / "render"
+        folder = output_folder(self.output, sequence.name, "render")
         frames = self.select.frame_indices(sequence)
         for domain in self.select.domain_names(sequence):
             for camera in self.select.camera_names(sequence.scene):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..errors import SettingsError
+from ..files import OutputPath, output_path
 from ..settings import OptimizerSettings
 
 if TYPE_CHECKING:
@@ -157,6 +158,15 @@ def check_second_order(what: str, settings: OptimizerSettings) -> None:
             f"{what} needs gauss_newton and surface; given are --solver {settings.solver} and --loss {settings.loss}. "
             "Leave both out."
         )
+
+
+def output_folder(named: Path | None, *default: str) -> OutputPath:
+    """The folder that a command writes to: the one that a person named, else the one of these names in `runs`.
+
+    Raises:
+        OutputError: one of the names cannot be part of a path.
+    """
+    return output_path(Path(), "runs", *default) if named is None else output_path(named)
 
 
 def check_writable(folder: Path) -> None:

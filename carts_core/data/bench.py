@@ -17,6 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from ..console import Terminal
+from ..files import OutputPath, output_path, output_stream, write_bytes, write_text
 from ..process import tune_process
 from .frame_reader import FrameReader
 from .sequence import Sequence
@@ -39,30 +40,29 @@ def resident_megabytes() -> float:
 def make_recording(folder: Path, frames: int) -> dict[str, Path]:
     """Write the same recording as image files and as a video; gives the sequence file of each."""
     pictures = list(_pictures())
-    images = folder / "left"
-    images.mkdir()
+    output = output_path(folder, draft=True)
     encoded = [cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes() for picture in pictures]
     for frame in range(frames):
-        (images / f"{frame:06d}.jpg").write_bytes(encoded[frame % _PICTURES])
-    with av.open(str(folder / "left.mp4"), "w") as container:
+        write_bytes(output / "left" / f"{frame:06d}.jpg", encoded[frame % _PICTURES])
+    with output_stream(output / "left.mp4") as file, av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=RATE, options={"preset": "veryfast", "bf": "3", "g": "50"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for frame in range(frames):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pictures[frame % _PICTURES], format="rgb24")))
         container.mux(stream.encode(None))
-    _write_table(folder / "rows.csv", "frame", (f"{frame:06d}" for frame in range(frames)))
+    _write_table(output / "rows.csv", "frame", (f"{frame:06d}" for frame in range(frames)))
     seconds = np.arange(0.0, frames / RATE, 1.0 / LOG_RATE)
-    _write_table(folder / "log.csv", "time", map(str, seconds.tolist()))
+    _write_table(output / "log.csv", "time", map(str, seconds.tolist()))
     files = {
         "image files": _sequence('[kinematics]\ntable = "rows.csv"', "left/{frame}.jpg"),
         "MP4, rows by time": _sequence(
             '[frames]\nvideo = "left.mp4"\n[kinematics]\ntable = "log.csv"\ntimestamp = "time"', "left.mp4"
         ),
     }
-    paths = {name: folder / f"{number}.toml" for number, name in enumerate(files)}
+    paths = {name: output / f"{number}.toml" for number, name in enumerate(files)}
     for name, path in paths.items():
-        path.write_text(files[name])
-    return paths
+        write_text(path, files[name])
+    return {name: path.path for name, path in paths.items()}
 
 
 def open_seconds(path: Path, runs: int) -> list[float]:
@@ -102,9 +102,10 @@ def _pictures() -> Iterator[np.ndarray]:
         yield np.ascontiguousarray(noisy.clip(0, 255).astype(np.uint8))
 
 
-def _write_table(path: Path, column: str, cells: Iterable[str]) -> None:
+def _write_table(path: OutputPath, column: str, cells: Iterable[str]) -> None:
     positions = ",".join("0.150000" if joint == "insertion" else "0.100000" for joint in _JOINTS)
-    path.write_text("\n".join([f"{column},{','.join(_JOINTS)}", *(f"{cell},{positions}" for cell in cells)]) + "\n")
+    rows = [f"{column},{','.join(_JOINTS)}", *(f"{cell},{positions}" for cell in cells)]
+    write_text(path, "\n".join(rows) + "\n")
 
 
 def _sequence(tables: str, images: str) -> str:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ..console import in_markdown
 from ..data import Sequence, calibrated_sequence_file
+from ..files import OutputPath, output_stream, write_text
 from ..optimization import CalibrationResult
 from ..wording import counted
 from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames, remark
@@ -20,7 +21,7 @@ matplotlib.rcParams["text.parse_math"] = False
 
 
 def write_calibration(
-    folder: Path, target: Path, sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]
+    folder: OutputPath, target: Path, sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]
 ) -> None:
     """Write `sequence.toml`, `calibration.json`, `frames.png`, `unknowns.png` and `README.md`.
 
@@ -31,14 +32,14 @@ def write_calibration(
         result: the new one.
         residuals: of the frames that it was made from.
     """
-    folder.mkdir(parents=True)
     text = calibrated_sequence_file(sequence.path, target, sequence.scene, result.scene)
-    (folder / "sequence.toml").write_text(text, encoding="utf-8")
+    write_text(folder / "sequence.toml", text)
     content = calibration_json(sequence.scene, result, residuals)
-    (folder / "calibration.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-    _frames_figure(residuals).savefig(folder / "frames.png", dpi=110)
-    _unknowns_figure(result).savefig(folder / "unknowns.png", dpi=110)
-    (folder / "README.md").write_text(_page(sequence, result, residuals), encoding="utf-8")
+    write_text(folder / "calibration.json", json.dumps(content, indent=1))
+    for name, figure in (("frames.png", _frames_figure(residuals)), ("unknowns.png", _unknowns_figure(result))):
+        with output_stream(folder / name) as stream:
+            figure.savefig(stream, format="png", dpi=110)
+    write_text(folder / "README.md", _page(sequence, result, residuals))
 
 
 def _cameras(residuals: Frames[FrameResidual]) -> list[str]:

@@ -3,8 +3,6 @@
 from ..settings import FormatName as FormatName
 from ..settings import Parts as Parts
 from .dataset import Dataset as Dataset
-from .files import file_name as file_name
-from .files import write_bytes as write_bytes
 from .formats import FORMATS as FORMATS
 from .formats import ExportFormat as ExportFormat
 from .formats import export as export
@@ -21,5 +19,3 @@ from .overlay import outlined as outlined
 from .overlay import overlay as overlay
 from .png import image_png as image_png
 from .png import mask_png as mask_png
-from .publish import MARKER as MARKER
-from .publish import published as published

@@ -1,14 +1,14 @@
 """COCO instance segmentation: `images/`, and `annotations/instances_default.json` with a run-length mask per object."""
 
 import json
-from pathlib import Path
 
+from ..files import OutputPath, write_text
 from .dataset import Dataset
 from .monitor import Monitor
 from .rle import bounding_box, coco_rle
 
 
-def write_coco(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in COCO's format; masks lose nothing."""
     images, annotations = [], []
     for view in dataset.views(monitor):
@@ -43,6 +43,4 @@ def write_coco(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
         "annotations": annotations,
         "categories": categories,
     }
-    file = folder / "annotations" / "instances_default.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")
+    write_text(folder / "annotations" / "instances_default.json", json.dumps(content, ensure_ascii=False))

@@ -1,16 +1,15 @@
 """CVAT for images 1.1: `images/`, and `annotations.xml` with run-length masks (CVAT reads these since 2.3)."""
 
-from pathlib import Path
 from xml.etree import ElementTree
 
+from ..files import OutputPath, write_bytes
 from .dataset import Dataset
 from .monitor import Monitor
 from .rle import bounding_box, row_runs
 
 
-def write_cvat(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in CVAT's format; masks lose nothing."""
-    folder.mkdir(parents=True)
     root = ElementTree.Element("annotations")
     _text(root, "version", "1.1")
     _add_meta(root, dataset)
@@ -34,7 +33,8 @@ def write_cvat(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
             }
             ElementTree.SubElement(image, "mask", attributes)
     ElementTree.indent(root, " ")
-    ElementTree.ElementTree(root).write(folder / "annotations.xml", encoding="utf-8", xml_declaration=True)
+    content = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    write_bytes(folder / "annotations.xml", content)
 
 
 def _add_meta(root: ElementTree.Element, dataset: Dataset) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -12,11 +11,11 @@ from scipy.ndimage import distance_transform_edt
 from ..camera import Camera
 from ..data import Sequence
 from ..errors import CartsError, SettingsError
+from ..files import OutputPath, unique_file_names, write_bytes
 from ..rendering import Renderer
 from ..scene import Scene
 from ..settings import Parts
 from ..wording import counted
-from .files import unique_file_names
 from .frames import ExportFrame
 from .monitor import Monitor
 from .png import image_png
@@ -141,12 +140,11 @@ class Dataset:
         """
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]
 
-    def write_image(self, view: View, folder: Path) -> str:
+    def write_image(self, view: View, folder: OutputPath) -> str:
         """Write the view's image as PNG into `folder`, if images are asked for; the file's name."""
         name = f"{view.name}.png"
         if self.images:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(image_png(self.image(view)))
+            write_bytes(folder / name, image_png(self.image(view)))
         return name
 
 

@@ -1,8 +1,8 @@
 """Datumaro's own format, version 1.0: `images/default/`, and `annotations/default.json` with run-length masks."""
 
 import json
-from pathlib import Path
 
+from ..files import OutputPath, write_text
 from .dataset import Dataset
 from .monitor import Monitor
 from .rle import coco_rle
@@ -11,7 +11,7 @@ _IMAGE = 2
 """Datumaro's media type of still images."""
 
 
-def write_datumaro(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in Datumaro's format; masks lose nothing."""
     items = []
     for view in dataset.views(monitor):
@@ -44,6 +44,4 @@ def write_datumaro(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
         "categories": {"label": {"labels": labels, "label_groups": [], "attributes": []}},
         "items": items,
     }
-    file = folder / "annotations" / "default.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")
+    write_text(folder / "annotations" / "default.json", json.dumps(content, ensure_ascii=False))

@@ -10,13 +10,13 @@ share/schemas/dvrk-system-arm.schema.json and share/suj-fixed.json.
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..camera import Camera
+from ..files import OutputPath, write_text
 from ..scene import Arm
 from .dataset import Dataset
 from .monitor import Monitor
@@ -30,27 +30,27 @@ def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:
     return T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base
 
 
-def write_dvrk(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_dvrk(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """Base frames of all arms in the frame of the first exported camera, to be merged into a system's file (2.4)."""
     _write(dataset, path, monitor, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
 
 
-def write_dvrk_2_3(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_dvrk_2_3(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """The same for a console's file of 2.3 and earlier."""
     _write(dataset, path, monitor, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
 
 
-def write_dvrk_suj(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_dvrk_suj(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """The same as a file of fixed set-up joints."""
     _write(dataset, path, monitor, lambda _, T: {"measured_cp": T})
 
 
 def _write(
-    dataset: Dataset, path: Path, monitor: Monitor, entry: Callable[[str, list[list[float]]], dict[str, Any]]
+    dataset: Dataset, path: OutputPath, monitor: Monitor, entry: Callable[[str, list[list[float]]], dict[str, Any]]
 ) -> None:
     camera = dataset.scene.cameras[0]
     arms = [
         {"name": arm.name, **entry(camera.name, base_frame_transform(arm, camera).tolist())}
         for arm in monitor.track(dataset.scene.arms)
     ]
-    path.write_text(json.dumps({"arms": arms}, indent=1, ensure_ascii=False), encoding="utf-8")
+    write_text(path, json.dumps({"arms": arms}, indent=1, ensure_ascii=False))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..files import MARKER, OutputPath, published, write_text
 from ..settings import FormatName
 from .coco import write_coco
 from .cvat import write_cvat
@@ -14,7 +15,6 @@ from .dvrk import write_dvrk, write_dvrk_2_3, write_dvrk_suj
 from .kinematics_files import write_kinematics_csv, write_kinematics_json, write_kinematics_npz
 from .masks import write_masks
 from .monitor import Monitor
-from .publish import MARKER, published
 from .video import write_video
 from .voc import write_voc
 from .yolo import write_yolo
@@ -26,7 +26,7 @@ class ExportFormat:
 
     label: str
     """For people."""
-    write: Callable[[Dataset, Path, Monitor], None]
+    write: Callable[[Dataset, OutputPath, Monitor], None]
     """Writes the file, or makes the folder."""
     suffix: str = ""
     """Of the file; empty for a format that is a folder."""
@@ -50,7 +50,12 @@ FORMATS: dict[FormatName, ExportFormat] = {
 
 
 def export(
-    dataset: Dataset, name: FormatName, output: Path, *, overwrite: bool = False, monitor: Monitor | None = None
+    dataset: Dataset,
+    name: FormatName,
+    output: OutputPath | Path,
+    *,
+    overwrite: bool = False,
+    monitor: Monitor | None = None,
 ) -> Path:
     """Write a dataset in a format; `output` is there whole at the end, or as it was before.
 
@@ -69,13 +74,13 @@ def export(
         CartsError: the output exists, cannot be written, or what it needs is missing.
     """
     chosen = FORMATS[name]
-    if chosen.suffix and output.suffix.lower() != chosen.suffix:
-        output = output.with_name(output.name + chosen.suffix)
+    if chosen.suffix and Path(output).suffix.lower() != chosen.suffix:
+        output = output.parent / (output.name + chosen.suffix)
     with published(output, overwrite=overwrite) as path:
         chosen.write(dataset, path, monitor or Monitor())
         if not chosen.suffix:
-            (path / MARKER).write_text(_summary(dataset, name), encoding="utf-8")
-    return output
+            write_text(path / MARKER, _summary(dataset, name))
+    return Path(output)
 
 
 def _summary(dataset: Dataset, name: FormatName) -> str:

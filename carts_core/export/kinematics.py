@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SequenceError
+from ..files import csv_cell, text_of_cell
 from ..files.reading import TABLE, open_regular
 from ..scene import Scene
 from ..wording import shortened
@@ -62,7 +63,9 @@ def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
     table.writerow(_header(scene, with_std))
     for row in rows:
         values = [position_values(scene, row), *([std_values(scene, row)] if with_std else [])]
-        table.writerow([row.frame_id, row.source, *(f"{value:.9g}" for value in np.concatenate(values))])
+        table.writerow(
+            [csv_cell(row.frame_id), csv_cell(row.source), *(f"{value:.9g}" for value in np.concatenate(values))]
+        )
     return text.getvalue()
 
 
@@ -80,7 +83,8 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
 
 def _header(scene: Scene, with_std: bool) -> list[str]:
     columns = joint_columns(scene)
-    return ["frame", "source", *columns, *([f"{column}.std" for column in columns] if with_std else [])]
+    further = [f"{column}.std" for column in columns] if with_std else []
+    return ["frame", "source", *map(csv_cell, [*columns, *further])]
 
 
 def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
@@ -103,7 +107,12 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
                 raise SequenceError(f"{path}, line {line}: a joint position is not finite. Remove the line.")
             positions, std = np.split(values, [len(joint_columns(scene))])
             rows.append(
-                KinematicsRow(cells[0], cells[1], _by_arm(scene, positions), _by_arm(scene, std) if with_std else None)
+                KinematicsRow(
+                    text_of_cell(cells[0]),
+                    text_of_cell(cells[1]),
+                    _by_arm(scene, positions),
+                    _by_arm(scene, std) if with_std else None,
+                )
             )
     return rows
 

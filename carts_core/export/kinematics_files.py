@@ -2,21 +2,21 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 
+from ..files import OutputPath, output_stream, write_text
 from .dataset import Dataset
 from .kinematics import joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .monitor import Monitor
 
 
-def write_kinematics_csv(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """The table that `read_kinematics_csv` reads, and `carts export --kinematics`."""
-    path.write_text(kinematics_csv(dataset.scene, monitor.track(dataset.frames)), encoding="utf-8", newline="")
+    write_text(path, kinematics_csv(dataset.scene, monitor.track(dataset.frames)))
 
 
-def write_kinematics_npz(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """NumPy's archive without pickles.
 
     Arrays: `frame_id` and `source` (text) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
@@ -24,7 +24,7 @@ def write_kinematics_npz(dataset: Dataset, path: Path, monitor: Monitor) -> None
     is NaN.
     """
     frames = list(monitor.track(dataset.frames))
-    with path.open("wb") as file:
+    with output_stream(path) as file:
         np.savez_compressed(
             file,
             frame_id=np.array([frame.frame_id for frame in frames]),
@@ -37,7 +37,7 @@ def write_kinematics_npz(dataset: Dataset, path: Path, monitor: Monitor) -> None
         )
 
 
-def write_kinematics_json(dataset: Dataset, path: Path, monitor: Monitor) -> None:
+def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if unknown."""
     columns = joint_columns(dataset.scene)
     frames = [
@@ -58,4 +58,4 @@ def write_kinematics_json(dataset: Dataset, path: Path, monitor: Monitor) -> Non
         "units": dict(zip(columns, joint_units(dataset.scene), strict=True)),
         "frames": frames,
     }
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))

@@ -1,8 +1,8 @@
 """PNG masks: binary, by arm and by link."""
 
 import json
-from pathlib import Path
 
+from ..files import OutputPath, write_bytes, write_text
 from ..settings import Parts
 from .dataset import Dataset
 from .monitor import Monitor
@@ -11,18 +11,16 @@ from .png import label_png, mask_png
 _KINDS: tuple[Parts, ...] = ("arms", "links")
 
 
-def write_masks(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Folders `binary`, `arms` and `links` with a PNG per view, and `labels.json` with the meaning of the values."""
-    for kind in ("binary", *_KINDS):
-        (folder / kind).mkdir(parents=True)
     for view in dataset.views(monitor):
         dataset.write_image(view, folder / "images")
-        (folder / "binary" / f"{view.name}.png").write_bytes(mask_png(view.link_ids >= 0))
+        write_bytes(folder / "binary" / f"{view.name}.png", mask_png(view.link_ids >= 0))
         for kind in _KINDS:
-            (folder / kind / f"{view.name}.png").write_bytes(label_png(dataset.label_image(view, kind)))
+            write_bytes(folder / kind / f"{view.name}.png", label_png(dataset.label_image(view, kind)))
     meaning = {
         "binary": {0: "background", 255: "arm"},
         "arms": {0: "background"} | {category.id: category.name for category in dataset.arms},
         "links": {0: "background"} | {category.id: category.name for category in dataset.links},
     }
-    (folder / "labels.json").write_text(json.dumps(meaning, indent=1, ensure_ascii=False), encoding="utf-8")
+    write_text(folder / "labels.json", json.dumps(meaning, indent=1, ensure_ascii=False))

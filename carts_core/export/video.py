@@ -2,7 +2,6 @@
 
 from contextlib import ExitStack
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import cv2
@@ -10,8 +9,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..camera import Camera
+from ..files import OutputPath, output_stream, unique_file_names
 from .dataset import Dataset, View
-from .files import unique_file_names
 from .monitor import Monitor
 from .overlay import image_and_mask, outlined, overlay
 
@@ -20,16 +19,16 @@ _OPACITY = 0.5
 _QUALITY = {"crf": "18", "preset": "medium"}
 
 
-def write_video(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_video(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write `CAMERA.mp4` for every camera."""
-    folder.mkdir()
     rate = Fraction(frame_rate(dataset)).limit_denominator(1001)
     cameras = dataset.scene.cameras
     names = unique_file_names([camera.name for camera in cameras])
     with ExitStack() as stack:
         streams = {}
         for name, camera in zip(names, cameras, strict=True):
-            container = stack.enter_context(av.open(str(folder / f"{name}.mp4"), "w"))
+            file = stack.enter_context(output_stream(folder / f"{name}.mp4"))
+            container = stack.enter_context(av.open(file, "w", format="mp4"))
             stream = container.add_stream("libx264", rate=rate, options=_QUALITY)
             stream.width, stream.height, stream.pix_fmt = *_even(camera), "yuv420p"
             streams[camera.name] = container, stream

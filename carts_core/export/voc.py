@@ -4,7 +4,6 @@ Class names stand in `labelmap.txt`, as Datumaro and CVAT look for them. Polygon
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
@@ -13,19 +12,20 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from ..errors import CartsError
+from ..files import OutputPath, output_stream, write_bytes, write_text
 from .dataset import Category, Dataset, View
 from .monitor import Monitor
 from .polygons import polygons
 from .rle import bounding_box
 
-_LISTS = ("ImageSets/Main", "ImageSets/Segmentation")
-"""Where lists of the images stand; there is no split, so each is one list of all."""
+_LISTS = ("Main", "Segmentation")
+"""Folders in `ImageSets` where lists of the images stand; there is no split, so each is one list of all."""
 _QUALITY = 95
 _MOST_CATEGORIES = 254
 """0 is the background and 255 is VOC's void."""
 
 
-def write_voc(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in Pascal VOC's format; label images lose nothing, images become JPEG.
 
     Raises:
@@ -33,8 +33,6 @@ def write_voc(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
     """
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
-    for name in ("Annotations", "SegmentationClass", "SegmentationObject", *_LISTS):
-        (folder / name).mkdir(parents=True)
     for view in dataset.views(monitor):
         _write_jpeg(dataset, view, folder / "JPEGImages")
         labels, objects = dataset.label_image(view), np.zeros(view.link_ids.shape, np.uint8)
@@ -45,19 +43,18 @@ def write_voc(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
         _write_palette(folder / "SegmentationClass" / f"{view.name}.png", labels)
         _write_palette(folder / "SegmentationObject" / f"{view.name}.png", objects)
         ElementTree.indent(root, " ")
-        ElementTree.ElementTree(root).write(folder / "Annotations" / f"{view.name}.xml", encoding="utf-8")
+        write_bytes(folder / "Annotations" / f"{view.name}.xml", ElementTree.tostring(root, encoding="utf-8"))
     names = "".join(f"{name}\n" for name, _, _ in dataset.steps)
     for name in _LISTS:
-        (folder / name / "trainval.txt").write_text(names, encoding="utf-8")
+        write_text(folder / "ImageSets" / name / "trainval.txt", names)
     _write_label_map(folder / "labelmap.txt", dataset)
 
 
-def _write_jpeg(dataset: Dataset, view: View, folder: Path) -> None:
+def _write_jpeg(dataset: Dataset, view: View, folder: OutputPath) -> None:
     if dataset.images:
-        folder.mkdir(exist_ok=True)
         bgr = cv2.cvtColor(dataset.image(view), cv2.COLOR_RGB2BGR)
         _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        (folder / f"{view.name}.jpg").write_bytes(data.tobytes())
+        write_bytes(folder / f"{view.name}.jpg", data.tobytes())
 
 
 def _annotation(view: View) -> ElementTree.Element:
@@ -99,14 +96,15 @@ def _palette() -> UInt8[np.ndarray, "256 3"]:
     ).astype(np.uint8)
 
 
-def _write_palette(path: Path, labels: UInt8[np.ndarray, "height width"]) -> None:
+def _write_palette(path: OutputPath, labels: UInt8[np.ndarray, "height width"]) -> None:
     image = Image.fromarray(labels, mode="L")
     image.putpalette(_palette().tobytes())  # turns grey values into numbers of colours
-    image.save(path)
+    with output_stream(path) as stream:
+        image.save(stream, format="PNG")
 
 
-def _write_label_map(path: Path, dataset: Dataset) -> None:
+def _write_label_map(path: OutputPath, dataset: Dataset) -> None:
     colors = [",".join(map(str, color)) for color in _palette().tolist()]
     names = ["background", *(_name(category) for category in dataset.categories)]
     lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:{colors[n]}::\n" for n, name in enumerate(names))]
-    path.write_text("".join(lines), encoding="utf-8")
+    write_text(path, "".join(lines))

@@ -1,8 +1,8 @@
 """YOLO segmentation: `images/`, `labels/` with a line per polygon, and `data.yaml`."""
 
 import json
-from pathlib import Path
 
+from ..files import OutputPath, write_text
 from .dataset import Dataset
 from .monitor import Monitor
 from .polygons import polygons
@@ -12,9 +12,8 @@ _INTO_PIXEL = 0.25
 fraction (Ultralytics)."""
 
 
-def write_yolo(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
+def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in YOLO's format: a visible part of an arm that stands alone is an object of its own."""
-    (folder / "labels").mkdir(parents=True)
     for view in dataset.views(monitor):
         dataset.write_image(view, folder / "images")
         size = (view.camera.width, view.camera.height)
@@ -23,8 +22,7 @@ def write_yolo(dataset: Dataset, folder: Path, monitor: Monitor) -> None:
             for polygon in polygons(mask):
                 numbers = " ".join(f"{value:.6f}" for value in ((polygon + _INTO_PIXEL) / size).ravel())
                 lines.append(f"{category.id - 1} {numbers}\n")
-        (folder / "labels" / f"{view.name}.txt").write_text("".join(lines))
+        write_text(folder / "labels" / f"{view.name}.txt", "".join(lines))
     names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is YAML
-    (folder / "data.yaml").write_text(
-        f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n", encoding="utf-8"
-    )
+    text = f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n"
+    write_text(folder / "data.yaml", text)

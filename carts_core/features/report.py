@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..console import in_markdown
+from ..files import OutputPath, output_stream, write_text
 from ..wording import counted
 from .checkpoint import History
 
@@ -17,14 +18,15 @@ Panels = list[list[tuple[str, np.ndarray]]]
 """Per sample, titled pictures; one without colours runs from -1 to 1."""
 
 
-def write_report(folder: Path, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
+def write_report(folder: OutputPath, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
     """Write `curves.png`, `predictions.jpg` and `README.md`; returns the path of the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    _curves(history, columns).savefig(folder / "curves.png", dpi=110)
-    _predictions(examples).savefig(folder / "predictions.jpg", dpi=110, pil_kwargs={"quality": 85})
+    with output_stream(folder / "curves.png") as stream:
+        _curves(history, columns).savefig(stream, format="png", dpi=110)
+    with output_stream(folder / "predictions.jpg") as stream:
+        _predictions(examples).savefig(stream, format="jpg", dpi=110, pil_kwargs={"quality": 85})
     page = folder / "README.md"
-    page.write_text(_page(config, history, columns), encoding="utf-8")
-    return page
+    write_text(page, _page(config, history, columns))
+    return page.path
 
 
 def _curves(history: History, columns: dict[str, str]) -> Figure:

@@ -11,6 +11,7 @@ import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ..errors import SettingsError
+from ..files import locked_folder, output_path
 from ..settings import Architecture, TrainingConfig
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .growth import grow
@@ -68,11 +69,11 @@ def train(
         SettingsError: `output` holds a run with other settings.
         WeightsError: its checkpoint, or the weights to start from, cannot be read.
         RobotError: a robot cannot be loaded.
+        OutputError: `output` cannot be written to, or another process trains there.
     """
-    output.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(config.threads)
-    run = _Run(_as_large_as_start(config), output)
-    return run.finish(progress or (lambda event: None))
+    with locked_folder(output):
+        return _Run(_as_large_as_start(config), output).finish(progress or (lambda event: None))
 
 
 class _Run:
@@ -134,9 +135,8 @@ class _Run:
             validation = self.task.validate(self._averaged().folded(), samples)
             self._save(validation)
         examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
-        report = write_report(
-            self.output / "report", json.loads(config_json(self.config)), self.history, self.task.columns, examples
-        )
+        folder = output_path(self.output, "report")
+        report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
         return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
 
     def _planned(self) -> int:

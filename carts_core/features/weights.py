@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from ..errors import SettingsError, WeightsError
+from ..files import write_bytes
 from ..files.reading import WEIGHTS, check_regular, parse_json, read_bytes
 from ..settings import Architecture
 from ..wording import shortened
@@ -52,7 +53,6 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
         training: settings and figures that JSON can hold.
         working_size: width and height [px] of the images that the network is meant for.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {
         "format": f"carts-{network.kind}-network",
         "version": VERSION,
@@ -60,10 +60,7 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
         "working_size": json.dumps(working_size),
         "training": json.dumps(training),
     }
-    partial = path.with_name(path.name + ".part")
-    save_file({name: value.contiguous() for name, value in network.state_dict().items()}, partial, metadata)
-    partial.chmod(0o644)  # safetensors keeps its files to their owner, which a shipped file must not be
-    partial.replace(path)
+    write_bytes(path, save({name: value.contiguous() for name, value in network.state_dict().items()}, metadata))
 
 
 def read_weights(path: Path) -> Weights:

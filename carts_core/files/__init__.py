@@ -3,6 +3,8 @@
 No other module opens a file for writing; `tests/files/test_one_writer.py` sees to it.
 """
 
+from .foreign import csv_cell as csv_cell
+from .foreign import text_of_cell as text_of_cell
 from .locks import BusyError as BusyError
 from .locks import lock_holder as lock_holder
 from .locks import locked_folder as locked_folder

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.exchange.ply import export_ply
 
 from ..errors import RobotError
+from ..files import output_path, write_bytes, write_text
 from ..resources import shipped_robot
 
 try:
@@ -130,15 +132,13 @@ def write(folder: Path) -> list[Path]:
     Raises:
         RobotError: a part is not a closed solid.
     """
-    meshes = folder / "meshes"
-    meshes.mkdir(parents=True, exist_ok=True)
-    urdf = folder / f"{ROBOT_NAME}.urdf"
-    written = [urdf]
+    urdf = output_path(folder, f"{ROBOT_NAME}.urdf")
+    written = [urdf.path]
     for part in parts():
-        path = meshes / f"{part.name}.ply"
-        to_mesh(part).export(path, encoding="binary", vertex_normal=False)
-        written.append(path)
-    urdf.write_text(urdf_text())
+        path = output_path(folder, "meshes", f"{part.name}.ply")
+        write_bytes(path, export_ply(to_mesh(part), encoding="binary", vertex_normal=False))
+        written.append(path.path)
+    write_text(urdf, urdf_text())
     return written
 
 

@@ -1,7 +1,7 @@
 """`synthesize`: a whole sequence on disk."""
 
 import hashlib
-import shutil
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import SettingsError
+from ..files import OutputPath, holds_file, published
 from ..settings import SynthesisConfig
 from .domains import Conditions, View
 from .layout import load_robot, place_arms, place_cameras
@@ -24,7 +25,7 @@ Progress = Callable[[str, int, int], None]
 """Called with what is going on, how many steps are done and how many there are."""
 
 
-def synthesize(config: SynthesisConfig, output: Path | str, progress: Progress | None = None) -> Path:
+def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
     """Render a sequence of two arms in all wanted domains.
 
     The files appear under `output` when everything is there. Until then they lie beside it, and a run that was
@@ -43,10 +44,17 @@ def synthesize(config: SynthesisConfig, output: Path | str, progress: Progress |
         RobotError: the robot is not a PSM.
         CartsError: Mitsuba is not installed.
     """
+    target = output if isinstance(output, OutputPath) else Path(output)
     output = Path(output)
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
         raise SettingsError(f"{output} exists already. Name a folder that does not exist, or remove this one first.")
-    report = progress or (lambda what, done, total: None)
+    with published(target, key=hashlib.sha256(repr(config).encode()).hexdigest()) as work:
+        _write_sequence(config, work, output, progress or (lambda what, done, total: None))
+    return output / "sequence.toml"
+
+
+def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, report: Progress) -> None:
+    """Write into `work` what is not there yet; `output` is where it will lie in the end."""
     frames = config.motion.frames
     report("tissue, robots and motion", 0, frames)
     robot = load_robot(config)
@@ -57,7 +65,6 @@ def synthesize(config: SynthesisConfig, output: Path | str, progress: Progress |
     joints = plan_motion(arms, [tissue, other], cameras[0], config)
     stage = Stage(arms, joints, times)
 
-    work = _work_folder(output, config)
     painter = _Painter(config, stage, cameras, tissue, other)
     for frame in range(frames):
         if not _is_done(work, frame, cameras):
@@ -71,10 +78,6 @@ def synthesize(config: SynthesisConfig, output: Path | str, progress: Progress |
     write_table(work / "kinematics.csv", arms, times, measured)
     write_table(work / "truth.csv", arms, times, joints)
     write_sequence_file(work / "sequence.toml", config, output, arms, cameras)
-    if output.is_dir():
-        output.rmdir()
-    work.rename(output)
-    return output / "sequence.toml"
 
 
 class _Painter:
@@ -90,7 +93,7 @@ class _Painter:
         self._conditions = Conditions(config, tissue)
         self._gains: list[float] = []
 
-    def paint(self, folder: Path, frame: int) -> None:
+    def paint(self, folder: OutputPath, frame: int) -> None:
         """All pictures of one frame. Its masks come last: they say that the frame is complete."""
         masks = []
         for number, camera in enumerate(self._cameras):
@@ -143,20 +146,9 @@ def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
     return regular, other
 
 
-def _work_folder(output: Path, config: SynthesisConfig) -> Path:
-    """The folder beside `output` for the unfinished sequence of exactly these settings."""
-    fingerprint = hashlib.sha256(repr(config).encode()).hexdigest()[:12]
-    folder = output.parent / f".{output.name}.{fingerprint}.partial"
-    for stale in output.parent.glob(f".{output.name}.*.partial"):
-        if stale != folder:
-            shutil.rmtree(stale)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def _mask_file(folder: Path, frame: int, camera: Camera) -> Path:
+def _mask_file(folder: OutputPath, frame: int, camera: Camera) -> OutputPath:
     return folder / "masks" / camera.name / f"{frame_name(frame)}.png"
 
 
-def _is_done(folder: Path, frame: int, cameras: tuple[Camera, ...]) -> bool:
-    return all(_mask_file(folder, frame, camera).is_file() for camera in cameras)
+def _is_done(folder: OutputPath, frame: int, cameras: tuple[Camera, ...]) -> bool:
+    return all(holds_file(_mask_file(folder, frame, camera)) for camera in cameras)

@@ -1,6 +1,8 @@
 """The files of a synthetic sequence."""
 
 import csv
+import io
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..camera import Camera
 from ..errors import CartsError
+from ..files import OutputPath, write_bytes, write_text
 from ..resources import shipped_robot
 from ..scene import Arm
 from ..settings import SynthesisConfig
@@ -21,47 +24,48 @@ def frame_name(frame: int) -> str:
     return f"{frame + 1:03d}"
 
 
-def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"], quality: int) -> None:
+def write_image(path: OutputPath, image: UInt8[np.ndarray, "h w 3"], quality: int) -> None:
     """A JPEG file of an RGB picture, whole or not at all."""
     _write(path, ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
+def write_mask(path: OutputPath, mask: Bool[np.ndarray, "h w"]) -> None:
     """A PNG file of one bit per pixel, whole or not at all."""
     _write(path, ".png", mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1, cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def write_table(
-    path: Path,
+    path: OutputPath,
     arms: Sequence[Arm],
     times: Float[np.ndarray, " frames"],
     joints: Sequence[Float[np.ndarray, "frames dofs"]],
 ) -> None:
     """A CSV file with a row per frame: its id, its time [s], and the joint positions of every arm [rad, m]."""
     columns = [_column(arm, joint) for arm in arms for joint in arm.robot.joint_names]
-    with path.open("w", newline="", encoding="utf-8") as handle:
-        table = csv.writer(handle, lineterminator="\n")
-        table.writerow(["frame", "time", *columns])
-        for frame, time in enumerate(times):
-            values = np.concatenate([table_of_arm[frame] for table_of_arm in joints])
-            table.writerow([frame_name(frame), f"{time:.4f}", *(f"{value:.7f}" for value in values)])
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "time", *columns])
+    for frame, time in enumerate(times):
+        values = np.concatenate([table_of_arm[frame] for table_of_arm in joints])
+        table.writerow([frame_name(frame), f"{time:.4f}", *(f"{value:.7f}" for value in values)])
+    write_text(path, text.getvalue())
 
 
 def write_sequence_file(
-    path: Path, config: SynthesisConfig, output: Path, arms: Sequence[Arm], cameras: Sequence[Camera]
+    path: OutputPath, config: SynthesisConfig, output: Path, arms: Sequence[Arm], cameras: Sequence[Camera]
 ) -> None:
     """The sequence file that ties the others together; `output` is the folder that it will lie in."""
     domains = ", ".join(f'"{domain}"' for domain in config.domains)
     sections = [
         'format = "carts-sequence/1"\n'
-        f'name = "{config.name}"\n'
+        f"name = {json.dumps(config.name)}\n"
         f'description = "Two synthetic arms over made-up tissue; carts synthesize, seed {config.seed}."\n'
         f"domains = [{domains}]\n",
         '[kinematics]\ntable = "kinematics.csv"\ntruth = "truth.csv"\nframe = "frame"\ntimestamp = "time"\n',
         *(_camera_section(camera) for camera in cameras),
         *(_arm_section(arm, config, output) for arm in arms),
     ]
-    path.write_text("\n".join(sections), encoding="utf-8")
+    write_text(path, "\n".join(sections))
 
 
 def _camera_section(camera: Camera) -> str:
@@ -104,11 +108,8 @@ def _matrix(values: np.ndarray) -> str:
     return "[\n" + "".join(f"    [{row}],\n" for row in rows) + "]"
 
 
-def _write(path: Path, suffix: str, pixels: np.ndarray, options: list[int]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _write(path: OutputPath, suffix: str, pixels: np.ndarray, options: list[int]) -> None:
     encoded, data = cv2.imencode(suffix, pixels, options)
     if not encoded:
         raise CartsError(f"{path} could not be encoded as {suffix}.")
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(data.tobytes())
-    part.replace(path)
+    write_bytes(path, data.tobytes())

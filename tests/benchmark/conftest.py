@@ -9,6 +9,7 @@ import pytest
 from carts_core.benchmark import Benchmark, ResultsFile, Scope, Source, methods, plan
 from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
+from carts_core.files import output_path
 from carts_core.optimization import OptimizerSettings
 from carts_core.synthesis import DOMAINS
 
@@ -63,7 +64,7 @@ def tiny_benchmark(tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps
             cameras=("left", "right"),
             consecutive=[0, 1],
         )
-        results = ResultsFile(tmp_path / "bench" / "measurements.jsonl")
+        results = ResultsFile(output_path(tmp_path, "bench", "measurements.jsonl"))
         return Benchmark(TINY, [source], FeatureExtractor.load(), results, plan(TINY, [source]))
 
     return make

@@ -16,6 +16,7 @@ from rich.console import Console
 from carts_core.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
 from carts_core.benchmark.runner import _Bench
 from carts_core.cli import BAD_INPUT, main
+from carts_core.files import output_path
 
 QUIET = Console(quiet=True)
 RUNS = 46
@@ -57,7 +58,7 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     tiny_benchmark().run(QUIET)
     assert len(count_runs) == RUNS
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
-    assert f"{RUNS} of {RUNS}" in write_report(tmp_path / "bench", measurements, facts, {}).read_text()
+    assert f"{RUNS} of {RUNS}" in write_report(output_path(tmp_path, "bench"), measurements, facts, {}).read_text()
 
 
 def test_a_stopped_benchmark_goes_on_where_it_was(
@@ -196,9 +197,10 @@ def test_a_killed_benchmark_leaves_lines_that_are_all_valid(tmp_path: Path, tiny
         "from carts_core.benchmark import Benchmark, QUICK, ResultsFile, Run, Source\n"
         "from carts_core.data import Sequence\n"
         "from carts_core.features import FeatureExtractor\n"
+        "from carts_core.files import output_path\n"
         "source = Source('synthetic', 'tiny', 'left', [0], 'tiny', lambda progress: Sequence.open(sys.argv[1]))\n"
         "runs = [Run('synthetic', 'regular', 0, 'start', float(error)) for error in range(int(sys.argv[3]))]\n"
-        "results = ResultsFile(Path(sys.argv[2]))\n"
+        "results = ResultsFile(output_path(Path(sys.argv[2])))\n"
         "bench = Benchmark(QUICK, [source], FeatureExtractor.load(), results, runs)\n"
         "print(len(bench.measurements()), results.unreadable)\n"
         "bench.run(Console(quiet=True))\n"

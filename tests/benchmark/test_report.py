@@ -14,6 +14,7 @@ from carts_core.benchmark.accuracy_targets import accuracy_targets
 from carts_core.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
 from carts_core.benchmark.speed_tables import pair_table, worse_table
 from carts_core.benchmark.statistics import Measurements
+from carts_core.files import output_path
 from carts_core.synthesis import DOMAINS
 
 FACTS = Facts("quick", 200, {"synthetic": "seed 5 <b>"}, "abc", "def", "0.1")
@@ -59,7 +60,7 @@ class _Page(HTMLParser):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    assert write_report(folder, _measurements(), FACTS, {"render forward": 3.25}) == folder / "report.html"
+    assert write_report(output_path(folder), _measurements(), FACTS, {"render forward": 3.25}) == folder / "report.html"
     return folder
 
 
@@ -89,18 +90,18 @@ def test_json_and_csv_have_a_row_per_run_and_the_same_verdicts_as_the_page(folde
     page = (folder / "report.html").read_text()
     for target in document["targets"]:
         assert f"<td>{target['reached']}</td>" in page
-    assert not list(folder.rglob("*.part"))
+    assert not list(folder.rglob(".*"))
 
 
 def test_the_same_measurements_give_the_same_report_byte_by_byte(folder: Path, tmp_path: Path) -> None:
-    write_report(tmp_path, _measurements(), FACTS, {"render forward": 3.25})
+    write_report(output_path(tmp_path), _measurements(), FACTS, {"render forward": 3.25})
     files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
     assert len(files) == 7
     assert all((folder / path).read_bytes() == (tmp_path / path).read_bytes() for path in files)
 
 
 def test_a_report_of_a_single_run_is_written_too(tmp_path: Path) -> None:
-    page = write_report(tmp_path, [make_measurement((0.5, 0.6))], FACTS, {})
+    page = write_report(output_path(tmp_path), [make_measurement((0.5, 0.6))], FACTS, {})
     assert "not measured" in page.read_text()
 
 

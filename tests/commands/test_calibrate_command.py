@@ -103,7 +103,7 @@ def test_bad_input_leaves_nothing_behind(
     with pytest.raises(SystemExit) as stop:
         main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *arguments])
     assert stop.value.code == BAD_INPUT and message in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "out").exists() and not (tmp_path / ".out.part").exists()
+    assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".carts-*"))
 
 
 def test_a_moved_sequence_file_keeps_references_comments_and_absolute_paths(sequence: Path, tmp_path: Path) -> None:

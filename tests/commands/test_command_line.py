@@ -91,7 +91,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     assert "PSM1.wrist_yaw" in rows[0] and rows[0]["source"] == "optimized"
     mask = cv2.imread(str(folder / "masks" / "003.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None and mask.shape == (128, 160) and set(mask.flatten().tolist()) == {0, 255}
-    assert not list(folder.rglob("*.part"))
+    assert not list(folder.rglob(".*"))
 
 
 @pytest.mark.parametrize("mode", ["frame", "sequence"])

@@ -82,8 +82,8 @@ def test_a_stopped_run_goes_on_where_it_was_and_gives_the_same_files_byte_by_byt
     with pytest.raises(KeyboardInterrupt):
         synthesize(small_config, output, stop_after_one)
     assert not output.exists()
-    (partial,) = tmp_path.glob(".sequence.*.partial")
-    first = partial / "images" / "smoke" / "left" / "001.jpg"
+    (partial,) = tmp_path.glob(".carts-*")
+    first = partial / "sequence" / "images" / "smoke" / "left" / "001.jpg"
     written = first.stat().st_mtime_ns
     synthesize(small_config, output)
     assert (output / "images" / "smoke" / "left" / "001.jpg").stat().st_mtime_ns == written
@@ -121,7 +121,7 @@ def test_the_shipped_sequence_is_complete_and_small_enough(sample_sequence_path:
     assert len(sequence) >= 24
     folder = sample_sequence_path.parent
     assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 9_000_000
-    assert not list(folder.rglob("*.part"))
+    assert not list(folder.rglob(".*"))
 
 
 def test_the_shipped_sequence_shows_the_shipped_robot_at_its_true_joints(sample_sequence_path: Path) -> None:

@@ -10,7 +10,7 @@ import cv2
 import torch
 from viewer_run import run_without_end
 
-from carts_core.export.publish import MARKER
+from carts_core.files import MARKER
 from carts_viewer.app import ViewerApp
 from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.project import SavedPanel
