@@ -44,19 +44,29 @@ def _modules() -> Iterator[tuple[str, ast.Module]]:
 
 def writing_calls(module: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and name of every call that could write to a path."""
+    streams = {"stream", "file", *_in_memory(module)}
     for node in ast.walk(module):
         if not isinstance(node, ast.Call):
             continue
         method = isinstance(node.func, ast.Attribute)
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        if name in ("open", "fdopen") and _opens_for_writing(node, method):
+        if name in ("open", "fdopen") and _opens_for_writing(node, streams):
             yield node.lineno, name
         elif name == "replace" and _of(node) in ("os", "path", "part", "partial"):
             yield node.lineno, name
         elif (_of(node), name) in (("os", "remove"), ("sqlite3", "connect")):
             yield node.lineno, name
-        elif name in WRITERS and not _is_harmless(node, name, method):
+        elif name in WRITERS and not _is_harmless(node, name, method, streams):
             yield node.lineno, name
+
+
+def _in_memory(module: ast.Module) -> Iterator[str]:
+    """Names of variables that are made as a file in memory."""
+    for node in ast.walk(module):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+            made = node.value.func.attr if isinstance(node.value.func, ast.Attribute) else _name(node.value.func)
+            if made in ("BytesIO", "StringIO"):
+                yield from (_name(target) for target in node.targets)
 
 
 def _of(call: ast.Call) -> str:
@@ -65,17 +75,17 @@ def _of(call: ast.Call) -> str:
     return value.id if isinstance(value, ast.Name) else ""
 
 
-def _opens_for_writing(call: ast.Call, method: bool) -> bool:
+def _opens_for_writing(call: ast.Call, streams: set[str]) -> bool:
     if _of(call) in ("os", "webbrowser"):
         return _of(call) == "os"
     given = [*call.args, *(keyword.value for keyword in call.keywords)]
     modes = [value.value for value in given if isinstance(value, ast.Constant) and isinstance(value.value, str)]
-    into_stream = bool(call.args) and _name(call.args[0]) in ("stream", "file")
+    into_stream = bool(call.args) and _name(call.args[0]) in streams
     return any(set(mode) <= set("rwaxbt+") and set(mode) & set("wax+") for mode in modes) and not into_stream
 
 
-def _is_harmless(call: ast.Call, name: str, method: bool) -> bool:
-    if name in INTO_MEMORY and call.args and _name(call.args[0]) in ("stream", "file"):
+def _is_harmless(call: ast.Call, name: str, method: bool, streams: set[str]) -> bool:
+    if name in INTO_MEMORY and call.args and _name(call.args[0]) in streams:
         return True
     if name not in OWN_METHODS:
         return False
@@ -136,6 +146,7 @@ def test_the_search_finds_every_way_to_write(code: str) -> None:
         "dataclasses.replace(config, noise=0)",
         "write_text(path, text)",
         "figure.savefig(stream, format='png')",
+        "content = io.BytesIO()\nnp.savez(content, a=a)",
         "av.open(file, 'w', format='mp4')",
         "Sequence.open(path)",
         "names.remove(name)",
