@@ -18,7 +18,7 @@ WRITERS = {
     *("mkstemp", "mkdtemp", "NamedTemporaryFile", "VideoWriter", "FileStorage", "flock", "lockf"),
 }
 """Functions and methods that write when their first argument is a path."""
-INTO_MEMORY = {"save", "savez", "savez_compressed", "savefig"}
+INTO_MEMORY = {"save", "savetxt", "savez", "savez_compressed", "savefig"}
 """Those of them that write to an open stream just as well; it is called `stream` or `file` here."""
 OWN_METHODS = {
     "save": "Controller.save and Editor.save put an edit into the project",
