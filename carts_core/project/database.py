@@ -1,14 +1,16 @@
-"""The SQLite file: how it is made, opened, migrated and written to."""
+"""The SQLite database inside a project file: its schema, and connections that take nothing else."""
 
 import errno
-import os
+import secrets
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from ..errors import ProjectError
+from . import digests
 from .identity import SequenceIdentity
 
 APPLICATION_ID = 0x43415254
@@ -59,125 +61,183 @@ VERSION_2 = """
 -- The same tables. Changes may be of the kind time_offset, which version 1 would take for damage.
 """
 
-MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2)
-"""Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
+VERSION_3 = """
+ALTER TABLE steps ADD COLUMN digest BLOB;    -- of the row, see digests.py
+ALTER TABLE changes ADD COLUMN digest BLOB;
+ALTER TABLE figures ADD COLUMN digest BLOB;
+ALTER TABLE exports ADD COLUMN digest BLOB;
+CREATE TABLE seal (               -- one row
+    nonce BLOB NOT NULL,          -- random, tells this file from other projects
+    total BLOB NOT NULL,          -- sum of the digests of all rows
+    digest BLOB NOT NULL          -- over nonce, total, identity, position and time of creation
+);
+"""
 
+MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3)
+"""Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
+SEALED = 3
+"""The first schema with digests."""
+
+LONGEST_VALUE = 128 * 2**20
+"""What one value of a row may have [bytes]."""
+_LIMITS = {
+    sqlite3.SQLITE_LIMIT_LENGTH: LONGEST_VALUE,
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1_000_000,
+    sqlite3.SQLITE_LIMIT_COLUMN: 100,
+    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
+    sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 10,
+    sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
+    sqlite3.SQLITE_LIMIT_WORKER_THREADS: 0,
+}
+_NEVER = {
+    sqlite3.SQLITE_ATTACH,
+    sqlite3.SQLITE_CREATE_TRIGGER,
+    sqlite3.SQLITE_CREATE_TEMP_TRIGGER,
+    sqlite3.SQLITE_CREATE_TEMP_VIEW,
+    sqlite3.SQLITE_CREATE_TEMP_TABLE,
+    sqlite3.SQLITE_CREATE_VTABLE,
+}
+_STEPS_BETWEEN_LOOKS = 10_000
+"""Instructions of SQLite's virtual machine, some tens of microseconds."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
-def create(path: Path, identity: SequenceIdentity) -> None:
-    """Make an empty project; it appears under its name when it is complete.
-
-    Raises:
-        ProjectError: the folder cannot be written to, or the disk is full.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        with errors_explained(path):
-            part.unlink(missing_ok=True)
-            with closing(sqlite3.connect(part, isolation_level=None)) as connection:
-                connection.execute("PRAGMA synchronous = FULL")
-                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                _migrate(connection)
-                insert = "INSERT INTO project (identity, position, created) VALUES (?, 0, ?)"
-                connection.execute(insert, (identity.to_json(), time.time()))
-                # The last thing: up to here, what is saved is in the file itself, so it can be renamed.
-                connection.execute("PRAGMA journal_mode = WAL")
-            part.replace(path)
-            _sync_folder(path.parent)
-    except ProjectError:
-        for suffix in ("", "-wal", "-shm"):
-            part.with_name(part.name + suffix).unlink(missing_ok=True)
-        raise
+class DamagedProject(ProjectError):
+    """A project file is not as carts has written it."""
 
 
-def _sync_folder(folder: Path) -> None:
-    """Have a new name on disk before something is saved under it."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def connect(path: Path) -> sqlite3.Connection:
-    """A connection that writes to an existing project, which is migrated to the present schema.
-
-    Raises:
-        ProjectError: it cannot be written to.
-    """
-    with errors_explained(path):
-        uri = f"{path.as_uri()}?mode=rw"
-        connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-        try:
-            connection.execute("PRAGMA trusted_schema = OFF")
-            connection.execute("PRAGMA synchronous = FULL")
-            _migrate(connection)
-        except BaseException:
-            connection.close()
-            raise
+def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
+    """A connection that runs nothing that the file's own schema asks for, and loads no file but its own."""
+    for limit, value in _LIMITS.items():
+        connection.setlimit(limit, value)
+    for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "temp_store = MEMORY"):
+        connection.execute(f"PRAGMA {setting}")
+    connection.set_authorizer(_authorized)
     return connection
 
 
-def snapshot(path: Path) -> sqlite3.Connection:
-    """A copy of a project in memory, migrated there. The file stays as it is and is not held open.
-
-    Raises:
-        ProjectError: it is not there, not a project, or of a newer version of carts.
-    """
-    if not path.is_file():
-        raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
-    memory = sqlite3.connect(":memory:", isolation_level=None)
-    try:
-        with errors_explained(path):
-            _copy(path, memory)
-            memory.execute("PRAGMA trusted_schema = OFF")
-            _check_schema(memory, path)
-            _migrate(memory)
-    except BaseException:
-        memory.close()
-        raise
-    return memory
-
-
-def _copy(path: Path, memory: sqlite3.Connection) -> None:
-    if not _has_log(path):
-        # Nobody is writing. Reading it as it lies needs no further files, which a read-only folder would refuse.
-        changed = path.stat().st_mtime_ns
-        _backup(f"{path.as_uri()}?mode=ro&immutable=1", memory)
-        if not _has_log(path) and path.stat().st_mtime_ns == changed:
-            return
-    _backup(f"{path.as_uri()}?mode=ro", memory)
-
-
-def _has_log(path: Path) -> bool:
-    """Whether there are writes that did not reach the file itself yet, as there are while somebody is writing."""
-    try:
-        return path.with_name(path.name + "-wal").stat().st_size > 0
-    except FileNotFoundError:
-        return False
-
-
-def _backup(uri: str, memory: sqlite3.Connection) -> None:
-    with closing(sqlite3.connect(uri, uri=True)) as connection:
-        connection.backup(memory)
+def _authorized(action: int, _first: object, _second: object, _schema: object, inside: str | None) -> int:
+    """Deny what we never do, and whatever a trigger or a view other than ours asks for."""
+    return sqlite3.SQLITE_DENY if action in _NEVER or inside not in (None, "current") else sqlite3.SQLITE_OK
 
 
 @contextmanager
-def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[sqlite3.Connection]:
-    """All or nothing; on disk when the block has ended.
+def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
+    """Interrupt SQLite when the block takes longer [s]: no statement of ours does, a crafted file's may.
 
     Raises:
-        ProjectError: it could not be written; nothing of it was.
+        sqlite3.OperationalError: it was interrupted.
     """
-    with errors_explained(path):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield connection
-            connection.execute("COMMIT")
-        finally:
-            if connection.in_transaction:
+    end = time.monotonic() + seconds
+    connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
+    try:
+        yield
+    finally:
+        connection.set_progress_handler(None, 0)
+
+
+def empty(identity: SequenceIdentity) -> sqlite3.Connection:
+    """A new project, in memory."""
+    connection = hardened(sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False))
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    with transaction(connection):
+        for statement in _statements("".join(MIGRATIONS)):
+            connection.execute(statement)
+        insert = "INSERT INTO project (identity, position, created) VALUES (?, 0, ?)"
+        connection.execute(insert, (identity.to_json(), time.time()))
+        digests.seal(connection, secrets.token_bytes(digests.NONCE_BYTES))
+        connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+    return connection
+
+
+def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
+    """Run the scripts that are missing, all or none. With none missing, see whether the file can be written.
+
+    Args:
+        connection: to a project whose schema and digests were checked.
+        nonce: for a project that has none.
+    """
+    missing = MIGRATIONS[version(connection) :]
+    with transaction(connection):
+        for statement in _statements("".join(missing)):
+            connection.execute(statement)
+        if missing:
+            digests.seal(connection, nonce)
+        connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+
+
+def check_version(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse what is no project, or of a newer version.
+
+    Raises:
+        ProjectError: it is.
+    """
+    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+        raise not_a_project(path)
+    found = version(connection)
+    if found > len(MIGRATIONS):
+        raise ProjectError(
+            f"project {path} has schema {found}, made by a newer version of carts; this one knows schemas up to "
+            f"{len(MIGRATIONS)}. Nothing was changed. Update carts to open it."
+        )
+
+
+def check_schema(connection: sqlite3.Connection) -> None:
+    """Compare the schema with ours, as text: no trigger, view or expression of another is ever run.
+
+    Raises:
+        DamagedProject: it is another.
+    """
+    found = version(connection)
+    ours = _schema_of(MIGRATIONS[:found]) if found > 0 else frozenset()
+    theirs = frozenset(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema").fetchmany(1000))
+    if theirs != ours:
+        odd = sorted({f"{kind} {name!r}" for kind, name, _, _ in theirs ^ ours if isinstance(kind, str)})
+        raise DamagedProject(f"its tables are not those of a project of carts ({', '.join(odd)[:300]})")
+
+
+def version(connection: sqlite3.Connection) -> int:
+    """Number of the schema."""
+    return connection.execute("PRAGMA user_version").fetchone()[0]
+
+
+def not_a_project(path: Path) -> ProjectError:
+    """The error for another file."""
+    return ProjectError(f"{path} is not a project of carts; nothing was changed. Name another file.")
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """All or nothing; on disk when the block has ended."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield connection
+        connection.execute("COMMIT")
+    finally:
+        if connection.in_transaction:
+            with suppress(sqlite3.Error):
                 connection.execute("ROLLBACK")
+
+
+@lru_cache(maxsize=8)
+def _schema_of(scripts: tuple[str, ...]) -> frozenset[tuple]:
+    connection = sqlite3.connect(":memory:", isolation_level=None)
+    try:
+        connection.executescript("".join(scripts))
+        return frozenset(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema"))
+    finally:
+        connection.close()
+
+
+def _statements(script: str) -> Iterator[str]:
+    """The statements of a script, one by one: `executescript` would end our transaction."""
+    statement = ""
+    for line in script.splitlines(keepends=True):
+        statement += line
+        if sqlite3.complete_statement(statement):
+            yield statement
+            statement = ""
 
 
 @contextmanager
@@ -202,28 +262,3 @@ def _advice(code: str) -> str:
     if code.startswith("SQLITE_BUSY"):
         return "Another program holds it. Close that, then try again."
     return "Nothing of this was saved. If it stays so, the file may be damaged: keep a copy of it."
-
-
-def _check_schema(connection: sqlite3.Connection, path: Path) -> None:
-    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
-        raise ProjectError(f"{path} is not a project of carts; nothing was changed. Name another file.")
-    version = _version(connection)
-    if version > len(MIGRATIONS):
-        raise ProjectError(
-            f"project {path} has schema {version}, made by a newer version of carts; this one knows schemas up to "
-            f"{len(MIGRATIONS)}. Nothing was changed. Update carts to open it."
-        )
-
-
-def _version(connection: sqlite3.Connection) -> int:
-    return connection.execute("PRAGMA user_version").fetchone()[0]
-
-
-def _migrate(connection: sqlite3.Connection) -> None:
-    """Run the scripts that are missing, all or none. With none missing, see whether the file can be written."""
-    scripts = "".join(MIGRATIONS[_version(connection) :])
-    try:
-        connection.executescript(f"BEGIN IMMEDIATE; {scripts} PRAGMA user_version = {len(MIGRATIONS)}; COMMIT;")
-    finally:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")

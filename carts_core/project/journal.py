@@ -1,103 +1,149 @@
-"""The journal: every step and what it set. The state is the journal read up to a position, so undo moves that."""
+"""The journal: every step and what it set. The state is the journal read up to a position, so undo moves that.
+
+What writes to it gives a `Script`, since it goes to two places: the file and its copy in memory.
+"""
 
 import sqlite3
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from ..errors import ProjectError
+from . import digests
+from .database import DamagedProject
+from .digests import as_number, checked_rows, row_digest
 from .identity import SequenceIdentity
 from .keys import Edits, Key, Kind, check_edit, decode
 from .state import Entry, ExportRecord, ProjectState, Step
 from .values import Figures
 
 
-def load(connection: sqlite3.Connection, path: Path) -> ProjectState:
-    """The state that a project file holds; `path` is for errors.
+@dataclass
+class Script:
+    """One transaction.
+
+    Attributes:
+        statements: SQL, each with the rows of its parameters.
+        digests: what the transaction adds to the sum of all digests.
+        position: in the history, afterwards; None: as before.
+    """
+
+    statements: list[tuple[str, list[tuple]]] = field(default_factory=list)
+    digests: int = 0
+    position: int | None = None
+
+    def insert(self, table: str, rows: Iterable[tuple]) -> None:
+        """Add rows, in place of those of the same key."""
+        sealed = [(*row, row_digest(table, row)) for row in rows]
+        columns = digests.TABLES[table]
+        marks = ", ".join("?" * (len(columns) + 1))
+        statement = f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}, digest) VALUES ({marks})"
+        self.statements.append((statement, sealed))
+        self.digests += sum(as_number(row[-1]) for row in sealed)
+
+    def take_out(self, found: Iterable[tuple[bytes]]) -> None:
+        """Take the digests of rows that go, or are replaced, out of the sum."""
+        self.digests -= sum(as_number(digest) for (digest,) in found)
+
+
+def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
+    """The state that a project holds, and its seal. Every row is checked, values that undo brings back included.
 
     Raises:
-        ProjectError: something in it cannot be read.
+        DamagedProject, ValueError, TypeError and others of `rescue.UNREADABLE`, ProjectError, sqlite3.Error: something
+            in it cannot be read, or is not as it was written.
     """
-    try:
-        text, position = connection.execute("SELECT identity, position FROM project").fetchone()
-        identity = SequenceIdentity.from_json(text)
-        rows = connection.execute("SELECT kind, frame, name, step, value FROM current")
-        figures = connection.execute("SELECT frame, revision, loss, dice FROM figures")
-        steps = tuple(Step(*row) for row in connection.execute("SELECT step, name, time FROM steps ORDER BY step"))
-        exports = connection.execute("SELECT time, format, path, frames, settings FROM exports ORDER BY rowid")
-        state = ProjectState(identity, steps, position, exports=tuple(ExportRecord(*row) for row in exports))
-        entries = {key: Entry(step, value) for key, step, value in (_entry(*row) for row in rows)}
-        state = state.with_entries(entries)
-        state = state.with_figures({(frame, revision): Figures(*values) for frame, revision, *values in figures})
-        for key, entry in entries.items():
-            check_edit(identity, key, entry.value)
-        if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
-            raise ValueError("its history has gaps")
-    except (ValueError, TypeError, KeyError, ProjectError) as error:
-        raise ProjectError(f"project {path} is damaged: {error}. Go back to a copy of it.") from error
-    return state
+    text, position = connection.execute("SELECT identity, position FROM project").fetchone()
+    identity = SequenceIdentity.from_json(text)
+    total, steps, exports = 0, [], []
+    newest: dict[tuple[str, int, str], tuple[int, Any]] = {}
+    for number, name, time, digest in checked_rows(connection, "steps"):
+        total += digest
+        steps.append(Step(_typed(number, int), _typed(name, str), _typed(time, float)))
+    for kind, frame, name, step, value, digest in checked_rows(connection, "changes"):
+        total += digest
+        key = kind, frame, name
+        if step <= position and (key not in newest or newest[key][0] < step):
+            newest[key] = step, value
+    figures: dict[tuple[int, int], Figures] = {}
+    for frame, revision, *values, digest in checked_rows(connection, "figures"):
+        total += digest
+        figures[_typed(frame, int), _typed(revision, int)] = Figures(*values)
+    for *row, digest in checked_rows(connection, "exports"):
+        total += digest
+        exports.append(_record(*row))
+    seal = digests.check_seal(connection, total)
+    steps.sort(key=lambda step: step.number)
+    if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
+        raise DamagedProject("its history has gaps")
+    entries = {Key(Kind(kind), frame, name): value for (kind, frame, name), value in newest.items()}
+    decoded = {key: Entry(step, decode(key.kind, value)) for key, (step, value) in entries.items()}
+    for key, entry in decoded.items():
+        check_edit(identity, key, entry.value)
+    state = ProjectState(identity, tuple(steps), position, exports=tuple(exports))
+    return state.with_entries(decoded).with_figures(figures), seal
 
 
-def append(connection: sqlite3.Connection, step: Step, edits: Edits) -> None:
-    """Add a step at the present position; steps that were undone are forgotten."""
-    for statement in (
-        "DELETE FROM steps WHERE step >= ?",
-        "DELETE FROM changes WHERE step >= ?",
-        "DELETE FROM figures WHERE revision >= ?",
-    ):
-        connection.execute(statement, (step.number,))
-    connection.execute("INSERT INTO steps (step, name, time) VALUES (?, ?, ?)", (step.number, step.name, step.time))
-    connection.executemany(
-        "INSERT INTO changes (step, kind, frame, name, value) VALUES (?, ?, ?, ?, ?)",
-        (
-            (step.number, key.kind, key.frame, key.name, None if value is None else value.encode())
-            for key, value in edits.items()
-        ),
-    )
-    _set_position(connection, step.number)
+def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Script:
+    """Add a step at the present position; steps that were undone are forgotten.
+
+    Args:
+        memory: the journal as it is.
+        step: the step.
+        edits: what it sets.
+        last: number of the last step, done or undone.
+    """
+    script = Script(position=step.number)
+    if last >= step.number:
+        for table, column in (("steps", "step"), ("changes", "step"), ("figures", "revision")):
+            script.take_out(memory.execute(f"SELECT digest FROM {table} WHERE {column} >= ?", (step.number,)))
+            script.statements.append((f"DELETE FROM {table} WHERE {column} >= ?", [(step.number,)]))
+    script.insert("steps", [(step.number, step.name, float(step.time))])
+    rows = [
+        (key.kind.value, key.frame, str(key.name), step.number, None if value is None else value.encode())
+        for key, value in edits.items()
+    ]
+    script.insert("changes", rows)
+    return script
 
 
-def move(connection: sqlite3.Connection, start: int, target: int) -> dict[Key[Any], Entry | None]:
-    """Go to another position of the history; gives the entries that may differ there (None: not there)."""
-    touched = connection.execute(
+def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, dict[Key[Any], Entry | None]]:
+    """Go to another position of the history; gives the entries that may differ there, too (None: not there)."""
+    touched = memory.execute(
         "SELECT DISTINCT kind, frame, name FROM changes WHERE step > ? AND step <= ?", sorted((start, target))
     ).fetchall()
     entries: dict[Key[Any], Entry | None] = {}
     for kind, frame, name in touched:
-        row = connection.execute(
-            "SELECT kind, frame, name, step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? "
+        row = memory.execute(
+            "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? "
             "AND step <= ? ORDER BY step DESC LIMIT 1",
             (kind, frame, name, target),
         ).fetchone()
-        if row is None:
-            entries[Key(Kind(kind), frame, name)] = None
-        else:
-            key, step, value = _entry(*row)
-            entries[key] = Entry(step, value)
-    _set_position(connection, target)
-    return entries
+        key: Key[Any] = Key(Kind(kind), frame, name)
+        entries[key] = None if row is None else Entry(row[0], decode(key.kind, row[1]))
+    return Script(position=target), entries
 
 
-def write_figures(connection: sqlite3.Connection, figures: Mapping[tuple[int, int], Figures]) -> None:
-    """Keep figures of (frame, revision)."""
-    connection.executemany(
-        "INSERT OR REPLACE INTO figures (frame, revision, loss, dice) VALUES (?, ?, ?, ?)",
-        ((frame, revision, value.loss, value.dice) for (frame, revision), value in figures.items()),
-    )
+def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
+    """Keep figures of (frame, revision), too; `script` does not yet remove any of them."""
+    for key in figures:
+        script.take_out(memory.execute("SELECT digest FROM figures WHERE frame = ? AND revision = ?", key))
+    script.insert("figures", [(*key, value.loss, value.dice) for key, value in figures.items()])
+    return script
 
 
-def write_export(connection: sqlite3.Connection, record: ExportRecord) -> None:
+def add_export(record: ExportRecord) -> Script:
     """Add a line to the log of exports."""
-    connection.execute(
-        "INSERT INTO exports (time, format, path, frames, settings) VALUES (?, ?, ?, ?, ?)",
-        (record.time, record.format, record.path, record.frames, record.settings),
-    )
+    script = Script()
+    script.insert("exports", [(record.time, record.format, record.path, record.frames, record.settings)])
+    return script
 
 
-def _set_position(connection: sqlite3.Connection, position: int) -> None:
-    connection.execute("UPDATE project SET position = ?", (position,))
+def _record(time: Any, format: Any, path: Any, frames: Any, settings: Any) -> ExportRecord:
+    texts = [_typed(text, str) for text in (format, path, settings)]
+    return ExportRecord(_typed(time, float), texts[0], texts[1], _typed(frames, int), texts[2])
 
 
-def _entry(kind: str, frame: int, name: str, step: int, stored: str | bytes | None) -> tuple[Key[Any], int, Any]:
-    key: Key[Any] = Key(Kind(kind), frame, name)
-    return key, step, decode(key.kind, stored)
+def _typed(value: Any, kind: type) -> Any:
+    if not isinstance(value, kind):
+        raise DamagedProject(f"it has a {type(value).__name__} where a {kind.__name__} belongs")
+    return value

@@ -1,65 +1,54 @@
-"""One writer per project: a lock that ends with the process, however that ends."""
+"""One writer per project: a lock on the project file itself, which ends with the process, however that ends.
 
+It covers the bytes that SQLite locks, so other programs that use SQLite cannot write either. It belongs to the open
+file (F_OFD_SETLK), so closing another descriptor of the file in this process does not end it, as it would end SQLite's.
+"""
+
+import errno
 import fcntl
 import os
-import socket
+import struct
+import sys
 from contextlib import suppress
 from pathlib import Path
 
-
-class WriterLock:
-    """The right to write to a project, held on a small file beside it. Made by `acquire`."""
-
-    def __init__(self, path: Path, descriptor: int) -> None:
-        self._path = path
-        self._descriptor = descriptor
-
-    @staticmethod
-    def acquire(path: Path) -> "WriterLock | None":
-        """Take the lock; None if somebody holds it.
-
-        Raises:
-            OSError: the file cannot be made, or its file system knows no locks.
-        """
-        while True:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Whoever held the lock before may have removed the file between our two calls: then lock the new one.
-                if _is_at(path, descriptor):
-                    _sign(descriptor)
-                    return WriterLock(path, descriptor)
-            except BlockingIOError:
-                os.close(descriptor)
-                return None
-            except BaseException:
-                os.close(descriptor)
-                raise
-            os.close(descriptor)
-
-    @staticmethod
-    def holder(path: Path) -> str:
-        """Who holds the lock, for people."""
-        try:
-            return path.read_text(encoding="utf-8") or "another process"
-        except OSError:
-            return "another process"
-
-    def release(self) -> None:
-        """Let the next one in."""
-        self._path.unlink(missing_ok=True)
-        os.close(self._descriptor)
+_START, _LENGTH = 0x40000000, 512
+"""Bytes of a database on which SQLite's locks lie, whether the file is so long or not."""
 
 
-def _is_at(path: Path, descriptor: int) -> bool:
+def try_lock(descriptor: int) -> bool:
+    """Lock an open project file for writing until it is closed; False if somebody else has it open for writing.
+
+    Raises:
+        OSError: the file is not open for writing, or its file system knows no locks.
+    """
+    if sys.platform == "darwin":
+        request = struct.pack("qqihh", _START, _LENGTH, 0, fcntl.F_WRLCK, os.SEEK_SET)
+    else:
+        request = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, _START, _LENGTH, 0)
     try:
-        return os.path.samestat(os.stat(path), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
+        fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, request)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        raise
+    return True
 
 
-def _sign(descriptor: int) -> None:
-    """Say who holds the lock. On a full disk nobody does; the lock holds all the same."""
+def holder(path: Path) -> str:
+    """Who has a project open, for people, as far as this system tells."""
+    own = str(os.getpid())
     with suppress(OSError):
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        wanted = os.stat(path, follow_symlinks=False)
+        for process in sorted(Path("/proc").glob("[0-9]*"), key=lambda folder: folder.name == own):
+            with suppress(OSError):
+                if any(_is_open_at(entry, wanted) for entry in (process / "fd").iterdir()):
+                    return f"process {process.name} of this computer"
+    return "another process"
+
+
+def _is_open_at(entry: Path, wanted: os.stat_result) -> bool:
+    try:
+        return os.path.samestat(os.stat(entry), wanted)
+    except OSError:
+        return False

@@ -1,0 +1,154 @@
+"""A copy of a project file in memory, checked before anything in it is believed. The file itself is only read."""
+
+import os
+import sqlite3
+import tempfile
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import ProjectError
+from . import database, digests
+from .companions import LOG, beside, check_files, open_regular
+from .wal import drops_edits
+
+LARGEST = 768 * 2**20
+"""What a project may have, its log included [bytes]; twice that is held while it is opened."""
+_TRIES = 5
+_MAGIC = b"SQLite format 3\0"
+_WRITE_VERSION = slice(18, 20)
+"""Bytes that say whether a database keeps a log; one in memory must not."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a project file and its log hold."""
+
+    database: bytes
+    log: bytes
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A copy in memory, which nothing was checked of yet.
+
+    Attributes:
+        connection: to it.
+        drops_edits: whether SQLite drops a part of the log that is no unfinished transaction.
+    """
+
+    connection: sqlite3.Connection
+    drops_edits: bool
+
+
+def read(path: Path) -> Content:
+    """What lies there, at one moment.
+
+    Raises:
+        ProjectError: it is not there, is no regular file, is too large, or never holds still.
+        OSError: it cannot be read.
+    """
+    if not check_files(path):
+        raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
+    for _ in range(_TRIES):
+        descriptor = open_regular(path)
+        try:
+            before = os.fstat(descriptor)
+            main, log = _content(descriptor, path), b""
+            try:
+                log_descriptor = open_regular(beside(path, LOG))
+            except FileNotFoundError:
+                pass
+            else:
+                try:
+                    log = _content(log_descriptor, path)
+                finally:
+                    os.close(log_descriptor)
+            after = os.fstat(descriptor)
+        finally:
+            os.close(descriptor)
+        # Whoever has it open writes to the log, and to the file itself when that is full or at the end.
+        if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
+            return Content(main, log)
+    raise ProjectError(f"project {path} is being changed all the time. Try again when that has ended.")
+
+
+def open_copy(content: Content, path: Path) -> Copy:
+    """A connection to a copy in memory.
+
+    Raises:
+        ProjectError: it is no project, or of a newer version of carts.
+        sqlite3.Error: SQLite cannot read it.
+    """
+    main, drops = content.database, False
+    if not main.startswith(_MAGIC) or len(main) < 512:
+        raise database.not_a_project(path)
+    if content.log:
+        main, recovered = _with_log(content)
+        drops = drops_edits(content.log, recovered)
+    memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    try:
+        patched = bytearray(main)
+        patched[_WRITE_VERSION] = b"\1\1"
+        memory.deserialize(patched)
+        database.hardened(memory)
+        database.check_version(memory, path)
+    except BaseException:
+        memory.close()
+        raise
+    # Logs of older versions were used again without being emptied, so that old frames lie at their end.
+    return Copy(memory, drops and database.version(memory) >= database.SEALED)
+
+
+def check(copy: Copy) -> None:
+    """See that a copy has our schema and is a sound database, before rows are read.
+
+    Raises:
+        DamagedProject, sqlite3.Error: it is not.
+    """
+    memory = copy.connection
+    pages = memory.execute("PRAGMA page_count").fetchone()[0]
+    with database.time_limit(memory, 5.0 + pages / 5_000):
+        database.check_schema(memory)
+        found = memory.execute("PRAGMA integrity_check(3)").fetchall()
+    if found != [("ok",)]:
+        raise database.DamagedProject("; ".join(str(row[0]) for row in found)[:300])
+    if copy.drops_edits:
+        raise database.DamagedProject("the last edits in its log (-wal) cannot be read")
+
+
+def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
+    """What `seal` of the file that lies there now says, if all of it is as it was written; None if it is not."""
+    try:
+        with database.errors_explained(path):
+            copy = open_copy(read(path), path)
+            with closing(copy.connection):
+                check(copy)
+                digests.verify(copy.connection)
+                return copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone()
+    except ProjectError:
+        return None
+
+
+def _content(descriptor: int, path: Path) -> bytes:
+    size = os.fstat(descriptor).st_size
+    if size > LARGEST:
+        raise ProjectError(f"{path} has {size / 2**20:.0f} MiB; a project may have {LARGEST // 2**20}. Name another.")
+    parts = []
+    while len(part := os.pread(descriptor, 1 << 26, sum(map(len, parts)))):
+        parts.append(part)
+    return b"".join(parts)
+
+
+def _with_log(content: Content) -> tuple[bytes, int]:
+    """The database with its log played back, and how many frames of the log SQLite took."""
+    with tempfile.TemporaryDirectory(prefix="carts-") as folder:
+        path = Path(folder) / "copy.carts"
+        path.write_bytes(content.database)
+        beside(path, LOG).write_bytes(content.log)
+        with closing(sqlite3.connect(f"{path.as_uri()}?vfs=unix-none", uri=True, isolation_level=None)) as connection:
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+            connection.execute("PRAGMA synchronous = OFF")
+            database.hardened(connection)
+            _, recovered, _ = connection.execute("PRAGMA wal_checkpoint(FULL)").fetchone()
+        return path.read_bytes(), max(recovered, 0)
