@@ -1,13 +1,13 @@
 """The app: opens a sequence, builds page, panels and worker, and ties them together."""
 
 import logging
+import os
 import sys
-import threading
 import time
-import webbrowser
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
+from typing import TextIO
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.data import Sequence
@@ -16,10 +16,12 @@ from carts_core.optimization import FreeParameters, OptimizerSettings
 from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
+from carts_viewer.ending import EndRequest
 from carts_viewer.guard import check_address
 from carts_viewer.layers import Layer
 from carts_viewer.layout import Layout
 from carts_viewer.mailbox import Mailbox
+from carts_viewer.opening import opened_in_browser
 from carts_viewer.page import Page
 from carts_viewer.picture import Painter
 from carts_viewer.running import OptimizerFactory
@@ -47,7 +49,6 @@ class ViewerApp:
         scene: The recording's arms and cameras.
         stage: What is seen in 3D, frame and overlay included.
         project: The sequence's corrections.
-        notice: Why they are not kept; None if they are.
         display: What puts states on the page.
         joints: The panel with the joints' sliders.
     """
@@ -69,7 +70,6 @@ class ViewerApp:
         self.sequence = sequence
         self.scene = sequence.scene
         self.project = storage.project
-        self.notice = storage.notice
         self._storage = storage
         self._session = Session(sequence, storage.project)
         self._painter = Painter(sequence, device)
@@ -141,6 +141,11 @@ class ViewerApp:
     def state(self) -> ViewState:
         """The newest state; a snapshot that does not change."""
         return self._controller.state
+
+    @property
+    def notice(self) -> str | None:
+        """Why corrections are not kept, or in which other file they are; None if they are kept in the project."""
+        return self._storage.notice
 
     def close(self) -> None:
         """Save what is under way, stop the worker and the server; closing again does nothing.
@@ -239,7 +244,7 @@ def serve(
     weights: tuple[Path, ...] = (),
     open_browser: bool = False,
 ) -> None:
-    """Serve the viewer of a sequence until Ctrl-C; prints where it is.
+    """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
     Args:
         sequence_path: The sequence file.
@@ -251,28 +256,56 @@ def serve(
         open_browser: Open the page in the default browser.
 
     Raises:
-        SystemExit: with code 2, after a message on stderr, when the sequence or an option is not usable.
+        SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
+            when corrections could not be saved, or not in the project that was opened.
     """
     log_to_stderr()
     began = time.monotonic()
-    try:
-        app = ViewerApp.open(
-            sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_print_progress
-        )
-    except CartsError as error:
-        print(f"error: {visible(str(error))}", file=sys.stderr)
-        raise SystemExit(2) from error
-    with app:
+    with EndRequest() as end:
         try:
-            print(
-                f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.", flush=True
+            app = ViewerApp.open(
+                sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_say_doing
             )
-            if open_browser:
-                webbrowser.open(app.url)
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            print("\nClosing.", flush=True)
+        except CartsError as error:
+            print(f"error: {visible(str(error))}", file=sys.stderr)
+            raise SystemExit(2) from error
+        end.ready()
+        browser = opened_in_browser(app.url) if open_browser else nullcontext()
+        try:
+            _say(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.")
+            with browser:
+                end.wait()
+            _say("\nClosing.")
+        finally:
+            _close(app)
 
 
-def _print_progress(line: str) -> None:
-    print(f"  {visible(line)} …", flush=True)
+def _close(app: ViewerApp) -> None:
+    """Save and close.
+
+    Raises:
+        SystemExit: see `serve`.
+    """
+    try:
+        app.close()
+        problem = app.project.incident
+    except CartsError as error:
+        problem = f"error: {error}"
+    if problem is not None:
+        _say(visible(problem), sys.stderr)
+        raise SystemExit(1)
+
+
+def _say_doing(line: str) -> None:
+    _say(f"  {visible(line)} …")
+
+
+def _say(text: str, to: TextIO | None = None) -> None:
+    """Print; a terminal that is gone, as it is after SIGHUP, keeps nothing from being saved."""
+    stream: TextIO = to or sys.stdout
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        with suppress(OSError, ValueError):
+            # Python flushes once more at the end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -3,6 +3,7 @@
 Runs on the worker's thread alone, knows neither threads nor widgets.
 """
 
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -25,6 +26,9 @@ from carts_viewer.propagating import Propagator
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState
+
+WATCH_EVERY = 1.0
+"""How often the project's file is looked after while nothing is edited [s]."""
 
 Deliver = Callable[[int, str, bytes], None]
 """Sends a file to a tab: client id, file name, content."""
@@ -49,6 +53,8 @@ class Controller:
         self.deliver = deliver
         self._editor = session.editor
         self._loss: float | None = None
+        self._watch_at = 0.0
+        self._incident: str | None = None
         self._browser = Browser(self)
         self._annotator = Annotator(self)
         self._runner = Runner(self, optimizers)
@@ -88,8 +94,15 @@ class Controller:
         return min((wait for part in parts if (wait := part.patience()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
-        """How long until `advance` has to save a gesture that nobody has ended [s]; None: nothing to save."""
-        return self._editor.overdue_in()
+        """How long until `advance` has to save a gesture that nobody has ended, or look after the file [s].
+
+        None: for ever.
+        """
+        if not self._editor.project.writable:
+            return None
+        watch = max(0.0, self._watch_at - time.monotonic())
+        draft = self._editor.overdue_in()
+        return watch if draft is None else min(draft, watch)
 
     def advance(self) -> None:
         """Do one bit of what is going on: an iteration, a frame to be solved or exported, the next frame of playing."""
@@ -97,8 +110,20 @@ class Controller:
         self._propagator.advance()
         self._exporter.advance()
         self._browser.advance()
-        if self.overdue_in() == 0.0:
+        if self._editor.overdue_in() == 0.0:
             self.save()
+        self._watch()
+
+    def _watch(self) -> None:
+        """See now and then that the project's file is still there: nobody may be editing while it is deleted."""
+        project = self._editor.project
+        if project.writable and time.monotonic() >= self._watch_at:
+            self._watch_at = time.monotonic() + WATCH_EVERY
+            with suppress(CartsError):
+                project.check()
+        if project.incident != self._incident:
+            self._incident = project.incident
+            self.change(error=self._incident)
 
     def fail(self, error: Exception, *, stop: bool) -> None:
         """Show an error to the user.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from carts_core.data import Sequence
 from carts_core.errors import ProjectError
-from carts_core.project import Project, default_path
+from carts_core.project import DamagedProject, Project, default_path
 
 
 @dataclass(frozen=True)
@@ -14,16 +14,32 @@ class Storage:
     """An open project."""
 
     project: Project
-    notice: str | None
+    reason: str | None
     """Why what people do is not kept; None if it is."""
     scratch: tempfile.TemporaryDirectory | None = None
     """The folder of a project that ends with the viewer."""
 
+    @property
+    def kept(self) -> bool:
+        """Whether what people do is kept, in the file at `project.path`."""
+        return self.reason is None and self.project.safe
+
+    @property
+    def notice(self) -> str | None:
+        """What people must know: why what they do is not kept, or that it is kept in another file; None if nothing."""
+        return self.project.incident or self.reason
+
     def close(self) -> None:
-        """Let others write."""
-        self.project.close()
-        if self.scratch is not None:
-            self.scratch.cleanup()
+        """Let others write.
+
+        Raises:
+            ProjectError: what was saved is nowhere on disk any more.
+        """
+        try:
+            self.project.close()
+        finally:
+            if self.scratch is not None:
+                self.scratch.cleanup()
 
 
 def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
@@ -40,8 +56,11 @@ def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
     """
     try:
         project = Project.open(sequence, path)
+    except DamagedProject:
+        # It says what could be read of it, and where that is.
+        raise
     except ProjectError as error:
-        if (path or default_path(Path(sequence.path))).exists():
+        if (path or default_path(Path(sequence.path))).is_file():
             project = Project.open(sequence, path, read_only=True)
             return Storage(project, f"Read-only: {error}")
         if path is not None:

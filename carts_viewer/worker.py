@@ -7,11 +7,15 @@ from collections.abc import Callable
 from typing import Protocol
 
 from carts_core.errors import CartsError
+from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.mailbox import Mailbox
 from carts_viewer.state import ViewState
 
 _log = logging.getLogger(__name__)
+
+_BEGINNING = (ask.Optimizing, ask.Propagating, ask.Exporting)
+"""Intents that may begin what takes long."""
 
 
 class Display(Protocol):
@@ -74,6 +78,10 @@ class Worker:
             self._attempt(self._startup)
         while not self._stop.is_set():
             self._attempt(self._round)
+        # What somebody did just before the end is saved, too; nothing long is begun.
+        for intent in self._mailbox.take(0.0):
+            if not isinstance(intent, _BEGINNING):
+                self._attempt(lambda intent=intent: self._controller.handle(intent))
 
     def _round(self) -> None:
         patience = self._patience()

@@ -37,6 +37,34 @@ def write_text(path: OutputPath | Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def write_new(path: OutputPath | Path, content: bytes) -> bool:
+    """Write a file where nothing is; False, and nothing is changed, where something is.
+
+    Of several processes that do this at once, one writes the file.
+
+    Raises:
+        OutputError: it cannot be written; nothing is changed then.
+    """
+    output = as_output(path)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        descriptor, temporary = _new_file(folder)
+        try:
+            with os.fdopen(descriptor, "w+b") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+                source = _OWN_DESCRIPTORS / str(stream.fileno()) if temporary is None else temporary
+                there = {} if temporary is None else {"src_dir_fd": folder}
+                os.link(source, output.name, dst_dir_fd=folder, follow_symlinks=temporary is None, **there)
+        except FileExistsError:
+            return False
+        finally:
+            if temporary is not None:
+                os.unlink(temporary, dir_fd=folder)
+        os.fsync(folder)
+    return True
+
+
 @contextmanager
 def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
     """A stream, seekable and readable, which becomes the file when the block ends without an exception.

@@ -1,5 +1,6 @@
 """The annotation project: one SQLite file that keeps every correction, with undo and redo across restarts."""
 
+from .database import DamagedProject as DamagedProject
 from .identity import SequenceIdentity as SequenceIdentity
 from .keys import Edits as Edits
 from .keys import Key as Key

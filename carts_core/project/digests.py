@@ -6,6 +6,7 @@ noticed too, and a digest over that sum, the position in the history and the ide
 
 import sqlite3
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 
 from ..errors import ProjectError
@@ -35,32 +36,41 @@ def as_number(digest: bytes) -> int:
     return int.from_bytes(digest, "big")
 
 
+@dataclass(frozen=True)
 class Seal:
-    """What `seal` says: the sum of all digests, and what belongs to no other table.
+    """What `seal` says but for the position in the history."""
 
-    Attributes:
-        nonce: random bytes, made with the file, which tell it from every other project of the sequence.
-        total: the sum of all rows' digests.
-    """
+    nonce: bytes
+    """Random, made with the file; tells it from every other project of the sequence."""
+    about: bytes
+    """Digest of what never changes: nonce, identity and time of creation."""
+    total: int
+    """The sum of all rows' digests."""
 
-    def __init__(self, nonce: bytes, identity: str, created: float, total: int) -> None:
-        self.nonce = nonce
-        self.total = total % _MODULUS
-        self._about = blake2b(ascii((nonce, identity, created)).encode(), digest_size=_BYTES).digest()
+    @staticmethod
+    def of(nonce: bytes, identity: str, created: float, total: int) -> "Seal":
+        """The seal of a project with these."""
+        about = blake2b(ascii((nonce, identity, created)).encode(), digest_size=_BYTES).digest()
+        return Seal(nonce, about, total % _MODULUS)
 
-    def add(self, change: int) -> None:
-        """Add digests as one number, negative where rows go."""
-        self.total = (self.total + change) % _MODULUS
+    def plus(self, change: int) -> "Seal":
+        """The seal with digests added as one number, negative where rows go."""
+        return replace(self, total=(self.total + change) % _MODULUS)
 
     def row(self, position: int) -> tuple[bytes, bytes, bytes]:
         """The row of `seal` at a position of the history."""
         total = self.total.to_bytes(_BYTES, "big")
-        whole = blake2b(ascii((self._about, position, total)).encode(), digest_size=_BYTES).digest()
+        whole = blake2b(ascii((self.about, position, total)).encode(), digest_size=_BYTES).digest()
         return self.nonce, total, whole
 
 
 def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Give every row its digest anew, inside a transaction of the caller's."""
+    """Give every row its digest anew, inside a transaction of the caller's.
+
+    Args:
+        connection: to a project of the present schema.
+        nonce: for one that has none yet.
+    """
     total = 0
     for table, columns in TABLES.items():
         rows = connection.execute(f"SELECT rowid, {', '.join(columns)} FROM {table}").fetchall()
@@ -68,8 +78,9 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
         connection.executemany(f"UPDATE {table} SET digest = ? WHERE rowid = ?", digests)
         total += sum(as_number(digest) for digest, _ in digests)
     identity, position, created = connection.execute("SELECT identity, position, created FROM project").fetchone()
+    nonce = next((nonce for (nonce,) in connection.execute("SELECT nonce FROM seal")), nonce)
     connection.execute("DELETE FROM seal")
-    row = Seal(nonce, identity, created, total).row(position)
+    row = Seal.of(nonce, identity, created, total).row(position)
     connection.execute("INSERT INTO seal (nonce, total, digest) VALUES (?, ?, ?)", row)
 
 
@@ -86,7 +97,7 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
     (identity, position, created), (nonce, *_) = projects[0], seals[0]
     if not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
         raise ProjectError("its own number was changed")
-    found = Seal(nonce, identity, created, total)
+    found = Seal.of(nonce, identity, created, total)
     expected = found.row(position)
     if seals[0][2] != expected[2] or seals[0] != expected:
         what = "rows are missing" if seals[0][1] != expected[1] else "its position or identity was changed"

@@ -164,6 +164,14 @@ class ProjectFile:
             self._check_content()
         self._release()
 
+    def dismiss(self) -> None:
+        """Close a file that was not written to, or not with success."""
+        if self._connection is not None and _lies_at(self.path, self._descriptor):
+            with suppress(sqlite3.Error):
+                self._connection.close()
+            self._connection = None
+        self.abandon()
+
     def abandon(self) -> None:
         """Let go of a file that is lost, without writing to it again."""
         if self._connection is not None:

@@ -25,11 +25,13 @@ class Script:
         statements: SQL, each with the rows of its parameters.
         digests: what the transaction adds to the sum of all digests.
         position: in the history, afterwards; None: as before.
+        cut_at: rows of this step and later ones are removed first; None: none are.
     """
 
     statements: list[tuple[str, list[tuple]]] = field(default_factory=list)
     digests: int = 0
     position: int | None = None
+    cut_at: int | None = None
 
     def insert(self, table: str, rows: Iterable[tuple]) -> None:
         """Add rows, in place of those of the same key."""
@@ -52,7 +54,10 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
         DamagedProject, ValueError, TypeError and others of `rescue.UNREADABLE`, ProjectError, sqlite3.Error: something
             in it cannot be read, or is not as it was written.
     """
-    text, position = connection.execute("SELECT identity, position FROM project").fetchone()
+    row = connection.execute("SELECT identity, position FROM project").fetchone()
+    if row is None:
+        raise DamagedProject("it does not say which sequence it belongs to")
+    text, position = _typed(row[0], str), _typed(row[1], int)
     identity = SequenceIdentity.from_json(text)
     total, steps, exports = 0, [], []
     newest: dict[tuple[str, int, str], tuple[int, Any]] = {}
@@ -94,12 +99,13 @@ def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> S
     """
     script = Script(position=step.number)
     if last >= step.number:
+        script.cut_at = step.number
         for table, column in (("steps", "step"), ("changes", "step"), ("figures", "revision")):
             script.take_out(memory.execute(f"SELECT digest FROM {table} WHERE {column} >= ?", (step.number,)))
             script.statements.append((f"DELETE FROM {table} WHERE {column} >= ?", [(step.number,)]))
     script.insert("steps", [(step.number, step.name, float(step.time))])
     rows = [
-        (key.kind.value, key.frame, str(key.name), step.number, None if value is None else value.encode())
+        (key.kind.value, int(key.frame), str(key.name), step.number, None if value is None else value.encode())
         for key, value in edits.items()
     ]
     script.insert("changes", rows)
@@ -124,17 +130,21 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
 
 
 def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
-    """Keep figures of (frame, revision), too; `script` does not yet remove any of them."""
+    """Keep figures of (frame, revision), too."""
     for key in figures:
+        if script.cut_at is not None and key[1] >= script.cut_at:
+            continue
         script.take_out(memory.execute("SELECT digest FROM figures WHERE frame = ? AND revision = ?", key))
-    script.insert("figures", [(*key, value.loss, value.dice) for key, value in figures.items()])
+    script.insert(
+        "figures", [(int(frame), revision, value.loss, value.dice) for (frame, revision), value in figures.items()]
+    )
     return script
 
 
 def add_export(record: ExportRecord) -> Script:
     """Add a line to the log of exports."""
     script = Script()
-    script.insert("exports", [(record.time, record.format, record.path, record.frames, record.settings)])
+    script.insert("exports", [(record.time, str(record.format), record.path, int(record.frames), record.settings)])
     return script
 
 

@@ -7,6 +7,7 @@ file (F_OFD_SETLK), so closing another descriptor of the file in this process do
 import errno
 import fcntl
 import os
+import socket
 import struct
 import sys
 from contextlib import suppress
@@ -43,7 +44,7 @@ def holder(path: Path) -> str:
         for process in sorted(Path("/proc").glob("[0-9]*"), key=lambda folder: folder.name == own):
             with suppress(OSError):
                 if any(_is_open_at(entry, wanted) for entry in (process / "fd").iterdir()):
-                    return f"process {process.name} of this computer"
+                    return f"process {process.name} on {socket.gethostname()}"
     return "another process"
 
 

@@ -2,23 +2,22 @@
 
 import json
 import logging
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import AbstractContextManager, closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from ..errors import ProjectError
 from ..wording import counted
-from . import database, journal
+from . import database, journal, opening
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
-from .lock import WriterLock
 from .place import default_path
 from .state import ExportRecord, ProjectState, Step
+from .store import Store
 from .values import Figures
 
 if TYPE_CHECKING:
@@ -48,7 +47,6 @@ class Project:
     """The corrections of one sequence, in one file. Safe to use from several threads.
 
     Attributes:
-        path: the file.
         state: what it says now. An immutable snapshot, which reading needs no lock for.
         read_only_reason: for people, why nothing can be saved; None if it can.
 
@@ -63,19 +61,15 @@ class Project:
     """
 
     def __init__(self, identity: SequenceIdentity, path: Path, *, read_only: bool = False) -> None:
-        self.path = path.resolve()
+        # Links on the way to the file's folder are a matter of the person who names it; the file itself must be none.
+        self._path = path.parent.resolve() / path.name
         self.read_only_reason = "It was opened read-only." if read_only else None
         self._edit = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
-        self._connection: sqlite3.Connection | None = None
-        self._writer: WriterLock | None = None
-        if not read_only:
-            self._lock_or_explain()
-        try:
-            self.state = self._load(identity)
-        except BaseException:
-            self.close()
-            raise
+        self._store: Store | None = None
+        self._incident: str | None = None
+        """Of a store that was closed."""
+        self.state = self._opened(identity)
 
     @classmethod
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
@@ -94,9 +88,36 @@ class Project:
         return cls(SequenceIdentity.of(sequence), path, read_only=read_only)
 
     @property
+    def path(self) -> Path:
+        """The file; another one after a rescue, see `incident`."""
+        return self._path if self._store is None else self._store.path
+
+    @property
     def writable(self) -> bool:
         """Whether edits are taken."""
-        return self._connection is not None
+        return self._store is not None
+
+    @property
+    def incident(self) -> str | None:
+        """What happened to the file that was opened, for people, and where its edits are now; None if nothing did."""
+        return self._incident if self._store is None else self._store.incident
+
+    @property
+    def safe(self) -> bool:
+        """Whether everything that was acknowledged is on disk, as far as was seen; see `check`."""
+        return self._store is None or self._store.safe
+
+    def check(self) -> None:
+        """See that the file is still as it was left; if not, everything is saved to another one, see `incident`.
+
+        Every edit does this, too.
+
+        Raises:
+            ProjectError: it is not, and nothing could be saved elsewhere yet.
+        """
+        with self._edit:
+            if self._store is not None:
+                self._store.check()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
         """Save one gesture as one step of undo. It is on disk when this returns.
@@ -123,9 +144,9 @@ class Project:
             step = Step(state.position + 1, _step_name(name), time.time())
             after = state.after(step, changed)
             known = _by_revision(after, figures or {})
-            with self._transaction() as connection:
-                journal.append(connection, step, changed)
-                journal.write_figures(connection, known)
+            store = self._writer()
+            script = journal.append(store.memory, step, changed, len(state.steps))
+            store.commit(journal.add_figures(store.memory, script, known))
             return self._saved(after.with_figures(known), "apply", step, changed.keys())
 
     def undo(self) -> Change | None:
@@ -160,8 +181,9 @@ class Project:
                 )
             if position == state.position:
                 return None
-            with self._transaction() as connection:
-                entries = journal.move(connection, state.position, position)
+            store = self._writer()
+            script, entries = journal.move(store.memory, state.position, position)
+            store.commit(script)
             back = position < state.position
             step = state.steps[position if back else position - 1]
             moved = replace(state.with_entries(entries), position=position)
@@ -186,8 +208,8 @@ class Project:
                 key: value for key, value in known.items() if _step_at(state, key[1]) == _step_at(self.state, key[1])
             }
             if known:
-                with self._transaction() as connection:
-                    journal.write_figures(connection, known)
+                store = self._writer()
+                store.commit(journal.add_figures(store.memory, journal.Script(), known))
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
@@ -204,8 +226,7 @@ class Project:
         """
         record = ExportRecord(time.time(), format, str(path), frames, json.dumps(settings, allow_nan=False))
         with self._edit:
-            with self._transaction() as connection:
-                journal.write_export(connection, record)
+            self._writer().commit(journal.add_export(record))
             self._saved(replace(self.state, exports=(*self.state.exports, record)), "export")
 
     def listen(self, listener: Callable[[Change], None]) -> Callable[[], None]:
@@ -223,15 +244,19 @@ class Project:
         return forget
 
     def close(self) -> None:
-        """Let others write. The state can still be read."""
+        """Let others write. The state can still be read.
+
+        Raises:
+            ProjectError: what was saved is nowhere on disk any more.
+        """
         with self._edit:
-            if self._connection is not None:
-                self._connection.close()
-                self._connection = None
+            if self._store is not None:
+                store, self._store = self._store, None
                 self.read_only_reason = "It was closed."
-            if self._writer is not None:
-                self._writer.release()
-                self._writer = None
+                try:
+                    store.close()
+                finally:
+                    self._path, self._incident = store.path, store.incident
 
     def __enter__(self) -> Self:
         return self
@@ -239,34 +264,21 @@ class Project:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _lock_or_explain(self) -> None:
-        lock_file = self.path.with_name(self.path.name + ".lock")
-        with database.errors_explained(self.path):
-            self._writer = WriterLock.acquire(lock_file)
-        if self._writer is None:
-            holder = WriterLock.holder(lock_file)
-            self.read_only_reason = f"It is open for writing elsewhere ({holder}). Close it there, then open it again."
+    def _opened(self, identity: SequenceIdentity) -> ProjectState:
+        with database.errors_explained(self._path):
+            if self.read_only_reason is not None:
+                return opening.read(self._path, identity)
+            opened = opening.open_or_begin(self._path, identity)
+        if isinstance(opened, opening.Writable):
+            self._store = opened.store
+        else:
+            self.read_only_reason = opened.reason
+        return opened.state
 
-    def _load(self, identity: SequenceIdentity) -> ProjectState:
-        if self._writer is not None and not self.path.exists():
-            database.create(self.path, identity)
-        # Everything is checked on a copy, so that a file that is refused stays as it is.
-        with closing(database.snapshot(self.path)) as copy, database.errors_explained(self.path):
-            state = journal.load(copy, self.path)
-        difference = state.identity.difference(identity)
-        if difference is not None:
-            raise ProjectError(
-                f"project {self.path} belongs to another sequence ({state.identity.name!r}, not {identity.name!r}): "
-                f"{difference}. Nothing was changed. Open it with its own sequence, or name another project file."
-            )
-        if self._writer is not None:
-            self._connection = database.connect(self.path)
-        return state
-
-    def _transaction(self) -> AbstractContextManager[sqlite3.Connection]:
-        if self._connection is None:
-            raise ProjectError(f"project {self.path} cannot be changed. {self.read_only_reason}")
-        return database.transaction(self._connection, self.path)
+    def _writer(self) -> Store:
+        if self._store is None:
+            raise ProjectError(f"project {self._path} cannot be changed. {self.read_only_reason}")
+        return self._store
 
     def _saved(
         self,

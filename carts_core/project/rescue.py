@@ -81,7 +81,7 @@ def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
                     if number in seen:
                         continue
                     seen.add(number)
-                    if sealed and digests.row_digest(table, row) != written or not _has_types(table, row):
+                    if (sealed and digests.row_digest(table, row) != written) or not _has_types(table, row):
                         rescued.lost.append(f"a row of {table}")
                     else:
                         yield tuple(row)

@@ -2,7 +2,6 @@
 
 import os
 import sqlite3
-import tempfile
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from ..errors import ProjectError
 from . import database, digests
 from .companions import LOG, beside, check_files, open_regular
-from .wal import drops_edits
+from .wal import played_back
 
 LARGEST = 768 * 2**20
 """What a project may have, its log included [bytes]; twice that is held while it is opened."""
@@ -34,11 +33,11 @@ class Copy:
 
     Attributes:
         connection: to it.
-        drops_edits: whether SQLite drops a part of the log that is no unfinished transaction.
+        fault: what was seen to be wrong with the files, for people; None if nothing was.
     """
 
     connection: sqlite3.Connection
-    drops_edits: bool
+    fault: str | None
 
 
 def read(path: Path) -> Content:
@@ -78,18 +77,19 @@ def open_copy(content: Content, path: Path) -> Copy:
 
     Raises:
         ProjectError: it is no project, or of a newer version of carts.
-        sqlite3.Error: SQLite cannot read it.
+        sqlite3.Error: SQLite cannot read it at all.
     """
-    main, drops = content.database, False
+    main = content.database
     if not main.startswith(_MAGIC) or len(main) < 512:
         raise database.not_a_project(path)
-    if content.log:
-        main, recovered = _with_log(content)
-        drops = drops_edits(content.log, recovered)
+    played = played_back(main, content.log)
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
-        patched = bytearray(main)
+        patched = played.database
         patched[_WRITE_VERSION] = b"\1\1"
+        # SQLite opens nothing that was cut off; with the rest empty it reads what is there.
+        missing = min(_promised(patched), LARGEST) - len(patched)
+        patched.extend(bytes(max(missing, 0)))
         memory.deserialize(patched)
         database.hardened(memory)
         database.check_version(memory, path)
@@ -97,7 +97,9 @@ def open_copy(content: Content, path: Path) -> Copy:
         memory.close()
         raise
     # Logs of older versions were used again without being emptied, so that old frames lie at their end.
-    return Copy(memory, drops and database.version(memory) >= database.SEALED)
+    drops = played.damaged and database.version(memory) >= database.SEALED
+    fault = "the last edits in its log (-wal) cannot be read" if drops else None
+    return Copy(memory, f"{missing} bytes at its end are missing" if missing > 0 else fault)
 
 
 def check(copy: Copy) -> None:
@@ -107,14 +109,14 @@ def check(copy: Copy) -> None:
         DamagedProject, sqlite3.Error: it is not.
     """
     memory = copy.connection
+    if copy.fault is not None:
+        raise database.DamagedProject(copy.fault)
     pages = memory.execute("PRAGMA page_count").fetchone()[0]
     with database.time_limit(memory, 5.0 + pages / 5_000):
         database.check_schema(memory)
         found = memory.execute("PRAGMA integrity_check(3)").fetchall()
     if found != [("ok",)]:
         raise database.DamagedProject("; ".join(str(row[0]) for row in found)[:300])
-    if copy.drops_edits:
-        raise database.DamagedProject("the last edits in its log (-wal) cannot be read")
 
 
 def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
@@ -130,6 +132,12 @@ def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
         return None
 
 
+def _promised(main: bytearray) -> int:
+    """How many bytes a database has, as its header says."""
+    size = int.from_bytes(main[16:18], "big")
+    return int.from_bytes(main[28:32], "big") * (65536 if size == 1 else size)
+
+
 def _content(descriptor: int, path: Path) -> bytes:
     size = os.fstat(descriptor).st_size
     if size > LARGEST:
@@ -138,17 +146,3 @@ def _content(descriptor: int, path: Path) -> bytes:
     while len(part := os.pread(descriptor, 1 << 26, sum(map(len, parts)))):
         parts.append(part)
     return b"".join(parts)
-
-
-def _with_log(content: Content) -> tuple[bytes, int]:
-    """The database with its log played back, and how many frames of the log SQLite took."""
-    with tempfile.TemporaryDirectory(prefix="carts-") as folder:
-        path = Path(folder) / "copy.carts"
-        path.write_bytes(content.database)
-        beside(path, LOG).write_bytes(content.log)
-        with closing(sqlite3.connect(f"{path.as_uri()}?vfs=unix-none", uri=True, isolation_level=None)) as connection:
-            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            connection.execute("PRAGMA synchronous = OFF")
-            database.hardened(connection)
-            _, recovered, _ = connection.execute("PRAGMA wal_checkpoint(FULL)").fetchone()
-        return path.read_bytes(), max(recovered, 0)

@@ -13,13 +13,13 @@ _LISTED = 60
 
 
 class SavedPanel:
-    """Whether everything is saved, a banner where nothing is, and undo and redo, always at hand."""
+    """Whether everything is saved, a banner where it is not or in another file, and undo and redo, always at hand."""
 
     def __init__(self, page: Page, storage: Storage, emit: Emit) -> None:
         gui = page.server.gui
         self._storage = storage
-        if storage.notice is not None:
-            gui.add_html(f'<p class="carts-notice" role="status">{escaped(storage.notice)}</p>')
+        self._notice = gui.add_html("", visible=False)
+        self._noticed: str | None = None
         self._text = gui.add_html("")
         self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
         self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
@@ -29,8 +29,14 @@ class SavedPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the line and the buttons up to date."""
-        path = self._storage.project.path
-        if self._storage.notice is not None:
+        path, notice = self._storage.project.path, self._storage.notice
+        if notice != self._noticed:
+            self._noticed = notice
+            self._notice.visible = notice is not None
+            self._notice.content = f'<p class="carts-notice" role="status">{escaped(notice or "")}</p>'
+        if not self._storage.project.safe:
+            text = "<b>NOT SAVED</b>"
+        elif not self._storage.kept:
             text = "Not saved" if state.unsaved else escaped(path.name)
         elif state.unsaved:
             text = "Not saved yet …"

@@ -45,8 +45,9 @@ def test_a_closed_project_is_one_file(project: Project, project_path: Path) -> N
 
 
 def test_writes_wait_for_the_disk(project: Project) -> None:
-    assert project._connection is not None
-    assert project._connection.execute("PRAGMA synchronous").fetchone() == (2,), "2 is FULL"
+    assert project._store is not None
+    connection = project._store._usable()._usable()
+    assert connection.execute("PRAGMA synchronous").fetchone() == (2,), "2 is FULL"
 
 
 def test_the_file_can_be_read_with_plain_sql(project: Project, project_path: Path) -> None:
@@ -54,6 +55,7 @@ def test_the_file_can_be_read_with_plain_sql(project: Project, project_path: Pat
     project.apply("Accept", {Key.review(1): ACCEPTED})
     project.apply("Reject", {Key.review(1): Review(ReviewState.REJECTED)})
     project.undo()
+    project.close()
     query = "SELECT frame, name, json_extract(value, '$.joint_positions[1]') FROM current"
     assert rows(project_path, query + " WHERE kind = 'joints'") == [(1, "PSM2", 0.5)]
     assert rows(project_path, "SELECT json_extract(value, '$.state') FROM current WHERE kind = 'review'") == [
@@ -86,11 +88,11 @@ def test_a_second_opening_in_the_same_process_is_read_only_too(project: Project,
     project.apply("Reject", {Key.review(0): None})
 
 
-def test_a_link_to_a_project_is_the_same_project(project: Project, project_path: Path) -> None:
-    link = project_path.with_name("link.carts")
-    link.symlink_to(project_path)
-    with Project(IDENTITY, link) as second:
-        assert not second.writable
+def test_a_link_to_the_folder_of_a_project_leads_to_the_same_project(project: Project, project_path: Path) -> None:
+    link = project_path.parent / "link"
+    link.symlink_to(project_path.parent)
+    with Project(IDENTITY, link / project_path.name) as second:
+        assert not second.writable and second.path == project.path
 
 
 def test_the_project_lies_beside_its_sequence_which_is_never_written_to(

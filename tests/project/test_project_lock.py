@@ -1,51 +1,56 @@
 """The lock that lets one writer in."""
 
-import fcntl
 import os
+import socket
+import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from project_model import IDENTITY
 
-from carts_core.project.lock import WriterLock
+from carts_core.project import Key, Project, Review
+from carts_core.project.lock import holder, try_lock
 
-
-def test_one_at_a_time(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    first = WriterLock.acquire(path)
-    assert first is not None
-    assert WriterLock.acquire(path) is None
-    assert WriterLock.holder(path).startswith(f"process {os.getpid()} on ")
-    first.release()
-    assert not path.exists()
-    second = WriterLock.acquire(path)
-    assert second is not None
-    second.release()
+NOTE = {Key.review(0): Review(note="a")}
 
 
-def test_a_lock_file_that_was_left_behind_is_no_lock(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    path.write_text("process 1 on another machine")
-    lock = WriterLock.acquire(path)
-    assert lock is not None
-    lock.release()
+def test_one_at_a_time_and_the_next_when_the_first_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "project"
+    path.touch()
+    first, second = (os.open(path, os.O_RDWR) for _ in range(2))
+    assert try_lock(first) and not try_lock(second)
+    assert holder(path) == f"process {os.getpid()} on {socket.gethostname()}"
+    os.close(first)
+    assert try_lock(second)
+    os.close(second)
+    assert holder(path) == "another process"
 
 
-def test_a_lock_file_that_its_holder_removes_while_it_is_being_locked_is_no_lock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "lock"
-    holder = WriterLock.acquire(path)
-    assert holder is not None
-    flock, locked = fcntl.flock, []
+def test_the_lock_outlives_another_descriptor_of_the_file_that_is_closed(project: Project, project_path: Path) -> None:
+    project_path.read_bytes()
+    with Project(IDENTITY, project_path) as second:
+        assert not second.writable and "open for writing elsewhere" in (second.read_only_reason or "")
+    program = (
+        "import sys; from pathlib import Path; from project_model import IDENTITY;"
+        "from carts_core.project import Project; print(Project(IDENTITY, Path(sys.argv[1])).writable)"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    command = [sys.executable, "-c", program, str(project_path)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, timeout=60)
+    assert finished.stdout == "False\n"
 
-    def release_first(descriptor: int, operation: int) -> None:
-        if not locked:
-            holder.release()
-        flock(descriptor, operation)
-        locked.append(descriptor)
 
-    monkeypatch.setattr(fcntl, "flock", release_first)
-    second = WriterLock.acquire(path)
-    assert second is not None and len(locked) == 2, "the file that was removed was locked, so it is tried again"
-    assert WriterLock.acquire(path) is None, "the lock that counts is on the file under the name"
-    second.release()
+def test_there_is_no_lock_file_whose_loss_would_let_two_writers_in(project: Project, project_path: Path) -> None:
+    project.apply("Note", NOTE)
+    assert {path.name for path in project_path.parent.iterdir()} == {"small.carts", "small.carts-wal"}
+
+
+def test_other_programs_that_use_sqlite_cannot_write_meanwhile(project: Project, project_path: Path) -> None:
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        sqlite3.connect(project_path, timeout=0).execute("DELETE FROM steps")
+    project.apply("Note", NOTE)
+    project.close()
+    with sqlite3.connect(project_path, timeout=0) as connection:
+        assert connection.execute("SELECT count(*) FROM steps").fetchone() == (1,)

@@ -55,7 +55,7 @@ def test_a_file_that_may_not_be_written_is_an_error_when_it_is_opened(ordinary_u
     path = ordinary_user_folder / "small.carts"
     Project(IDENTITY, path).close()
     path.chmod(0o444)
-    with pytest.raises(ProjectError, match=r"readonly database. Name a file in a folder that you may write to"):
+    with pytest.raises(ProjectError, match=r"Permission denied. Name a file in a folder that you may write to"):
         Project(IDENTITY, path)
 
 
@@ -129,8 +129,10 @@ def test_a_damaged_project_is_a_clear_error(project_path: Path, damage: str) -> 
         joints = JointCorrection((0.0, 0.0), HAND)
         project.apply("Accept", {Key.review(0): ACCEPTED, Key.joints(0, "PSM2"): joints})
     edit_file(project_path, damage)
-    with pytest.raises(ProjectError, match=r"small\.carts is damaged: .* Go back to a copy of it"):
+    damaged = project_path.read_bytes()
+    with pytest.raises(ProjectError, match=r"small\.carts is damaged: .* It was not changed. .* Go back to a copy of"):
         Project(IDENTITY, project_path)
+    assert project_path.read_bytes() == damaged
 
 
 def test_a_file_that_was_cut_off_is_a_clear_error(project_path: Path) -> None:
@@ -138,5 +140,5 @@ def test_a_file_that_was_cut_off_is_a_clear_error(project_path: Path) -> None:
         for number in range(20):
             project.apply("Note", {Key.review(0): Review(note=f"{number} " + "long " * 1000)})
     project_path.write_bytes(project_path.read_bytes()[:8192])
-    with pytest.raises(ProjectError, match=r"malformed.*keep a copy"):
+    with pytest.raises(ProjectError, match=r"is damaged: .*It was not changed"):
         Project(IDENTITY, project_path)
