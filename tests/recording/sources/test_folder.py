@@ -1,0 +1,258 @@
+"""Images, tables and calibrations of nobody's format: guesses that are right, shown, and can be changed."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from recordings import SIZE, START, K, image, joints_at, pose_of, write_images
+from scipy.io import savemat
+
+from carts_core.cli import main
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.psm_kinematics import JOINT_NAMES, forward
+from carts_core.recording.importing import find, import_recording
+from carts_core.settings.importing import ImportOptions
+
+FRAMES = 5
+ROS_YAML = f"""image_width: {SIZE[0]}
+image_height: {SIZE[1]}
+camera_name: left
+camera_matrix: {{rows: 3, cols: 3, data: {K.reshape(-1).tolist()}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.02, 0, 0, 0]}}
+"""
+
+
+def write_csv(path: Path, header: list[str], rows: np.ndarray, delimiter: str = ",") -> None:
+    with path.open("w", newline="") as stream:
+        writer = csv.writer(stream, delimiter=delimiter)
+        writer.writerows([header, *rows.tolist()])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two cameras, joints in degrees and millimetres under names of their own, and a ROS calibration."""
+    source = tmp_path / "Recording {1}"
+    write_images(source / "imgs_left", FRAMES, "img_{:04d}.png")
+    write_images(source / "imgs_right", FRAMES, "img_{:04d}.png", "right")
+    q = joints_at(np.arange(FRAMES) / 10)
+    scaled = q * np.where(np.arange(6) == 2, 1e3, 180 / np.pi)
+    write_csv(
+        source / "log.csv",
+        ["image", *(f"Joint{n} [deg]" for n in range(1, 7))],
+        np.column_stack([range(FRAMES), scaled]),
+    )
+    (source / "left.yaml").write_text(ROS_YAML)
+    (source / "right.yaml").write_text(
+        ROS_YAML.replace("left", "right")
+        + "projection_matrix: {rows: 3, cols: 4, data: [110, 0, 47.5, -0.55, 0, 110, 35.5, 0, 0, 0, 1, 0]}\n"
+    )
+    return source
+
+
+def test_two_folders_a_table_in_degrees_and_ros_calibrations_need_no_word(folder, tmp_path, capsys):
+    main(["import", str(folder), "-o", str(tmp_path / "out")])
+    sequence = Sequence.open(tmp_path / "out/sequence.toml")
+    for index in range(FRAMES):
+        frame = sequence.frame(index)
+        assert np.abs(frame.measured["PSM1"][:6] - joints_at(index / 10)).max() < 1e-7
+    left, right = sequence.scene.cameras
+    assert left.intrinsics == pytest.approx((110, 110, 48, 36)) and left.distortion[:2] == (-0.1, 0.02)
+    assert right.T_camera_world[0, 3] == pytest.approx(-0.005)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "guessed: PSM1: angles are in deg, lengths in mm (change: --angle-unit, --length-unit)" in said
+    assert "guessed: left.yaml is the calibration of left" in said
+    assert "missing: PSM1: no base frame (hand-eye calibration)" in said
+
+
+def test_every_guess_can_be_changed(folder):
+    found = find(folder, ImportOptions(angle_unit="rad", length_unit="m", calibration={"left": folder / "right.yaml"}))
+    assert found.arms[0].values is not None and np.abs(found.arms[0].values).max() > 10
+    columns = {name: f"Joint{number} [deg]" for number, name in zip((2, 1, 3, 4, 5, 6), JOINT_NAMES, strict=True)}
+    swapped = find(folder, ImportOptions(columns=columns, arms={"PSM7": ""}))
+    assert swapped.arms[0].name == "PSM7" and swapped.arms[0].values is not None
+    assert swapped.arms[0].values[3, 1] == pytest.approx(joints_at(0.3)[0])
+    images = {"scope": "imgs_right"}
+    assert [camera.name for camera in find(folder, ImportOptions(images=images)).cameras] == ["scope"]
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path, unit):
+    factor = {"s": 1e-9, "ms": 1e-6, "us": 1e-3, "ns": 1}[unit]
+    write_images(tmp_path / "rec/left", FRAMES)
+    stamps = START + np.arange(-3, 60) * 10_000_000
+    times = [f"{stamp * factor:.9f}" if factor < 1 else str(stamp) for stamp in stamps]
+    rows = np.column_stack([times, joints_at((stamps - START) * 1e-9).astype(str)])
+    write_csv(tmp_path / "rec/psm.csv", ["stamp", *(f"PSM2_q{n}" for n in range(6))], rows)
+    frame_times = START + np.arange(FRAMES) * 100_000_000
+    write_csv(tmp_path / "rec/frames.csv", ["frame", "timestamp_ns"], np.column_stack([np.arange(FRAMES), frame_times]))
+    file, found = import_recording(tmp_path / "rec", tmp_path / "out")
+    assert any(f"are in {unit} (change: --clock)" in note.text for note in found.notes)
+    sequence = Sequence.open(file)
+    assert np.abs(sequence.frame(3).measured["PSM2"][:6] - joints_at(0.3)).max() < 1e-5
+
+
+def write_video(path: Path, frames: int, rate: int = 25) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        for number in range(frames):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image(number), "rgb24")))
+        container.mux(stream.encode())
+
+
+def test_a_video_with_another_clock_gets_a_guessed_offset_that_is_said(tmp_path):
+    (tmp_path / "rec").mkdir()
+    write_video(tmp_path / "rec/scope.mp4", 20)
+    times = np.arange(200) / 100
+    poses = np.array([pose_of(T) for T in forward(joints_at(times))])
+    header = ["time", *(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]
+    columns = {name: np.column_stack([1000 + times, poses])[:, index] for index, name in enumerate(header)}
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "rec/poses.parquet")
+    file, found = import_recording(tmp_path / "rec", tmp_path / "out")
+    assert found.time_offset == pytest.approx(1000.0)
+    assert any(note.kind == "guessed" and "clocks do not overlap" in note.text for note in found.notes)
+    assert np.abs(Sequence.open(file).frame(10).measured["PSM1"][:6] - joints_at(0.4)).max() < 1e-4
+
+
+def test_numpy_arrays_of_joint_states_are_read(tmp_path):
+    write_images(tmp_path / "rec/images", FRAMES)
+    q = joints_at(np.arange(FRAMES) / 10)
+    np.save(tmp_path / "rec/psm1_js.npy", np.stack([q, 0 * q, 0 * q], 1))
+    file, _ = import_recording(tmp_path / "rec", tmp_path / "out")
+    assert np.abs(Sequence.open(file).frame(4).measured["PSM1"][:6] - joints_at(0.4)).max() < 1e-7
+
+
+def opencv_yaml(path: Path) -> None:
+    numbers = ", ".join(map(str, K.reshape(-1)))
+    matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [{}]\n"
+    path.write_text(
+        f"%YAML:1.0\n---\nM1: {matrix.format(3, 3, numbers)}D1: {matrix.format(1, 5, '-0.1, 0.02, 0, 0, 0')}"
+        f"M2: {matrix.format(3, 3, numbers)}D2: {matrix.format(1, 5, '0, 0, 0, 0, 0')}"
+        f"R: {matrix.format(3, 3, '1, 0, 0, 0, 1, 0, 0, 0, 1')}T: {matrix.format(3, 1, '-5.0, 0, 0')}"
+    )
+
+
+def kalibr_yaml(path: Path) -> None:
+    path.write_text(
+        "cam0:\n  distortion_model: radtan\n  intrinsics: [110, 110, 47.5, 35.5]\n"
+        f"  distortion_coeffs: [-0.1, 0.02, 0, 0]\n  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
+        "cam1:\n  T_cn_cnm1: [[1, 0, 0, -0.005], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+        "  distortion_model: radtan\n"
+        f"  intrinsics: [110, 110, 47.5, 35.5]\n  distortion_coeffs: [0, 0, 0, 0]\n  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
+    )
+
+
+def matlab(path: Path) -> None:
+    one = K + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    first = {"IntrinsicMatrix": one.T, "RadialDistortion": [-0.1, 0.02], "TangentialDistortion": [0.0, 0.0]}
+    second = {**first, "RadialDistortion": [0.0, 0.0]}
+    pair = {"CameraParameters1": first, "CameraParameters2": second}
+    savemat(path, {"stereoParams": {**pair, "RotationOfCamera2": np.eye(3), "TranslationOfCamera2": [-5.0, 0, 0]}})
+
+
+def own_json(path: Path) -> None:
+    cameras = {side: {"K": K.tolist(), "distortion": [-0.1, 0.02, 0, 0, 0]} for side in ("left", "right")}
+    path.write_text(json.dumps({**cameras, "R": np.eye(3).tolist(), "T": [-0.005, 0, 0]}))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("stereo.yaml", opencv_yaml),
+        ("kalibr.yaml", kalibr_yaml),
+        ("stereo.mat", matlab),
+        ("calibration.json", own_json),
+    ],
+)
+def test_calibrations_of_other_programs_give_the_same_cameras(folder, name, write: Callable[[Path], None]):
+    for file in ("left.yaml", "right.yaml"):
+        (folder / file).unlink()
+    write(folder / name)
+    left, right = find(folder).cameras
+    assert left.intrinsics == pytest.approx((110, 110, 47.5, 35.5)) and left.pixel_center == 0.0
+    assert left.distortion[:2] == pytest.approx((-0.1, 0.02))
+    assert np.allclose(right.T_camera_world[:3, 3], [-0.005, 0, 0])
+
+
+def rewrite(name: str, old: str, new: str) -> Callable[[Path], None]:
+    def mutate(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new))
+
+    return mutate
+
+
+def shorten(folder: Path) -> None:
+    lines = (folder / "log.csv").read_text().splitlines()
+    (folder / "log.csv").write_text("\n".join(line.split(",", 1)[1] for line in lines[:4]))
+
+
+MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
+    "fewer rows than images": (shorten, {}, "has 5 images and log.csv has 3 rows.*--frame-rate"),
+    "ragged rows": (
+        lambda folder: (folder / "log.csv").write_text("a,b\n1\n"),
+        {"kinematics": Path("log.csv")},
+        "cells",
+    ),
+    "no joints": (rewrite("log.csv", "Joint", "Motor"), {"kinematics": Path("log.csv")}, "not recognized. Name them"),
+    "text in a cell": (rewrite("log.csv", "\n1.0,", "\n1.0,x"), {}, "cells that are no numbers"),
+    "empty table": (lambda folder: (folder / "log.csv").write_text(""), {"kinematics": Path("log.csv")}, "has no rows"),
+    "binary table": (
+        lambda f: (f / "log.csv").write_bytes(b"\xff\xfe"),
+        {"kinematics": Path("log.csv")},
+        "cannot be read",
+    ),
+    "missing table": (lambda folder: None, {"kinematics": Path("none.csv")}, "none.csv is missing"),
+    "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
+    "fisheye": (rewrite("left.yaml", "plumb_bob", "equidistant"), {}, "distortion model 'equidistant'"),
+    "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
+    "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
+    "other size": (rewrite("left.yaml", "image_height: 72", "image_height: 20"), {}, "another shape"),
+    "missing folder": (lambda folder: None, {"images": {"left": "nothing"}}, "nothing has no images"),
+    "cut image": (lambda f: (f / "imgs_left/img_0000.png").write_bytes(b"\x89PNG\r\n\x1a\n123"), {}, "damaged"),
+    "names without numbers": (lambda f: (f / "imgs_left/last.png").write_bytes(b""), {}, ""),
+    "no common frames": (
+        lambda f: [p.rename(p.with_name(f"img_9{p.name[4:]}")) for p in (f / "imgs_left").iterdir()],
+        {},
+        "every camera",
+    ),
+    "third camera": (lambda f: write_images(f / "left again", 2), {}, "not clear which camera is which"),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_broken_folder_is_an_error_in_words_and_leaves_nothing(folder, tmp_path, name):
+    mutate, options, message = MUTATIONS[name]
+    mutate(folder)
+    if not message:
+        assert len(find(folder).frame_ids) == FRAMES
+        return
+    with pytest.raises(CartsError, match=message):
+        import_recording(folder, tmp_path / "out", ImportOptions(**options))
+    assert [entry.name for entry in tmp_path.iterdir()] == [folder.name]
+
+
+def test_real_stereo_frames_given_as_a_folder_are_imported(shared_dir, tmp_path):
+    source = tmp_path / "rec"
+    source.mkdir()
+    for side in ("left", "right"):
+        (source / side).symlink_to(shared_dir / "data/dvrk_stereo" / side)
+    with (shared_dir / "data/dvrk_stereo/kinematics.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    values = np.array([[float(row[name]) for name in JOINT_NAMES] for row in rows])
+    scaled = np.column_stack([np.arange(1, 31), values * np.where(np.arange(6) == 2, 1e3, 180 / np.pi)])
+    write_csv(source / "angles.csv", ["picture_index", *(f"axis_{n}" for n in range(1, 7))], scaled)
+    columns = {name: f"axis_{number}" for number, name in enumerate(JOINT_NAMES, start=1)}
+    file, _ = import_recording(source, tmp_path / "out", ImportOptions(columns={**columns, "frame": "picture_index"}))
+    sequence = Sequence.open(file)
+    assert len(sequence) == 30 and len(sequence.scene.cameras) == 2
+    assert np.abs(sequence.frame(29).measured["PSM1"][:6] - values[29]).max() < 1e-8
