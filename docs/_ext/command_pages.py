@@ -9,7 +9,7 @@ import tyro
 
 from carts_core import cli
 
-WIDTH = 100
+WIDTH = 88
 """Columns of the help text."""
 
 

@@ -14,7 +14,7 @@ def example_pages() -> dict[str, str]:
     for path in sorted(EXAMPLES.glob("[0-9]*.py")):
         summary, rest = _docstring(path)
         number, _, name = path.stem.partition("_")
-        title = f"{int(number)}. {name.replace('_', ' ').capitalize()}"
+        title = f"{int(number)}. {_title(name)}"
         picture = f"../../images/examples/{path.stem}.jpg"
         pages[f"{path.stem}.md"] = "\n\n".join(
             [
@@ -44,11 +44,19 @@ def _gallery(cards: list[str], pages: list[str]) -> str:
     )
 
 
+def _title(name: str) -> str:
+    """A file's name as a title."""
+    words = name.replace("_", " ").capitalize()
+    return words.replace("papers", "paper's").replace("urdf", "URDF")
+
+
 def _docstring(path: Path) -> tuple[str, str]:
     """The first paragraph of a module's docstring, and the rest with its commands as code."""
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     summary, _, rest = text.partition("\n\n")
-    return " ".join(summary.split()), rest
+    return " ".join(summary.split()), re.sub(
+        r"^(python examples/.*)$", r"```console\n$ \1\n```", rest, flags=re.MULTILINE
+    )
 
 
 def _alternative(summary: str) -> str:

@@ -1,0 +1,111 @@
+"""The Dockerfile, as far as a machine without Docker can follow it."""
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def steps() -> list[tuple[str, str]]:
+    """Instruction and arguments of every step, continued lines joined."""
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    return [(line.split(maxsplit=1)[0], line.split(maxsplit=1)[1]) for line in lines]
+
+
+def arguments_of(instruction: str) -> list[str]:
+    return [arguments for name, arguments in steps() if name == instruction]
+
+
+def command() -> list[str]:
+    """What the container runs."""
+    (arguments,) = arguments_of("CMD")
+    return [part.strip().strip('"') for part in arguments.strip("[]").split(",")]
+
+
+def test_it_opens_one_port_as_a_user_without_rights_with_a_volume() -> None:
+    assert arguments_of("EXPOSE") == ["8080"] and command()[-2:] == ["--port", "8080"]
+    assert arguments_of("USER") == ["carts"] and steps()[-1][0] == "CMD"
+    (volume,) = arguments_of("VOLUME")
+    variables = dict(word.split("=", 1) for line in arguments_of("ENV") for word in line.split())
+    for name in ("CARTS_DATA", "CARTS_CACHE", "NUMBA_CACHE_DIR"):
+        assert variables[name].startswith(volume)
+
+
+def test_everything_that_is_copied_exists_and_is_sent_to_docker() -> None:
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    copied = {source for line in arguments_of("COPY") for source in line.split()[:-1]}
+    assert copied == sent and all((ROOT / source).exists() for source in copied)
+
+
+def test_what_is_installed_is_pinned_and_torch_is_the_build_without_cuda() -> None:
+    installs = [line for line in arguments_of("RUN") if line.startswith("pip ")]
+    assert len(installs) == 2 and all("-c constraints.txt" in line for line in installs)
+    assert "https://download.pytorch.org/whl/cpu" in installs[0] and installs[0].endswith(" torch")
+
+
+def follow(folder: Path, environment: dict[str, str], variables: Path) -> None:
+    """Do what the steps say, in `folder` in place of the image, as the present user."""
+    (folder / "image").mkdir()
+    for instruction, arguments in steps():
+        if instruction == "COPY":
+            *sources, target = arguments.split()
+            for source in sources:
+                place = folder / "image" / (source if target == "./" else target)
+                copy = shutil.copytree if (ROOT / source).is_dir() else shutil.copy
+                copy(ROOT / source, place)
+        elif instruction == "ENV":
+            pairs = (word.split("=", 1) for word in arguments.split())
+            environment |= {name: re.sub(r"^/data", str(variables), value) for name, value in pairs}
+        elif instruction == "RUN" and arguments.startswith("pip "):
+            subprocess.run(shlex.split(arguments), cwd=folder / "image", env=environment, check=True, timeout=280)
+
+
+def status(address: str) -> int:
+    try:
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+@pytest.mark.slow
+def test_its_steps_install_a_command_that_starts_and_asks_for_the_token(tmp_path: Path) -> None:
+    """Packages of the present environment count as installed, so that no gigabytes are fetched."""
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=120)
+    (site_packages,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "CARTS_", "XDG_"))}
+    environment = kept | {"PATH": f"{tmp_path / 'venv' / 'bin'}:{os.environ['PATH']}", "HOME": str(tmp_path)}
+    data = tmp_path / "data"
+    data.mkdir()
+    follow(tmp_path, environment, data)
+
+    program = tmp_path / "venv" / "bin" / "carts"
+    assert str(tmp_path) in program.read_text().splitlines()[0]
+    arguments = [*command()[1:-1], "0"]
+    with subprocess.Popen(
+        [program, *arguments], cwd=data, env=environment, stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        lines = (line for line in server.stdout if "http://" in line)
+        (address,) = re.findall(r"http://\S+", next(lines))
+        port = re.findall(r":(\d+)/", address)[0]
+        token = address.partition("?token=")[2]
+        assert len(token) > 20
+        assert status(f"http://127.0.0.1:{port}/") == 403
+        assert status(f"http://127.0.0.1:{port}/?token={token}") == 200
+        server.send_signal(signal.SIGINT)
+        assert server.wait(60) in (0, 130)
+    assert list(data.glob("*.carts")) or list(data.rglob("*.carts"))

@@ -1,0 +1,105 @@
+"""Every command and Python block of the documentation runs, with an empty HOME and relative paths, from elsewhere."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+from doc_blocks import ROOT, Block, all_blocks, blocks
+
+RUNNABLE = {"python", "console", "bash"}
+TESTED_ELSEWHERE = {"toml", "sql"}
+"""By test_sequence_format_docs.py and test_project_docs.py."""
+NO_PROGRAMS = {"json", "text", ""}
+SLOW = {"docs/howto/calibration.md", "docs/howto/sequences.md", "docs/reference/sequence_format.md"}
+SECONDS = 280
+
+TO_RUN = {
+    page: list(group)
+    for page, group in groupby(
+        (block for block in all_blocks() if block.language in RUNNABLE and block.reason is None),
+        key=lambda block: block.page,
+    )
+}
+
+
+@pytest.fixture
+def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, dict[str, str]]:
+    """A folder with what pages speak of, and the environment of somebody who has never used CaRTS."""
+    recording = tiny_sequence(edit=lambda text: text.replace('name = "tiny"', 'name = "NAME"')).parent
+    shutil.copytree(recording, tmp_path / "desk", ignore=shutil.ignore_patterns("desk", "home"))
+    desk = tmp_path / "desk"
+    shutil.copytree(ROOT / "sample_data", desk / "sample_data")
+    (desk / "path").mkdir()
+    (desk / "path" / "to").symlink_to(desk)
+    home = tmp_path / "home"
+    home.mkdir()
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "CARTS_"))}
+    return desk, kept | {"HOME": str(home), "PYTHONPATH": str(ROOT)}
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in TO_RUN]
+)
+def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]) -> None:
+    desk, environment = reader
+    todo = [
+        [str(block), block.language, block.text if block.language == "python" else block.commands()]
+        for block in TO_RUN[page]
+    ]
+    finished = subprocess.run(
+        [sys.executable, str(ROOT / "tests" / "run_doc_blocks.py")],
+        input=json.dumps(todo),
+        cwd=desk,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=SECONDS,
+    )
+    assert finished.returncode == 0, f"{finished.stdout[-2000:]}\n{finished.stderr[-4000:]}"
+    assert finished.stdout.count("--- ") == len(todo)
+
+
+def test_every_block_is_run_marked_or_tested_elsewhere() -> None:
+    known = RUNNABLE | TESTED_ELSEWHERE | NO_PROGRAMS
+    strange = [block for block in all_blocks() if block.language not in known and not block.language.startswith("{")]
+    assert not strange, f"of which language are these? {', '.join(map(str, strange))}"
+    assert {"README.md", "docs/tutorial/python.md", "docs/howto/exports.md"} <= set(TO_RUN)
+
+
+def test_a_mark_holds_for_the_next_block_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("doc_blocks.ROOT", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(
+        "Text\n\n<!-- not run: needs a GPU -->\n    carts view \\\n        there  # a remark\n\n"
+        "Then\n\n    carts render it\n\n```python\nprint(1)\n```\n\n    no program\n"
+    )
+    found = blocks(page)
+    assert found == [
+        Block("page.md", 4, "console", "carts view \\\n    there  # a remark", "needs a GPU"),
+        Block("page.md", 9, "console", "carts render it", None),
+        Block("page.md", 11, "python", "print(1)", None),
+    ]
+    assert found[0].commands() == ["carts view      there"]
+
+
+def test_a_block_that_fails_fails_the_test(reader: tuple[Path, dict[str, str]]) -> None:
+    desk, environment = reader
+    for language, content in (("console", ["carts render missing.toml"]), ("python", "1 / 0")):
+        finished = subprocess.run(
+            [sys.executable, str(ROOT / "tests" / "run_doc_blocks.py")],
+            input=json.dumps([["page:1", language, content]]),
+            cwd=desk,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=SECONDS,
+        )
+        assert finished.returncode != 0 and ("missing.toml" in finished.stderr or "page:1" in finished.stderr)
