@@ -4,6 +4,7 @@ python examples/09_batch.py [SEQUENCE.toml ...] [--frames 1] [--domains regular 
 """
 
 import csv
+import math
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -55,9 +56,11 @@ def main(
     figure = Figure((6.4, 1.4 + 0.4 * len(scores)), layout="constrained")
     axes = figure.subplots()
     for row, (_, score) in enumerate(scores):
-        axes.plot([score.dice_before, score.dice_after], [row, row], color="lightgray", zorder=0)
-        axes.scatter(score.dice_before, row, color="tab:orange", label="" if row else "2 degrees off")
-        axes.scatter(score.dice_after, row, color="tab:blue", label="" if row else "corrected")
+        # There is none where a sequence has no masks.
+        before, after = score.dice_before or math.nan, score.dice_after or math.nan
+        axes.plot([before, after], [row, row], color="lightgray", zorder=0)
+        axes.scatter(before, row, color="tab:orange", label="" if row else "2 degrees off")
+        axes.scatter(after, row, color="tab:blue", label="" if row else "corrected")
     axes.set_yticks(range(len(scores)), [f"{score.domain} {score.frame}" for _, score in scores])
     axes.margins(y=0.4)
     axes.set_xlabel("Dice")

@@ -1,7 +1,7 @@
 """Run blocks of one page of the documentation one after the other, as a reader would; see tests/test_doc_blocks.py.
 
 Reads a JSON list of [place, language, text or commands] from the standard input. All blocks share one process, which
-saves starting torch anew for each; every Python block has a namespace of its own.
+saves starting torch anew for each, and Python blocks go on where the one before ended.
 """
 
 import json
@@ -10,8 +10,6 @@ import signal
 import subprocess
 import sys
 import urllib.request
-
-from carts_core import cli
 
 SERVER_SECONDS = 240
 
@@ -24,6 +22,8 @@ def run_command(command: str) -> None:
     if arguments[:1] == ["view"]:
         serve(arguments)
         return
+    from carts_core import cli  # noqa: PLC0415  pages without commands do without it
+
     try:
         cli.main(arguments)
     except SystemExit as end:
@@ -49,10 +49,11 @@ def serve(arguments: list[str]) -> None:
 
 def main() -> None:
     """Run every block; the first failure ends it with a message or a traceback that names the place."""
+    namespace = {"__name__": "__main__"}
     for place, language, content in json.load(sys.stdin):
         print(f"--- {place}", flush=True)
         if language == "python":
-            exec(compile(content, place, "exec"), {"__name__": "__main__"})
+            exec(compile(content, place, "exec"), namespace)
         else:
             for command in content:
                 print(f"$ {command}", flush=True)

@@ -16,7 +16,12 @@ RUNNABLE = {"python", "console", "bash"}
 TESTED_ELSEWHERE = {"toml", "sql"}
 """By test_sequence_format_docs.py and test_project_docs.py."""
 NO_PROGRAMS = {"json", "text", ""}
-SLOW = {"docs/howto/calibration.md", "docs/howto/sequences.md", "docs/reference/sequence_format.md"}
+SLOW = {
+    "docs/howto/calibration.md",
+    "docs/howto/exports.md",
+    "docs/howto/sequences.md",
+    "docs/reference/sequence_format.md",
+}
 SECONDS = 280
 
 TO_RUN = {
@@ -40,7 +45,8 @@ def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, di
     home = tmp_path / "home"
     home.mkdir()
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "CARTS_"))}
-    return desk, kept | {"HOME": str(home), "PYTHONPATH": str(ROOT)}
+    # One thread: tests run side by side, and threads that wait for each other take many times longer then.
+    return desk, kept | {"HOME": str(home), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
 
 @pytest.mark.parametrize(
