@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import (
+    Backgrounds,
     FrameEstimate,
     FrameOptimizer,
     FreeParameters,
@@ -99,8 +100,7 @@ class OptimizerFactory:
         extractor = self.prepare()
         self._report("Preparing the frame")
         frame = sequence.frame(index, domain, list(cameras))
-        seen = cameras if settings.needs_background else ()
-        backgrounds = {camera: sequence.background(camera, domain) for camera in seen}
+        backgrounds = Backgrounds.of(sequence, cameras, domain, required=settings.needs_background)
         scene = scene_at(sequence.scene, pose.scene)
         start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
         return FrameOptimizer(
@@ -159,6 +159,7 @@ class OptimizerFactory:
             free=free,
             keyframes=keyframes,
             ignore=ignore,
+            backgrounds=Backgrounds.of(sequence, cameras, domain),
             cameras=list(cameras),
         )
         used = {

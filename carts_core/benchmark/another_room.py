@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from ..data import Frame, Sequence
-from ..data.background import estimate_background, spread, widen
-from ..rendering import Renderer
+from ..data import Frame, MeanBackground, Sequence, background_of_recording
+from ..data.background import spread
 from .rooms import Room
 
 _PARALLAX = 24
@@ -83,7 +82,11 @@ class AnotherRoom:
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """The mean background, estimated from the recording in the room."""
-        return self._background(domain or next(iter(self.rooms)), camera).copy()
+        return self.mean_background(camera, domain).image.copy()
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known."""
+        return self._background(domain or next(iter(self.rooms)), camera)
 
     def _make_picture(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         known = self.scene.with_cameras([camera]).cameras[0]
@@ -91,12 +94,11 @@ class AnotherRoom:
         wide = self.rooms[room].draw(known.width + _PARALLAX * (len(self._cameras) - 1), known.height)
         return np.ascontiguousarray(wide[:, left : left + known.width])
 
-    def _make_background(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        renderer = Renderer(self.scene, cameras=[camera])
-        frames = (self.frame(index, room, [camera]) for index in spread(len(self)))
-        return estimate_background(
-            (frame.images[camera], widen(renderer.segment(self.scene.state(frame.measured))[0] >= 0))
-            for frame in frames
+    def _make_background(self, room: str, camera: str) -> MeanBackground:
+        indices = spread(len(self))
+        measured = [self._sequence.frame(index, cameras=()).measured for index in indices]
+        return background_of_recording(
+            self.scene, camera, measured, lambda place: self.frame(indices[place], room, [camera]).images[camera]
         )
 
     def _photographed(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ..data import Frame, Sequence
+from ..data import Frame, MeanBackground, Sequence
 from ..data.background import spread
 from ..settings import DOMAINS, DomainConfig, SensorConfig, SynthesisConfig
 from ..synthesis.blood import Bleeding
@@ -87,6 +87,11 @@ class Counterfactual:
             ]
             self._backgrounds[domain] = np.rint(np.mean(moments, axis=0)).astype(np.uint8)
         return self._backgrounds[domain]
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known."""
+        regular = self._sequence.mean_background(camera)
+        return dataclasses.replace(regular, image=self.background(camera, domain))
 
     def _time(self, index: int) -> float:
         times = self._sequence.timestamps

@@ -13,7 +13,7 @@ from ..data import Frame
 from ..evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ..features.extractor import FeatureExtractor
 from ..keypoints import keypoints
-from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, OptimizerSettings
 from ..optimization.observability import Uncertainty
 from ..perturbation import perturb
 from ..rendering import Renderer
@@ -150,7 +150,7 @@ def optimize(
     run: Run,
     scene: Scene,
     frame: Frame,
-    background: dict[str, UInt8[np.ndarray, "h w 3"]],
+    backgrounds: Backgrounds,
     extractor: FeatureExtractor,
     settings: OptimizerSettings,
     free: FreeParameters,
@@ -164,7 +164,7 @@ def optimize(
         run: which.
         scene: with the cameras that take part.
         frame: its images and kinematics.
-        background: camera name -> mean background.
+        backgrounds: of these cameras.
         extractor: the feature network.
         settings: of the method.
         free: what is unknown.
@@ -175,7 +175,7 @@ def optimize(
     start = start_of(scene, frame, run, truth.measured_joints)
     began = time.perf_counter()
     optimizer = FrameOptimizer(
-        scene, frame, background, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False
+        scene, frame, backgrounds, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False
     )
     seconds = time.perf_counter() - began
     trace: list[Score] = []

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, Time
 from ..console import Bar, PlainColumn
 from ..data import Frame
 from ..features.extractor import FeatureExtractor
-from ..optimization import FreeParameters
+from ..optimization import Backgrounds, FreeParameters
 from ..rendering import Renderer
 from ..scene import Scene
 from ..wording import counted
@@ -129,12 +129,13 @@ class _Bench:
         if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
         settings = method.settings(scope.steps(run))
-        background = {camera: recording.background(camera, run.domain)} if settings.needs_background else {}
+        domain = "regular" if covered else run.domain
+        backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
         ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
         scene = known.with_cameras(cameras)
         free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))
-        return optimize(run, scene, frame, background, extractor, settings, free, truth, renderer, ignore)
+        return optimize(run, scene, frame, backgrounds, extractor, settings, free, truth, renderer, ignore)
 
     def _truth(self, frame: Frame) -> Truth:
         recording, _ = self._open()

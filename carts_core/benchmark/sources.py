@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..data import Frame, Sequence
+from ..data import Frame, MeanBackground, Sequence
 from ..data.background import spread
 from ..errors import SettingsError
 from ..files import holds_file, output_path
@@ -51,6 +51,10 @@ class Recording(Protocol):
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """The mean background in a domain."""
+        ...
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known."""
         ...
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from ..data import Frame
 from ..data.background import spread
 from ..features.extractor import FeatureExtractor
-from ..optimization import CalibrationOptimizer, SequenceOptimizer
+from ..optimization import Backgrounds, CalibrationOptimizer, SequenceOptimizer
 from ..rendering import Renderer
 from ..scene import Scene
 from .frame import Truth, start_of
@@ -60,6 +60,7 @@ def correct_together(
         frame_at,
         {index: None if stamps is None else float(stamps[index]) for index in by_frame},
         extractor,
+        backgrounds=Backgrounds.of(recording, cameras, domain),
     )
     for _ in optimizer:
         pass

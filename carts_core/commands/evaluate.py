@@ -51,6 +51,7 @@ class Evaluate:
         from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
         from ..features.extractor import FeatureExtractor
         from ..files import write_text
+        from ..optimization import Backgrounds
         from .hints import base_frame_hint, kept_start_hint, print_hints
         from .score_table import score_table
 
@@ -85,6 +86,10 @@ class Evaluate:
                 kept_start_hint(where, [score.stopped for score in seen]),
                 base_frame_hint(where, [score.base_frame_gain for score in seen]),
             )
+        required = self.optimizer.needs_background
+        for group in camera_groups(cameras, self.together):
+            for domain in domains:
+                print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:
             write_text(self.json, json.dumps(to_json(scores), indent=1))
             console.print(f"wrote {self.json}")

@@ -12,7 +12,7 @@ from ..data import Sequence
 from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
 from ..features.extractor import FeatureExtractor
-from ..optimization import FrameOptimizer, SequenceOptimizer
+from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer
 from ..optimization.parameters import ParameterVector
 from ..wording import counted
 from .frame_folder import FrameFolder
@@ -91,15 +91,16 @@ class Optimizing:
 
     def _each_alone(self, todo: list[int], part: _Part) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
-        needed = todo and asked.optimizer.needs_background
-        background = {camera: sequence.background(camera, domain) for camera in cameras} if needed else {}
+        if not todo:
+            return
+        backgrounds = Backgrounds.of(sequence, cameras, domain, required=asked.optimizer.needs_background)
         stopped, gains = [], []
         for index in track(todo, part.name, console=self._console, disable=not todo):
             frame = sequence.frame(index, domain, cameras)
             optimizer = FrameOptimizer(
                 sequence.scene,
                 frame,
-                background,
+                backgrounds,
                 self._extractor,
                 start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
                 settings=asked.optimizer,
@@ -115,10 +116,16 @@ class Optimizing:
             part.output.write([(row, best.state)])
             stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
-        print_hints(self._console, kept_start_hint(part.name, stopped), base_frame_hint(part.name, gains))
+        print_hints(
+            self._console,
+            kept_start_hint(part.name, stopped),
+            base_frame_hint(part.name, gains),
+            *backgrounds.problems,
+        )
 
     def _as_sequence(self, part: _Part) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
+        backgrounds = Backgrounds.of(sequence, cameras, part.domain)
         starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
         optimizer = SequenceOptimizer(
             sequence.scene,
@@ -129,6 +136,7 @@ class Optimizing:
             model=asked.model,
             free=asked.free,
             keyframes=self._keyframes,
+            backgrounds=backgrounds,
             cameras=cameras,
         )
         try:

@@ -1,12 +1,16 @@
 """The mean background BG_m of the paper, estimated from a recording when it is not given."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
+from ..rendering import Renderer
+from ..scene import Scene
 
 FRAMES = 30
 """How many frames, spread evenly over the recording, the estimate looks at."""
@@ -14,8 +18,25 @@ FRAMES = 30
 MARGIN = 15 / 640
 """How far round an arm's silhouette pixels are not trusted, as a share of the image's width."""
 
+_LARGEST_ERROR = 3
+"""Where measured arms are farther away than so many margins, there is none [1]."""
+
+_STAYS = 0.4
+"""Share of an arm's silhouette that is covered throughout a recording, from which it hardly moves [1]."""
+
 _COVERED = 256
 _ROWS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class MeanBackground:
+    """The mean background BG_m of a camera, and how far it is one."""
+
+    image: UInt8[np.ndarray, "height width 3"]
+    known: Bool[np.ndarray, "height width"]
+    """Where it certainly shows no arm, measured kinematics being off as they may be."""
+    problem: str | None = None
+    """Why it cannot say what is there without arms, for people; None where it can."""
 
 
 def spread(length: int, count: int = FRAMES) -> list[int]:
@@ -23,11 +44,47 @@ def spread(length: int, count: int = FRAMES) -> list[int]:
     return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
 
 
-def widen(silhouette: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """A silhouette with the margin that measured kinematics are off by."""
-    radius = max(1, round(MARGIN * silhouette.shape[1]))
+def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Bool[np.ndarray, "height width"]:
+    """A silhouette with the margin that measured kinematics are off by, or several of them."""
+    radius = max(1, round(margins * MARGIN * silhouette.shape[1]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return cv2.dilate(silhouette.astype(np.uint8), disc).astype(bool)
+
+
+def background_of_recording(
+    scene: Scene,
+    camera: str,
+    measured: Items[Mapping[str, np.ndarray]],
+    image: Callable[[int], UInt8[np.ndarray, "height width 3"]],
+) -> MeanBackground:
+    """The mean background of a recording: see `estimate_background`.
+
+    A pixel of it is known where most of the views that it is the median of have the arms far away.
+
+    Args:
+        scene: with that camera and others.
+        camera: its name.
+        measured: arm -> joint positions, of each frame that is looked at.
+        image: of the frame at a place in `measured`.
+
+    Raises:
+        SequenceError: the whole image is covered in every view.
+    """
+    renderer = Renderer(scene, cameras=[camera])
+    arms = [renderer.segment(scene.state(positions))[0] >= 0 for positions in measured]
+    covers = [widen(silhouette) for silhouette in arms]
+    clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
+    used = len(arms) - np.sum(covers, axis=0)
+    estimate = estimate_background((image(place), cover) for place, cover in enumerate(covers))
+    always, usually = (used == 0).sum(), np.mean([cover.sum() for cover in covers])
+    problem = None
+    if always > _STAYS * usually:
+        problem = (
+            f"camera {camera!r}: what is behind the arms is not known, since they hardly move in {len(arms)} views; "
+            "what looks like an arm in the background cannot be told from one. A `background` image in the sequence "
+            "file, taken without arms, helps."
+        )
+    return MeanBackground(estimate, 2 * clear > used, problem)
 
 
 def estimate_background(

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..errors import SequenceError
-from ..rendering import Renderer
 from ..scene import Scene
 from ..wording import counted
-from .background import estimate_background, spread, widen
+from .background import MeanBackground, background_of_recording, spread
 from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
@@ -76,7 +75,7 @@ class Sequence:
         self._description = description
         self._cameras = description.cameras
         self._cache = ByteCache(CACHE_BYTES)
-        self._backgrounds: dict[tuple[str, str], np.ndarray] = {}
+        self._backgrounds: dict[tuple[str, str], MeanBackground] = {}
         self._background_lock = threading.Lock()
 
     @staticmethod
@@ -160,30 +159,29 @@ class Sequence:
         Raises:
             SequenceError: there is no such domain or camera, or an image is not usable.
         """
+        return self.mean_background(camera, domain).image.copy()
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known, and whether it tells what is there without arms; errors as `background`."""
         domain = self._domain(domain)
         entry = self._camera(camera)
         with self._background_lock:
             if (camera, domain) not in self._backgrounds:
                 self._backgrounds[camera, domain] = self._make_background(entry, domain)
-            return self._backgrounds[camera, domain].copy()
+            return self._backgrounds[camera, domain]
 
-    def _make_background(self, entry: CameraInput, domain: str) -> np.ndarray:
+    def _make_background(self, entry: CameraInput, domain: str) -> MeanBackground:
         camera = entry.camera
         if domain in entry.background:
             path = entry.background[domain]
             image = read_image(path)
             self._check_size(image, camera.name, f"background {path}")
-            return camera.undistort(image)
-        renderer = Renderer(self.scene, width=camera.width, height=camera.height, cameras=[camera.name])
+            return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
         indices = spread(len(self))
-        arm_ids = (
-            renderer.segment(self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}))[0]
-            for index in indices
-        )
+        measured = [{arm: rows[index] for arm, rows in self.measured.items()} for index in indices]
         try:
-            return estimate_background(
-                (self._image(camera.name, domain, index), widen(ids >= 0))
-                for index, ids in zip(indices, arm_ids, strict=True)
+            return background_of_recording(
+                self.scene, camera.name, measured, lambda place: self._image(camera.name, domain, indices[place])
             )
         except SequenceError as error:
             raise SequenceError(f"{self.path}: camera {camera.name!r}: {error}") from error

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, OptimizerSettings
 from ..perturbation import perturb
 from ..rendering import Renderer
 from ..scene import SceneState
@@ -69,8 +69,7 @@ def evaluate(
         for group in camera_groups(cameras, together):
             scene = sequence.scene.with_cameras(group)
             renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-            seen = group if settings.needs_background else ()
-            backgrounds = {camera: sequence.background(camera, domain) for camera in seen}
+            backgrounds = Backgrounds.of(sequence, group, domain, required=settings.needs_background)
             for index in frames:
                 frame = sequence.frame(index, domain, list(group))
                 start = start_positions(sequence, frame, perturb_deg, seed)

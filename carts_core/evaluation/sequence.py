@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
+from ..optimization import Backgrounds, FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
 from ..rendering import Renderer
 from .evaluate import FrameScore, camera_groups, frame_score, start_positions
 
@@ -43,6 +43,7 @@ def evaluate_sequence(
                 settings=settings,
                 model=model,
                 free=free,
+                backgrounds=Backgrounds.of(sequence, group, domain),
             )
             for _ in optimizer:
                 pass

@@ -9,6 +9,7 @@ from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
+from .counterfactual import Backgrounds as Backgrounds
 from .frame import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
@@ -21,6 +22,7 @@ __all__ = [
     "BASE_FRAME_GAIN",
     "CALIBRATION",
     "CALIBRATION_SETTINGS",
+    "Backgrounds",
     "CalibrationIterate",
     "CalibrationOptimizer",
     "CalibrationResult",

@@ -13,6 +13,7 @@ from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, OptimizerSettings
+from .counterfactual import Backgrounds
 from .edges import EdgeRefinement
 from .evaluation import Evaluation, Objective
 from .feature_objective import FeatureObjective
@@ -83,7 +84,8 @@ class FrameOptimizer:
     Args:
         scene: arms and cameras.
         frame: observed images and measured joint positions.
-        backgrounds: camera name -> mean background BG_m; the loss `surface` needs none.
+        backgrounds: camera name -> mean background BG_m. The loss `surface` takes what looks like an arm in them for
+            none, and goes without where one is missing; `Backgrounds` that serve several frames save it time.
         extractor: the feature network.
         ignore: camera name -> pixels that show an occluder; the loss `surface` leaves them out.
         start: arm name -> joint positions to start from, the measured ones by default.
@@ -102,7 +104,7 @@ class FrameOptimizer:
         self,
         scene: Scene,
         frame: Frame,
-        backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]] | Backgrounds,
         extractor: FeatureExtractor,
         *,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
@@ -121,16 +123,26 @@ class FrameOptimizer:
         self._parameters = ParameterVector(scene, state, self._free, self.settings.lever)
         self._scene, self._images, self._extractor, self._given = scene, frame.images, extractor, ignore or {}
         self._live = live
+        self._backgrounds = backgrounds if isinstance(backgrounds, Backgrounds) else Backgrounds(backgrounds)
         self._first: Objective
         if self.settings.loss == "surface":
             self._first = self._surface(self._given)
         else:
-            self._first = FeatureObjective(scene, frame.images, backgrounds, extractor, self._parameters, self.settings)
+            self._first = FeatureObjective(
+                scene, frame.images, self._backgrounds.images, extractor, self._parameters, self.settings
+            )
         self.reset()
 
     def _surface(self, ignore: Mapping[str, Bool[np.ndarray, "h w"]]) -> SurfaceObjective:
         return SurfaceObjective(
-            self._scene, self._images, self._extractor, self._parameters, self.settings, ignore, live=self._live
+            self._scene,
+            self._images,
+            self._extractor,
+            self._parameters,
+            self.settings,
+            ignore,
+            backgrounds=self._backgrounds,
+            live=self._live,
         )
 
     def reset(self) -> None:

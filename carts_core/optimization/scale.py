@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -11,6 +12,7 @@ from ..features.extractor import FeatureExtractor
 from ..rendering import Renderer
 from ..scene import Scene
 from ..settings import OptimizerSettings
+from .counterfactual import Backgrounds, without_background
 from .inputs import pixel_weights, stacked_images, working_size
 from .veil import certainty, transmission, unveiled
 
@@ -29,6 +31,8 @@ class Scale:
     """0 where an occluder is known to be, 1 elsewhere."""
     certainty: Float[Tensor, "cameras 1 h w"]
     """What a pixel tells, as a share of what it would tell without smoke and haze [1]."""
+    explained: Float[Tensor, "cameras 1 h w"] | None
+    """Share of what is seen of arms that the empty background shows as well [1]; None where that is not known."""
     whole: Renderer
     """Of the whole image."""
 
@@ -40,6 +44,7 @@ def scaled(
     zoom: float,
     settings: OptimizerSettings,
     extractor: FeatureExtractor,
+    backgrounds: Backgrounds | None = None,
 ) -> Scale:
     """Images at `zoom` times the working size, as far as the network's stride allows.
 
@@ -50,6 +55,7 @@ def scaled(
         zoom: times the working size [1].
         settings: working size, and how much of a veil is taken off.
         extractor: the networks.
+        backgrounds: of the cameras, where they are known.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -58,7 +64,14 @@ def scaled(
     unit, _ = working_size(scene, settings.working_width, extractor.stride)
     size = working_size(scene, round(settings.working_width * zoom), extractor.stride)
     stacked = stacked_images(scene, images, size, "image").to(device)
-    through = transmission(stacked, settings.unveil)
+    through, explained = transmission(stacked, settings.unveil), None
+    if backgrounds is not None and backgrounds.covers(scene):
+        background = backgrounds.at(scene, size, settings.unveil, extractor)
+        changed = background.changed(stacked, size[0] / unit)
+        if background.deceptive:
+            stacked, through = without_background(stacked, changed), torch.ones_like(through)
+        else:
+            explained = background.seen * (1.0 - changed)
     return Scale(
         zoom=size[0] / unit,
         size=size,
@@ -66,5 +79,6 @@ def scaled(
         weight=pixel_weights(scene, ignore, size).to(device),
         # Smoke, which the network has not seen, misleads it by more than noise does: measured, see docs/experiments.
         certainty=certainty(through).square(),
+        explained=explained,
         whole=Renderer(scene, width=size[0], height=size[1], device=device),
     )

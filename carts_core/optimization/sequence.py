@@ -20,6 +20,7 @@ from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
 from .beginning import best_beginning
+from .counterfactual import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, combined, news, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
@@ -84,6 +85,7 @@ class SequenceOptimizer:
         free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] that a person set.
         ignore: position -> camera name -> pixels that show an occluder; none by default.
+        backgrounds: of the cameras; what looks like an arm in them is taken for none.
         cameras: names of the cameras that take part, all by default.
 
     Raises:
@@ -104,6 +106,7 @@ class SequenceOptimizer:
         free: FreeParameters | None = None,
         keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
         ignore: Ignore | None = None,
+        backgrounds: Backgrounds | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
         self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
@@ -124,7 +127,9 @@ class SequenceOptimizer:
         strangers = set(self._keyframes) - set(self._gaps)
         if strangers:
             raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
-        self._eye = Eye(self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}))
+        self._eye = Eye(
+            self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}), backgrounds
+        )
         self._queue = list(self._gaps)
         self._told = self._shares()
         asked = {self._queue[place] for place in spread(len(self._queue), self.model.opinions)}

@@ -12,6 +12,7 @@ from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene
 from ..settings import OptimizerSettings
+from .counterfactual import Backgrounds
 from .edges import EdgeRefinement
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation, Objective
@@ -51,12 +52,20 @@ class Eye:
         settings: of a cold start; a warm one has its finest blur, one look and few steps.
         sight_noise: as `OptimizerSettings.noise`, for what a frame tells.
         ignore: position of a frame -> camera name -> pixels that show an occluder.
+        backgrounds: of the cameras, where they are known.
     """
 
     def __init__(
-        self, scene: Scene, extractor: FeatureExtractor, settings: OptimizerSettings, sight_noise: float, ignore: Ignore
+        self,
+        scene: Scene,
+        extractor: FeatureExtractor,
+        settings: OptimizerSettings,
+        sight_noise: float,
+        ignore: Ignore,
+        backgrounds: Backgrounds | None = None,
     ) -> None:
         self._scene, self._extractor, self._coarse, self._ignore = scene, extractor, settings, ignore
+        self._backgrounds = backgrounds
         self._share = (settings.noise / sight_noise) ** 2
         self._fine = replace(
             settings,
@@ -123,7 +132,16 @@ class Eye:
 
     def _objective(self, frame: Frame, parameters: ParameterVector, settings: OptimizerSettings) -> SurfaceObjective:
         ignore = self._ignore(frame.index)
-        return SurfaceObjective(self._scene, frame.images, self._extractor, parameters, settings, ignore, live=False)
+        return SurfaceObjective(
+            self._scene,
+            frame.images,
+            self._extractor,
+            parameters,
+            settings,
+            ignore,
+            backgrounds=self._backgrounds,
+            live=False,
+        )
 
 
 def _prior(expected: Gaussian, parameters: ParameterVector) -> Prior:

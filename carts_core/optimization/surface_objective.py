@@ -20,6 +20,7 @@ from ..settings import OptimizerSettings
 from ..surface import COVERAGE
 from ..threads import total
 from .comparison import Stage
+from .counterfactual import Backgrounds
 from .evaluation import Evaluation
 from .observability import uncertainty
 from .parameters import ParameterVector
@@ -97,6 +98,8 @@ class SurfaceObjective:
         parameters: the unknowns.
         settings: blurs, noise and prior.
         ignore: camera name -> pixels that show an occluder.
+        backgrounds: of the cameras; what the network also sees in them is no arm. Without them, or where one is
+            missing, all that it sees is believed.
         live: whether coarse stages are also rendered at the finest blur of their look, for someone who watches: losses
             compare through a look then, and maps are sharp. It takes a third more time and changes no step.
 
@@ -117,10 +120,11 @@ class SurfaceObjective:
         settings: OptimizerSettings,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
         *,
+        backgrounds: Backgrounds | None = None,
         live: bool = True,
     ) -> None:
         self.settings, self.parameters, self.scene, self._extractor = settings, parameters, scene, extractor
-        self._live = live
+        self._live, self._backgrounds = live, backgrounds
         coarse, fine = settings.blurs[:-_FINE], settings.blurs[-_FINE:]
         self._coarsest = coarse[:-1]
         first = int(settings.glance and len(self._coarsest) > 0)
@@ -165,7 +169,9 @@ class SurfaceObjective:
         if look < self.first_look:
             zoom = min(zoom, _GLANCE_ZOOM)
         if zoom not in self._scales:
-            self._scales[zoom] = scaled(self.scene, *self._given, zoom, self.settings, self._extractor)
+            self._scales[zoom] = scaled(
+                self.scene, *self._given, zoom, self.settings, self._extractor, self._backgrounds
+            )
         return self._scales[zoom]
 
     @property
@@ -314,6 +320,8 @@ class SurfaceObjective:
         reach = round(_ATTENTION[later] * scale.zoom)
         window = Window.around(believed[:, COVERAGE].sum(1), margin, self._extractor.stride, scale.size)
         observed = self._extractor.surface(window.of(scale.images), window.of(believed))
+        if scale.explained is not None:
+            observed = observed * (1.0 - window.of(scale.explained))
         silhouette = window.of((believed[:, COVERAGE].sum(1) > 0).to(believed))
         near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
         weight = window.of(scale.weight) * near[:, None]

@@ -258,7 +258,7 @@ def test_a_background_is_estimated_once_per_camera_and_domain(tiny_sequence, mon
     sequence = Sequence.open(tiny_sequence(domains=("regular", "dark")))
     regular, dark = sequence.background("left"), sequence.background("left", "dark")
     assert dark.mean() < 0.7 * regular.mean()
-    monkeypatch.setattr("carts_core.data.sequence.estimate_background", None)
+    monkeypatch.setattr("carts_core.data.sequence.background_of_recording", None)
     regular[:] = 0
     assert sequence.background("left").any()
 

@@ -1,0 +1,199 @@
+"""What the network takes for an arm although no arm is there: what it also sees in the empty background.
+
+The paper compares an image with BG_m + rendering, so what looks like an arm in the background is in both. The surface
+network sees one image at a time. It looks at the mean background once, and what it sees there is taken from what it
+sees in an image, as far as the image still shows that background.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from ..data import MeanBackground
+from ..errors import SequenceError
+from ..features.extractor import FeatureExtractor
+from ..scene import Scene
+from ..surface import COVERAGE, SURFACE_CHANNELS
+from .inputs import pixel_weights, stacked_images
+from .veil import transmission, unveiled
+
+_PATCH = 3
+"""Side of the patches over which differences are averaged [px of the working image]."""
+
+_NOISE = 3.0, 6.0
+"""A difference counts from so many deviations of the noise beyond its median on, and in full so many later [1]."""
+
+_CONTRAST = 0.04, 0.10
+"""The same at least, for images without noise [1]."""
+
+_FOREIGN = 0.06
+"""Median difference from which a background is not that of the image [1]."""
+
+_DECEPTIVE = 0.08
+"""Share of a background that the network takes for arms, from which it is not let see it [1]."""
+
+_NEUTRAL = 0.75, 0.55, 0.45
+"""What is put in the place of such a background, RGB: tissue without features."""
+
+_FITS, _SAMPLES = 4, 4
+"""Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """What cameras see without arms, in the size of the compared images."""
+
+    images: Float[Tensor, "cameras 3 h w"]
+    """RGB in [0, 1]."""
+    known: Float[Tensor, "cameras 1 h w"]
+    """How far they are known to show no arm [1]."""
+    seen: Float[Tensor, "cameras 1 h w"]
+    """What the network takes for an arm in them, where they are known."""
+
+    @property
+    def deceptive(self) -> bool:
+        """Whether the network takes much of what is there for arms."""
+        return float(self.seen.mean()) > _DECEPTIVE
+
+    def changed(self, images: Float[Tensor, "cameras 3 h w"], zoom: float) -> Float[Tensor, "cameras 1 h w"]:
+        """How surely each pixel of images, RGB in [0, 1], differs from the background under their light, in [0, 1].
+
+        What is not known to be background counts as different.
+
+        Args:
+            images: of the same cameras.
+            zoom: times the working size [1].
+        """
+        found = [self._changed(background, image, zoom) for background, image in zip(self.images, images, strict=True)]
+        return 1.0 - self.known * (1.0 - torch.stack(found))
+
+    def _changed(self, background: Tensor, image: Tensor, zoom: float) -> Float[Tensor, "1 h w"]:
+        """How surely each pixel differs from the background under the image's light, in [0, 1]."""
+        difference = (image - _lit_as(background, image)).abs().amax(0, keepdim=True)
+        side = 2 * round(_PATCH * zoom / 2) + 1
+        difference = functional.avg_pool2d(difference, side, stride=1, padding=side // 2, count_include_pad=False)
+        usual = float(difference.median())
+        if usual > _FOREIGN:
+            return torch.ones_like(difference)
+        deviation = 1.4826 * float((difference - usual).abs().median())
+        low = max(usual + _NOISE[0] * deviation, _CONTRAST[0])
+        width = max(_NOISE[1] * deviation, _CONTRAST[1] - _CONTRAST[0])
+        return ((difference - low) / width).clamp(0.0, 1.0)
+
+
+def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+    """The background under the gain and the haze of the image: a line per colour, fitted robustly."""
+    x, y = (values[:, ::_SAMPLES, ::_SAMPLES].flatten(1) for values in (background, image))
+    weight = torch.ones_like(x)
+    gain, offset = torch.ones(len(x), 1, device=x.device), torch.zeros(len(x), 1, device=x.device)
+    for _ in range(_FITS):
+        total = weight.sum(1, keepdim=True)
+        x_mean, y_mean = (weight * x).sum(1, keepdim=True) / total, (weight * y).sum(1, keepdim=True) / total
+        spread = (weight * (x - x_mean).square()).sum(1, keepdim=True) / total
+        together = (weight * (x - x_mean) * (y - y_mean)).sum(1, keepdim=True) / total
+        # A background of one colour says nothing of the gain; then it stays 1.
+        gain = ((together + 1e-4) / (spread + 1e-4)).clamp(0.3, 3.0)
+        offset = y_mean - gain * x_mean
+        error = (y - gain * x - offset).abs()
+        scale = 2.0 * error.median(1, keepdim=True).values.clamp(min=0.01)
+        weight = 1.0 / (1.0 + (error / scale).square()).square()
+    return (gain[..., None] * background + offset[..., None]).clamp(0.0, 1.0)
+
+
+def without_background(
+    images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"]
+) -> Float[Tensor, "cameras 3 h w"]:
+    """What has changed in images, before a background in which there is nothing to be seen."""
+    neutral = torch.tensor(_NEUTRAL, device=images.device)[:, None, None]
+    return changed * images + (1.0 - changed) * neutral
+
+
+class Recording(Protocol):
+    """What has frames of cameras, of which a mean background can be made."""
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """Of a camera, in a domain."""
+        ...
+
+
+class Backgrounds:
+    """The mean backgrounds of cameras, and what the network sees in them; one object serves all frames.
+
+    Args:
+        images: camera name -> mean background BG_m.
+        known: camera name -> where it certainly shows no arm; everywhere by default.
+        problems: why other cameras have none, for people.
+    """
+
+    def __init__(
+        self,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        known: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+        problems: Iterable[str] = (),
+    ) -> None:
+        self.images, self._known, self.problems = dict(images), dict(known or {}), tuple(problems)
+        self._found: dict[tuple[object, ...], Background] = {}
+
+    @staticmethod
+    def of(recording: Recording, cameras: Iterable[str], domain: str, *, required: bool = False) -> "Backgrounds":
+        """Those of a recording's cameras in a domain that say what is there without arms; made once, then kept.
+
+        Args:
+            recording: where they are from.
+            cameras: names.
+            domain: its name.
+            required: whether a loss needs them all, whatever they can say.
+
+        Raises:
+            SequenceError: they are required, and one cannot be estimated, or an image is not usable.
+        """
+        kept, key = _MADE.setdefault(recording, {}), (tuple(cameras), domain, required)
+        if key not in kept:
+            found, problems = {}, []
+            for camera in key[0]:
+                try:
+                    background = recording.mean_background(camera, domain)
+                except SequenceError as error:
+                    if required:
+                        raise
+                    problems.append(str(error))
+                    continue
+                if background.problem is None or required:
+                    found[camera] = background
+                else:
+                    problems.append(background.problem)
+            images = {camera: background.image for camera, background in found.items()}
+            known = {camera: background.known for camera, background in found.items()}
+            kept[key] = Backgrounds(images, known, problems)
+        return kept[key]
+
+    def covers(self, scene: Scene) -> bool:
+        """Whether the background of each camera of a scene is there."""
+        return all(camera.name in self.images for camera in scene.cameras)
+
+    def at(self, scene: Scene, size: tuple[int, int], unveil: float, extractor: FeatureExtractor) -> Background:
+        """The backgrounds of a scene's cameras in a width and height [px].
+
+        Raises:
+            SettingsError: one is missing, or of another size than its camera.
+        """
+        key = tuple(camera.name for camera in scene.cameras), size, unveil, id(extractor)
+        if key not in self._found:
+            stacked = stacked_images(scene, self.images, size, "background").to(extractor.device)
+            nothing = stacked.new_zeros(len(stacked), SURFACE_CHANNELS, *stacked.shape[-2:])
+            clear = unveiled(stacked, transmission(stacked, unveil))
+            seen = extractor.surface(clear, nothing)[:, COVERAGE].sum(1, keepdim=True).clamp(0.0, 1.0)
+            unknown = {name: ~mask for name, mask in self._known.items()}
+            known = pixel_weights(scene, unknown, size).to(seen)
+            self._found[key] = Background(stacked, known, seen * known)
+        return self._found[key]
+
+
+_MADE: WeakKeyDictionary[Recording, dict[tuple[tuple[str, ...], str, bool], Backgrounds]] = WeakKeyDictionary()

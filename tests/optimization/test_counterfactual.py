@@ -1,0 +1,141 @@
+"""What looks like an arm in the empty background is none; what has changed against it stays."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from carts_core.benchmark.another_room import AnotherRoom
+from carts_core.benchmark.rooms import made_rooms
+from carts_core.data import Sequence
+from carts_core.evaluation import dice
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import Backgrounds, FrameOptimizer, OptimizerSettings
+from carts_core.optimization.counterfactual import Background, without_background
+from carts_core.optimization.scale import Scale, scaled
+from carts_core.rendering import Renderer
+from carts_core.scene import Scene
+
+DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
+SIZE = {"width": 320, "height": 240}
+BAR, ARM = (slice(40, 120), slice(20, 200)), (slice(150, 200), slice(100, 240))
+
+
+class DarkIsArm:
+    """A network that takes whatever is dark for an arm."""
+
+    device, stride, sha256 = torch.device("cpu"), 16, ""
+
+    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+        found = torch.zeros_like(believed)
+        found[:, 0] = (images.amax(1) < 0.3).float()
+        return found
+
+
+@pytest.fixture
+def scene(tiny_sequence: Callable[..., Path]) -> Scene:
+    return Sequence.open(tiny_sequence(frames=1, **SIZE)).scene.with_cameras(["left"])
+
+
+def _room(bar: bool = True) -> np.ndarray:
+    image = np.full((240, 320, 3), (190, 160, 120), np.uint8)
+    image[::8] = (150, 120, 90)
+    if bar:
+        image[BAR] = 40
+    return image
+
+
+def _with_arm(room: np.ndarray) -> np.ndarray:
+    image = room.copy()
+    image[ARM] = (30, 20, 20)
+    return image
+
+
+def _seen(scene: Scene, image: np.ndarray, backgrounds: Backgrounds | None) -> tuple[Scale, np.ndarray]:
+    extractor = DarkIsArm()
+    found = scaled(scene, {"left": image}, {}, 1.0, OptimizerSettings(unveil=0.0), extractor, backgrounds)  # pyright: ignore[reportArgumentType]
+    seen = extractor.surface(found.images, torch.zeros(1, 6, 240, 320))[0, 0]
+    if found.explained is not None:
+        seen = seen * (1 - found.explained[0, 0])
+    return found, seen.numpy()
+
+
+def test_without_a_background_the_network_is_believed_in_all_that_it_sees(scene: Scene) -> None:
+    found, seen = _seen(scene, _with_arm(_room()), None)
+    assert found.explained is None and seen[BAR].all() and seen[ARM].all()
+
+
+@pytest.mark.parametrize("gain, haze", [(1.0, 0.0), (0.8, 0.0), (1.15, 0.0), (0.7, 60.0)])
+def test_what_is_in_the_background_too_is_no_arm_in_any_light(scene: Scene, gain: float, haze: float) -> None:
+    image = np.clip(gain * _with_arm(_room()).astype(float) + haze, 0, 255).astype(np.uint8)
+    found, _ = _seen(scene, image, Backgrounds({"left": _room()}))
+    bar = found.images[0, :, BAR[0], BAR[1]]
+    assert float(bar.std((1, 2)).max()) < 0.05, "something of the bar is left"
+    arm = found.images[0, :, 155:195, 110:230].mean((1, 2)) - torch.from_numpy(image[170, 150] / 255.0)
+    assert float(arm.abs().max()) < 0.02
+
+
+def test_what_may_hide_an_arm_is_not_taken_for_background(scene: Scene) -> None:
+    known = np.ones((240, 320), bool)
+    known[ARM] = False
+    contaminated = _with_arm(_room())
+    assert not _seen(scene, contaminated, Backgrounds({"left": contaminated}))[1][ARM].any()
+    assert _seen(scene, contaminated, Backgrounds({"left": contaminated}, {"left": known}))[1][ARM].all()
+
+
+def test_where_the_network_sees_no_arm_in_the_background_images_stay_as_they_are(scene: Scene) -> None:
+    image = _with_arm(_room(bar=False))
+    alone, seen_alone = _seen(scene, image, None)
+    found, seen = _seen(scene, image, Backgrounds({"left": _room(bar=False)}))
+    assert torch.equal(found.images, alone.images) and np.array_equal(seen, seen_alone)
+
+
+def test_the_background_of_another_scene_changes_nothing(scene: Scene) -> None:
+    rng = np.random.default_rng(0)
+    other = np.kron(rng.integers(0, 256, (24, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8)
+    other[BAR] = 10
+    image = _with_arm(_room())
+    assert np.array_equal(
+        _seen(scene, image, Backgrounds({"left": other}))[0].images, _seen(scene, image, None)[0].images
+    )
+
+
+def test_noise_does_not_count_as_a_change() -> None:
+    generator = torch.Generator().manual_seed(0)
+    room = torch.rand(1, 3, 8, 10, generator=generator).repeat_interleave(16, 2).repeat_interleave(16, 3)
+    background = Background(room, torch.ones_like(room[:, :1]), torch.ones_like(room[:, :1]))
+    noisy = room + 0.03 * torch.randn(room.shape, generator=generator)
+    noisy[..., 40:60, 40:80] = 1 - room[..., 40:60, 40:80]
+    changed = background.changed(noisy, 1.0)[0, 0]
+    assert changed[43:57, 43:77].mean() > 0.7
+    changed[36:64, 36:84] = 0
+    assert changed.mean() < 0.01
+    assert torch.equal(without_background(noisy, torch.ones_like(noisy[:, :1])), noisy)
+
+
+def test_arms_that_never_leave_say_so_once_and_nothing_is_explained_away(tiny_sequence: Callable[..., Path]) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, **SIZE))
+    backgrounds = Backgrounds.of(sequence, ["left"], "regular")
+    assert not backgrounds.images
+    (problem,) = backgrounds.problems
+    assert "camera 'left'" in problem and "hardly move" in problem and "`background` image" in problem
+    assert Backgrounds.of(sequence, ["left"], "regular") is backgrounds
+    assert set(Backgrounds.of(sequence, ["left"], "regular", required=True).images) == {"left"}
+
+
+def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_dir: Path) -> None:
+    sequence = Sequence.open(DVRK)
+    room = next(room for room in made_rooms() if room.name == "rods 1")
+    recording = AnotherRoom(sequence, [room], seed=0)
+    frame, extractor = recording.frame(22, room.domain, ["left"]), FeatureExtractor.load()
+    assert frame.masks is not None
+    scene, renderer = sequence.scene.with_cameras(["left"]), Renderer(sequence.scene, cameras=["left"])
+    found = []
+    for backgrounds in ({}, {"left": recording.empty(room.domain, "left")}):
+        optimizer = FrameOptimizer(scene, frame, backgrounds, extractor, live=False)
+        list(optimizer)
+        assert optimizer.best is not None
+        found.append(dice(renderer.segment(optimizer.best.state)[0] >= 0, frame.masks["left"]))
+    assert found[1] > 0.95 > found[0]
