@@ -69,6 +69,18 @@ def read_foreign_table(path: Path) -> ForeignTable:
     return table
 
 
+def read_array(path: Path) -> np.ndarray:
+    """The array of a .npy file.
+
+    Raises:
+        SequenceError: it is missing, damaged, or holds objects.
+    """
+    try:
+        return np.asarray(np.load(io.BytesIO(read_bytes(path, TABLE))))
+    except (OSError, ValueError, EOFError) as error:
+        raise SequenceError(f"array {path} cannot be read ({error}). Copy it again.") from error
+
+
 def _csv(path: Path) -> dict[str, np.ndarray]:
     lines = [line for line in read_text(path, TABLE).splitlines() if line.strip()]
     # Extracted dVRK topics begin with their name and type behind a mark.

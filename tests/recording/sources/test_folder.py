@@ -146,7 +146,8 @@ def kalibr_yaml(path: Path) -> None:
         f"  distortion_coeffs: [-0.1, 0.02, 0, 0]\n  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
         "cam1:\n  T_cn_cnm1: [[1, 0, 0, -0.005], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
         "  distortion_model: radtan\n"
-        f"  intrinsics: [110, 110, 47.5, 35.5]\n  distortion_coeffs: [0, 0, 0, 0]\n  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
+        f"  intrinsics: [110, 110, 47.5, 35.5]\n  distortion_coeffs: [0, 0, 0, 0]\n"
+        f"  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
     )
 
 
