@@ -8,15 +8,32 @@ from types import ModuleType
 
 import carts_core
 
-_ELSEWHERE = {"settings", "commands", "cli", "bench", "benchmark", "wording", "process", "mesh_cache", "parts"}
-"""Settings and commands have pages of their own; the others are for us."""
+_ELSEWHERE = {"settings", "commands", "cli"}
+"""They have pages of their own."""
+_INTERNAL = {
+    "bench",
+    "benchmark",
+    "decimation",
+    "extras",
+    "files",
+    "kinematics",
+    "mesh_cache",
+    "mesh_files",
+    "meshes",
+    "parts",
+    "process",
+    "threads",
+    "urdf_check",
+    "wording",
+}
+"""Nobody else should lean on them."""
 
 
 def api_pages() -> dict[str, str]:
     """File name -> Markdown."""
     pages = {}
     for info in pkgutil.iter_modules(carts_core.__path__):
-        if info.name in _ELSEWHERE or info.name.startswith("_"):
+        if info.name in _ELSEWHERE | _INTERNAL or info.name.startswith("_"):
             continue
         module = importlib.import_module(f"carts_core.{info.name}")
         names = list(_public_names(module, package=info.ispkg))
