@@ -22,6 +22,7 @@ from .commands.train import Train
 from .commands.view import View
 from .console import Terminal, log_to_stderr
 from .errors import CartsError
+from .stopping import exit_status, message, stopped_by_signals
 
 _DESCRIPTION = (
     "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is."
@@ -58,13 +59,14 @@ def main(arguments: list[str] | None = None) -> None:
 
         log_to_stderr()
         tune_process(keep_memory=not isinstance(command, View))
-        command.run()
+        with stopped_by_signals():
+            command.run()
     except CartsError as error:
         Terminal(stderr=True).print_error(error)
         sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        Terminal(stderr=True).print("interrupted; what was finished is kept")
-        sys.exit(130)
+    except KeyboardInterrupt as stopped:
+        Terminal(stderr=True).print(message(stopped), soft_wrap=True)
+        sys.exit(exit_status(stopped))
 
 
 @contextmanager
