@@ -2,9 +2,8 @@
 
 import hashlib
 from dataclasses import asdict
-from functools import cache
-from pathlib import Path
 
+from .. import fingerprints
 from ..features.extractor import FeatureExtractor
 from .frame import TOLERANCE
 from .methods import METHODS
@@ -25,19 +24,11 @@ _MEASURED = (
     "benchmark/occlusion.py",
     "benchmark/together.py",
 )
-_NOT_CODE = {"bench.py", "cli.py", "wording.py"}
 
 
-@cache
 def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
     """SHA-256 over modules of the package; by default those that decide what a method returns, and how it is scored."""
-    package = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256()
-    for pattern in patterns:
-        for path in sorted(package.glob(pattern)):
-            if path.name not in _NOT_CODE:
-                digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()
+    return fingerprints.code_fingerprint(patterns)
 
 
 def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source: str) -> str:

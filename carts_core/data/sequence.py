@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from ..camera import Camera
 from ..errors import SequenceError
 from ..scene import Scene
 from ..wording import counted
@@ -141,6 +142,14 @@ class Sequence:
             masks=masks or None,
             timestamp=None if self.timestamps is None else float(self.timestamps[index]),
         )
+
+    def recorded_camera(self, name: str) -> Camera:
+        """A camera as its images were recorded, with their distortion; `scene` has it without.
+
+        Raises:
+            SequenceError: there is no such camera.
+        """
+        return self._camera(name).camera
 
     def has_masks(self, camera: str, domain: str | None = None) -> bool:
         """Whether the sequence file gives masks for a camera (in a domain).

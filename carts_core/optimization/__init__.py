@@ -15,6 +15,7 @@ from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
+from .recalled import sequence_checkpoint as sequence_checkpoint
 from .sequence import FrameEstimate as FrameEstimate
 from .sequence import SequenceOptimizer as SequenceOptimizer
 

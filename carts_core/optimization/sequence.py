@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ..checkpoint import Checkpoint
 from ..data import Frame
 from ..data.background import spread
 from ..errors import CartsError, SettingsError
@@ -24,6 +25,7 @@ from .counterfactual import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, combined, news, without
 from .observability import Uncertainty
 from .parameters import ParameterVector
+from .recalled import RecallingEye
 from .sight import Eye, Ignore, Sight
 
 Start = Literal["warm", "cold", "keyframe", "carried"]
@@ -87,6 +89,7 @@ class SequenceOptimizer:
         ignore: position -> camera name -> pixels that show an occluder; none by default.
         backgrounds: of the cameras; what looks like an arm in them is taken for none.
         cameras: names of the cameras that take part, all by default.
+        checkpoint: keeps what was found on disk, for a run that goes on after a stop; see `sequence_checkpoint`.
 
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
@@ -108,6 +111,7 @@ class SequenceOptimizer:
         ignore: Ignore | None = None,
         backgrounds: Backgrounds | None = None,
         cameras: Sequence[str] | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
         self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
         self._scene, self._load, self._extractor = scene.with_cameras(cameras), load, extractor
@@ -130,6 +134,8 @@ class SequenceOptimizer:
         self._eye = Eye(
             self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}), backgrounds
         )
+        if checkpoint is not None:
+            self._eye = RecallingEye(self._eye, checkpoint)
         self._queue = list(self._gaps)
         self._told = self._shares()
         asked = {self._queue[place] for place in spread(len(self._queue), self.model.opinions)}

@@ -1,0 +1,102 @@
+"""Intermediate results on disk: a stopped run looks them up when it is started again, and comes to the same end.
+
+An entry is named by the content of everything that it was computed from, so the order does not matter and a changed
+input finds nothing. A line that a kill or a full disk has cut off is not used, and neither is an altered one.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from .errors import OutputError
+from .files import OutputPath, append_line, holds_file, remove_file, write_text
+from .fingerprints import fingerprint
+from .stopping import finished_first
+
+_FORMAT = "carts-checkpoint/1"
+_DIGITS = 32
+Value = TypeVar("Value")
+
+
+class Checkpoint:
+    """A file of intermediate results.
+
+    Args:
+        path: the file; it is made with the first entry.
+        made_with: fingerprint of what all entries depend on; a file of another one is replaced.
+        classes: the frozen dataclasses that values consist of, beside numbers, lists and float64 arrays.
+
+    Attributes:
+        recalled: how many values were looked up and not computed.
+    """
+
+    def __init__(self, path: OutputPath, made_with: str, classes: Sequence[type]) -> None:
+        self._path, self._made_with = path, made_with
+        self._classes = {kind.__name__: kind for kind in classes}
+        self._entries = self._read()
+        self._begun = bool(self._entries)
+        self.recalled = 0
+
+    def value(self, key: str, compute: Callable[[], Value]) -> Value:
+        """What is there under a key, or what is computed and kept there.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if key in self._entries:
+            self.recalled += 1
+            return self._decoded(self._entries[key])
+        found = compute()
+        with finished_first():
+            if not self._begun:
+                write_text(self._path, f"{_FORMAT} {self._made_with}\n")
+                self._begun = True
+            text = json.dumps(_encoded(found))
+            append_line(self._path, f"{key} {fingerprint(key, text)[:_DIGITS]} {text}".encode())
+        return found
+
+    def remove(self) -> None:
+        """Remove the file; the results it was for are written."""
+        remove_file(self._path)
+
+    def _read(self) -> dict[str, Any]:
+        if not holds_file(self._path):
+            return {}
+        try:
+            lines = self._path.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be read ({error.strerror}). Remove it to start over.") from error
+        if not lines or lines[0] != f"{_FORMAT} {self._made_with}":
+            return {}
+        entries = {}
+        for line in lines[1:]:
+            key, _, rest = line.partition(" ")
+            check, _, text = rest.partition(" ")
+            if check == fingerprint(key, text)[:_DIGITS]:
+                entries[key] = json.loads(text)
+        return entries
+
+    def _decoded(self, value: Any) -> Any:
+        if isinstance(value, list):
+            return [self._decoded(part) for part in value]
+        if not isinstance(value, Mapping):
+            return value
+        if "array" in value:
+            return np.array(value["array"], np.float64).reshape(value["shape"])
+        return self._classes[value["class"]](**{name: self._decoded(part) for name, part in value["fields"].items()})
+
+
+def _encoded(value: Any) -> Any:
+    """As JSON, which has the shortest digits that give the same float64 back."""
+    if isinstance(value, np.ndarray):
+        assert value.dtype == np.float64
+        return {"array": value.ravel().tolist(), "shape": value.shape}
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {field.name: _encoded(getattr(value, field.name)) for field in fields(value)}
+        return {"class": type(value).__name__, "fields": parts}
+    if isinstance(value, list):
+        return [_encoded(part) for part in value]
+    return value

@@ -1,0 +1,208 @@
+"""Results count only as long as what they were made from is the same, and they themselves are whole."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from carts_core.cli import BAD_INPUT, main
+from carts_core.features.weights import read_weights, save_weights
+from carts_core.files import locked_folder
+from carts_core.resources import shipped_robot, shipped_weights
+
+Outcome = Callable[..., str]
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Path:
+    """Three small frames of a robot with files of its own."""
+    shutil.copytree(shipped_robot().parent, tmp_path / "robot")
+    robot = tmp_path / "robot" / shipped_robot().name
+    return tiny_sequence(
+        frames=3, width=160, height=128, edit=lambda text: text.replace('"builtin:psm_lnd"', f'"{robot}"')
+    )
+
+
+@pytest.fixture
+def optimize(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Outcome:
+    """Runs `carts optimize` without steps and returns what it prints, in one line."""
+
+    def run(*arguments: str) -> str:
+        main(["optimize", str(sequence), "--output", str(tmp_path / "out"), "--solver", "none", *arguments])
+        return re.sub(r"\s+", " ", capsys.readouterr().out)
+
+    return run
+
+
+def replaced(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def image_changed(folder: Path) -> None:
+    path = folder / "regular" / "left" / "002.png"
+    image = cv2.imread(str(path))
+    assert image is not None
+    image[0, 0, 0] ^= 1
+    cv2.imwrite(str(path), image)
+
+
+def intrinsics_changed(folder: Path) -> None:
+    replaced(folder / "sequence.toml", "K = [[192.0,", "K = [[192.5,")
+
+
+def distortion_changed(folder: Path) -> None:
+    replaced(folder / "sequence.toml", 'name = "left"', 'name = "left"\ndistortion = [0.01, 0.0, 0.0, 0.0]')
+
+
+def extrinsics_changed(folder: Path) -> None:
+    found = re.search(
+        r"T_camera_world = .*, ([-\d.e]+)\], \[0\.0, 0\.0, 0\.0, 1\.0\]\]", (folder / "sequence.toml").read_text()
+    )
+    assert found
+    replaced(folder / "sequence.toml", f"{found[1]}], [0.0, 0.0", f"{float(found[1]) + 1e-4}], [0.0, 0.0")
+
+
+def base_frame_changed(folder: Path) -> None:
+    T = np.eye(4)
+    T[0, 3] = 1e-4
+    replaced(folder / "sequence.toml", "[arms.joints]", f"T_world_base = {T.tolist()}\n[arms.joints]")
+
+
+def kinematics_row_changed(folder: Path) -> None:
+    lines = (folder / "kinematics.csv").read_text().splitlines()
+    cells = lines[2].split(",")
+    lines[2] = ",".join([*cells[:-1], f"{float(cells[-1]) + 1e-6:.9f}"])
+    (folder / "kinematics.csv").write_text("\n".join(lines) + "\n")
+
+
+def urdf_changed(folder: Path) -> None:
+    path = folder / "robot" / shipped_robot().name
+    found = re.search(r'upper="([\d.]+)"', path.read_text())
+    assert found
+    replaced(path, found[0], f'upper="{float(found[1]) + 0.01}"')
+
+
+def mesh_changed(folder: Path) -> None:
+    path = folder / "robot" / "meshes" / "shaft_tube.ply"
+    mesh = trimesh.load_mesh(path)
+    mesh.vertices[:, 0] *= 1.01
+    mesh.export(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (image_changed, "1 of 3 frames redone: the images changed"),
+        (intrinsics_changed, "3 of 3 frames redone: the calibration changed"),
+        (distortion_changed, "3 of 3 frames redone: the calibration changed"),
+        (extrinsics_changed, "3 of 3 frames redone: the calibration changed"),
+        (base_frame_changed, "3 of 3 frames redone: the calibration changed"),
+        (kinematics_row_changed, "1 of 3 frames redone: the measured joint positions changed"),
+        (urdf_changed, "3 of 3 frames redone: the robot changed"),
+        (mesh_changed, "3 of 3 frames redone: the robot changed"),
+    ],
+)
+def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(
+    change: Callable[[Path], None], told: str, optimize: Outcome, tmp_path: Path
+) -> None:
+    optimize()
+    assert "3 of 3 frames already there" in optimize()
+    change(tmp_path)
+    assert told in optimize()
+    assert "3 of 3 frames already there" in optimize()
+
+
+def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path) -> None:
+    optimize()
+    weights = read_weights(shipped_weights()[1])
+    next(weights.network.parameters()).data.mul_(1.001)
+    save_weights(weights.network, tmp_path / "mine.safetensors", {}, weights.working_size)
+    assert "3 of 3 frames redone: the weights changed" in optimize("--weights", str(tmp_path / "mine.safetensors"))
+
+
+def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["optimize", str(sequence), "--output", str(tmp_path / "out"), "--mode", "sequence", "--iterations", "2"]
+    main(command)
+    image_changed(tmp_path)
+    capsys.readouterr()
+    main(command)
+    assert "3 of 3 frames redone: the images changed" in re.sub(r"\s+", " ", capsys.readouterr().out)
+    main([*command, "--frames", "0-1"])
+    told = re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert "2 of 2 frames redone: " in told and "they were solved together with other frames" in told
+    assert "1 frame not chosen now would have to be redone: they were solved together with other frames" in told
+
+
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def altered(path: Path) -> None:
+    cv2.imwrite(str(path), np.zeros((128, 160), np.uint8))
+
+
+@pytest.mark.parametrize("damage", [emptied, cut_off, altered, Path.unlink])
+def test_a_damaged_mask_is_made_again(damage: Callable[[Path], None], optimize: Outcome, tmp_path: Path) -> None:
+    optimize()
+    mask = tmp_path / "out" / "regular" / "left" / "masks" / "002.png"
+    before = mask.read_bytes()
+    damage(mask)
+    told = optimize()
+    assert "2 of 3 frames already there" in told
+    assert "1 of 3 frames redone: their masks are missing or damaged" in told
+    assert mask.read_bytes() == before
+
+
+def test_a_row_that_was_altered_and_results_of_unknown_origin_are_redone(optimize: Outcome, tmp_path: Path) -> None:
+    optimize()
+    folder = tmp_path / "out" / "regular" / "left"
+    before = (folder / "kinematics.csv").read_bytes()
+    replaced(folder / "kinematics.csv", "002,optimized,0.", "002,optimized,1.")
+    assert "1 of 3 frames redone: their rows in the table were changed" in optimize()
+    assert (folder / "kinematics.csv").read_bytes() == before
+    for content in ("", "[]", '{"format": "carts-results/1", "frames": {"001": {}}}'):
+        (folder / "results.json").write_text(content)
+        assert "3 of 3 frames redone: what they were made from is not known" in optimize()
+
+
+def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcome, tmp_path: Path) -> None:
+    optimize()
+    told = optimize("--overwrite", "--frames", "0")
+    assert "--overwrite starts over: results of 2 other frames are removed" in told
+    folder = tmp_path / "out" / "regular" / "left"
+    assert [path.name for path in (folder / "masks").iterdir()] == ["001.png"]
+    assert list(json.loads((folder / "results.json").read_text())["frames"]) == ["001"]
+    assert len((folder / "kinematics.csv").read_text().splitlines()) == 2
+
+
+def test_frames_that_are_out_of_date_and_not_chosen_are_told(optimize: Outcome, tmp_path: Path) -> None:
+    optimize()
+    intrinsics_changed(tmp_path)
+    told = optimize("--frames", "0")
+    assert "1 of 1 frame redone: the calibration changed" in told
+    assert "2 frames not chosen now would have to be redone: the calibration changed" in told
+
+
+def test_a_second_run_into_the_same_folder_is_refused(
+    optimize: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with locked_folder(tmp_path / "out" / "regular" / "left"), pytest.raises(SystemExit) as stop:
+        optimize()
+    assert stop.value.code == BAD_INPUT
+    assert "another process is writing to" in " ".join(capsys.readouterr().err.split())
+    assert not list((tmp_path / "out").rglob("*.csv"))
+    optimize()
