@@ -8,6 +8,7 @@ import tyro
 
 from ..console import Terminal
 from ..errors import CartsError
+from ..stopping import when_stopped
 from ..wording import counted
 from .selection import Network, output_folder
 
@@ -62,8 +63,9 @@ class Bench:
             console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
         stages = folder / "stages.json"
         if not self.report_only:
-            benchmark.run(console)
-            measure_stages(stages, extractor)
+            with when_stopped(f"{results.path} holds what was measured; the same command goes on from there"):
+                benchmark.run(console)
+                measure_stages(stages, extractor)
         measurements = benchmark.measurements()
         if not measurements:
             raise CartsError(

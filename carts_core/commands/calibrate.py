@@ -11,6 +11,7 @@ from rich.console import Console
 from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
+from ..stopping import when_stopped
 from .selection import Network, Selection, SequencePath, check_second_order, output_folder
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class Calibrate:
         indices = frame_indices(self.frames, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
-        with published(output, overwrite=self.overwrite) as folder:
+        with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [sequence.frame(index, self.domain, cameras) for index in indices]
             optimizer = CalibrationOptimizer(
                 sequence.scene,

@@ -11,6 +11,7 @@ import tyro
 from ..console import Terminal, track
 from ..errors import SettingsError
 from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
+from ..stopping import when_stopped
 from ..wording import counted
 from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_second_order, check_writable
 
@@ -77,7 +78,8 @@ class Evaluate:
             together=self.together,
         )
         total = len(frames) * len(cameras) * len(domains)
-        scores = list(track(found, "optimizing", total=total, console=console))
+        with when_stopped("nothing was written"):
+            scores = list(track(found, "optimizing", total=total, console=console))
         console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         for group in camera_groups(cameras, self.together):
             where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]

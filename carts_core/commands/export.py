@@ -9,6 +9,7 @@ import tyro
 from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import FormatName, Parts
+from ..stopping import when_stopped
 from ..wording import counted
 from .selection import Selection, SequencePath
 
@@ -62,5 +63,6 @@ class Export:
         with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
-            path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
+            with when_stopped(f"nothing was written to {self.output}"):
+                path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         console.print(f"wrote {path}")

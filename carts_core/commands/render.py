@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ..console import Terminal, track
+from ..stopping import when_stopped
 from .selection import Perturbation, Selection, SequencePath, output_folder
 
 
@@ -30,26 +31,27 @@ class Render:
         from ..data import Sequence
         from ..evaluation import start_positions
         from ..export import image_and_mask, image_png, mask_png, overlay
-        from ..files import write_bytes
+        from ..files import locked_folder, write_bytes
         from ..rendering import Renderer
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         folder = output_folder(self.output, sequence.name, "render")
         frames = self.select.frame_indices(sequence)
-        for domain in self.select.domain_names(sequence):
-            for camera in self.select.camera_names(sequence.scene):
-                renderer = Renderer(sequence.scene, cameras=[camera])
-                for index in track(frames, f"{domain}, {camera}", console=console):
-                    frame = sequence.frame(index, domain, [camera])
-                    start = start_positions(sequence, frame, self.start.perturb_deg, self.start.seed)
-                    state = sequence.scene.state(start)
-                    if self.style == "mask":
-                        png = mask_png(renderer.segment(state)[0] >= 0)
-                    else:
-                        image, mask = image_and_mask(renderer, state)
-                        if self.style == "overlay":
-                            image = overlay(frame.images[camera], image, mask, self.opacity)
-                        png = image_png(image)
-                    write_bytes(folder / domain / camera / f"{frame.frame_id}.png", png)
+        with locked_folder(folder), when_stopped(f"the pictures in {folder} are whole, some are missing"):
+            for domain in self.select.domain_names(sequence):
+                for camera in self.select.camera_names(sequence.scene):
+                    renderer = Renderer(sequence.scene, cameras=[camera])
+                    for index in track(frames, f"{domain}, {camera}", console=console):
+                        frame = sequence.frame(index, domain, [camera])
+                        start = start_positions(sequence, frame, self.start.perturb_deg, self.start.seed)
+                        state = sequence.scene.state(start)
+                        if self.style == "mask":
+                            png = mask_png(renderer.segment(state)[0] >= 0)
+                        else:
+                            image, mask = image_and_mask(renderer, state)
+                            if self.style == "overlay":
+                                image = overlay(frame.images[camera], image, mask, self.opacity)
+                            png = image_png(image)
+                        write_bytes(folder / domain / camera / f"{frame.frame_id}.png", png)
         console.print(f"wrote {folder}")

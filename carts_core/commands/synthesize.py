@@ -8,6 +8,7 @@ import tyro
 
 from ..console import Bar
 from ..settings import SynthesisConfig
+from ..stopping import when_stopped
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,10 @@ class Synthesize:
 
         with Bar() as bar:
             task = bar.add_task("synthesizing", total=None)
-            path = synthesize(
-                self.synthesis,
-                self.output,
-                lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
-            )
+            with when_stopped("frames that were made are kept beside the output; the same command goes on from there"):
+                path = synthesize(
+                    self.synthesis,
+                    self.output,
+                    lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+                )
         bar.console.print(f"wrote {path}")

@@ -13,6 +13,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from ..errors import SettingsError
 from ..files import locked_folder, output_path
 from ..settings import Architecture, TrainingConfig
+from ..stopping import finished_first, when_stopped
+from ..wording import counted
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .growth import grow
 from .loader import training_batches, validation_set
@@ -73,7 +75,13 @@ def train(
     """
     torch.set_num_threads(config.threads)
     with locked_folder(output):
-        return _Run(_as_large_as_start(config), output).finish(progress or (lambda event: None))
+        run = _Run(_as_large_as_start(config), output)
+        try:
+            with when_stopped(run.kept):
+                return run.finish(progress or (lambda event: None))
+        except KeyboardInterrupt:
+            run.save()
+            raise
 
 
 class _Run:
@@ -90,6 +98,7 @@ class _Run:
         self.modules = {"network": self.network, "average": self.average}
         self.step, self.history = 0, History()
         self._resume()
+        self._saved = self.step
         self._clock = time.perf_counter()
 
     def _resume(self) -> None:
@@ -116,7 +125,10 @@ class _Run:
             count, self._clock = 0, time.perf_counter()
             last = False
             while not last:
-                for name, value in self._train_step(next(batches)).items():
+                batch = next(batches)
+                with finished_first():
+                    terms = self._train_step(batch)
+                for name, value in terms.items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
                 last = self.step == self._planned()
@@ -138,6 +150,19 @@ class _Run:
         folder = output_path(self.output, "report")
         report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
         return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
+
+    def save(self) -> None:
+        """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""
+        if self.step > self._saved:
+            self.history.seconds += time.perf_counter() - self._clock
+            self._checkpoint()
+
+    def kept(self) -> str:
+        """What there is of a run that is stopped, for people."""
+        if self.step == 0:
+            return "no step was made, nothing was kept"
+        steps = counted(self.step, "step")
+        return f"{self.output} holds {steps}; the same command goes on from there"
 
     def _planned(self) -> int:
         """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
@@ -180,6 +205,7 @@ class _Run:
 
     def _checkpoint(self) -> None:
         save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
+        self._saved = self.step
 
 
 def _first_network(config: TrainingConfig) -> UNet:
