@@ -1,0 +1,56 @@
+"""Runs commands in forked processes and sends each a signal after a while: a process a second instead of ten.
+
+Reads requests from standard input, a JSON object a line: `arguments` of the command, `log` for what it prints, and
+`seconds` after which it gets `signal`. Answers each with a line: the exit status, negative if a signal ended it.
+"""
+
+import json
+import os
+import sys
+import threading
+from pathlib import Path
+
+from carts_core.cli import main
+from carts_core.commands import calibrate, optimizing, render, train
+from carts_core.features import training
+from carts_core.optimization import CalibrationOptimizer, SequenceOptimizer
+
+LOADED = (calibrate, optimizing, render, train, training, CalibrationOptimizer, SequenceOptimizer)
+"""So that no child has to import what all of them need."""
+
+
+def run(arguments: list[str], log: Path) -> int:
+    """The command's exit status."""
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    try:
+        main(arguments)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return 0
+
+
+def serve() -> None:
+    """Answer requests until there are no more."""
+    for line in sys.stdin:
+        request = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                status = run(request["arguments"], Path(request["log"]))
+            finally:
+                os._exit(status)
+        timer = threading.Timer(request["seconds"], os.kill, (child, request["signal"]))
+        timer.start()
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        timer.cancel()
+        print(status, flush=True)
+
+
+if __name__ == "__main__":
+    serve()

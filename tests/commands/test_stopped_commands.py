@@ -1,0 +1,204 @@
+"""Commands that are stopped at any moment: nothing acknowledged is lost, and the same command comes to the same end."""
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import pytest
+
+from carts_core.cli import main
+from carts_core.features.checkpoint import load_checkpoint
+from carts_core.features.weights import read_weights
+
+POLITE = [signal.SIGTERM, signal.SIGHUP]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+SMALL_RUN = [
+    *("--architecture.widths", "4", "6", "8", "--architecture.encoder-convolutions", "1", "1", "1"),
+    *("--architecture.decoder-convolutions", "1", "1"),
+    *("--images.width", "64", "--images.height", "48", "--images.field-width", "80", "--images.things", "0"),
+    *("--images.absent", "0"),
+    *("--batch-size", "2", "--validation-samples", "2", "--workers", "0", "--threads", "1", "--steps", "400"),
+    *("--checkpoint-every", "20", "--validation-every", "200"),
+]
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=4, width=160, height=128)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder but hidden ones."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    named = {path.relative_to(folder).as_posix(): path for path in files}
+    return {name: path.read_bytes() for name, path in named.items() if "/." not in f"/{name}"}
+
+
+def check_results(folder: Path) -> int:
+    """See that everything in a folder of `carts optimize` is whole; how many frames it has."""
+    records = folder / "results.json"
+    frames = json.loads(records.read_text())["frames"] if records.is_file() else {}
+    for frame_id in frames:
+        mask = cv2.imread(str(folder / "masks" / f"{frame_id}.png"), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None and mask.shape == (128, 160)
+    return len(frames)
+
+
+@pytest.mark.parametrize(("mode", "number"), [("frame", signal.SIGTERM), ("sequence", signal.SIGHUP)])
+def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_been_stopped(
+    sequence: Path, tmp_path: Path, mode: str, number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["optimize", str(sequence), "--mode", mode, "--iterations", "8", "--output"]
+    main([*command, str(tmp_path / "whole")])
+    folder = tmp_path / "stopped" / "regular" / "left"
+    sign = folder / ("results.json" if mode == "frame" else "checkpoint.txt")
+    arguments = [sys.executable, "-m", "carts_core.cli", *command, str(tmp_path / "stopped")]
+    for sent in (number, signal.SIGKILL):
+        before = sign.stat().st_size if sign.exists() else 0
+        process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+        deadline = time.monotonic() + 200
+        while process.poll() is None and not (sign.exists() and sign.stat().st_size > before):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.send_signal(sent)
+        _, told = process.communicate(timeout=100)
+        if sent != signal.SIGKILL:
+            assert process.returncode == 128 + number, told
+            assert f"stopped by {number.name}; " in told and "the same command goes on from there" in told
+            said = re.search(r"(\d+) (?:frame|of \d+ frames)", told)
+            assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
+    capsys.readouterr()
+    main([*command, str(tmp_path / "stopped")])
+    told = capsys.readouterr().out
+    assert "already there" in told if mode == "frame" else "went on from where" in told
+    assert contents(tmp_path / "stopped") == contents(tmp_path / "whole")
+
+
+@dataclass
+class Campaign:
+    """A command that is stopped again and again, at random moments, until it has been often enough."""
+
+    name: str
+    arguments: list[str]
+    output: Path
+    whole: dict[str, bytes] = field(default_factory=dict)
+    stops: int = 0
+    ends: int = 0
+
+
+@contextmanager
+def forked(log: Path) -> Iterator[Callable[[list[str], float, int], tuple[int, str]]]:
+    """Runs a command that gets a signal after some seconds; its status and what it printed."""
+    server = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("forked.py"))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+    assert server.stdin is not None and server.stdout is not None
+    stdin, stdout = server.stdin, server.stdout
+
+    def run(arguments: list[str], seconds: float, number: int) -> tuple[int, str]:
+        request = {"arguments": arguments, "log": str(log), "seconds": seconds, "signal": number}
+        stdin.write(json.dumps(request) + "\n")
+        stdin.flush()
+        return int(stdout.readline()), log.read_text()
+
+    try:
+        yield run
+    finally:
+        stdin.close()
+        server.wait(60)
+
+
+def campaigns(sequence: Path, folder: Path) -> list[Campaign]:
+    optimize = ["optimize", str(sequence), "--iterations", "8", "--output"]
+    few = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
+    made = {
+        "frame": [*optimize, str(folder / "frame")],
+        "sequence": [*optimize, str(folder / "sequence"), "--mode", "sequence"],
+        "calibrate": ["calibrate", str(sequence), "--output", str(folder / "calibrate"), *few],
+        "export": ["export", str(sequence), str(folder / "export"), "--format", "masks"],
+    }
+    return [Campaign(name, arguments, folder / name) for name, arguments in made.items()]
+
+
+def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Random) -> None:
+    """Stop and start again until it was stopped that often; whenever it comes to its end, compare and start over."""
+    began = time.monotonic()
+    status, told = run(campaign.arguments, 500.0, signal.SIGKILL)
+    length = time.monotonic() - began
+    assert status == 0, told
+    campaign.whole = contents(campaign.output)
+    acknowledged, overwrite = 0, ["--overwrite"] if campaign.name in ("calibrate", "export") else []
+    for path in sorted(campaign.output.rglob("*"), reverse=True):
+        path.unlink() if path.is_file() else path.rmdir()
+    while campaign.stops < times:
+        number = randoms.choice([*POLITE, signal.SIGKILL])
+        status, told = run([*campaign.arguments, *overwrite], randoms.uniform(0.0, 1.1 * length), number)
+        if status == 0:
+            assert contents(campaign.output) == campaign.whole, campaign.name
+            campaign.ends += 1
+            if not overwrite:
+                for path in sorted(campaign.output.rglob("*"), reverse=True):
+                    path.unlink() if path.is_file() else path.rmdir()
+            acknowledged = 0
+            continue
+        campaign.stops += 1
+        # Before `main` has set up its handlers a signal ends the process as it would any other.
+        assert status in ((-number,) if number == signal.SIGKILL else (128 + number, -number)), told
+        if overwrite:
+            assert contents(campaign.output) in ({}, campaign.whole), "neither nothing nor the whole"
+            continue
+        kept = check_results(campaign.output / "regular" / "left")
+        assert kept >= acknowledged, "a frame that was there is gone"
+        acknowledged = kept
+        if said := re.search(r"left holds (\d+) frame", told):
+            assert int(said[1]) == kept, told
+    status, told = run([*campaign.arguments, *overwrite], 500.0, signal.SIGKILL)
+    assert status == 0 and contents(campaign.output) == campaign.whole, told
+    campaign.ends += 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_commands_stopped_at_112_random_moments_come_to_the_same_bytes(sequence: Path, tmp_path: Path) -> None:
+    randoms = random.Random(7)
+    with forked(tmp_path / "log.txt") as run:
+        for campaign in campaigns(sequence, tmp_path / "out"):
+            stop_often(run, campaign, 28, randoms)
+            print(f"{campaign.name}: {campaign.stops} stops, {campaign.ends} ends, the same bytes at each")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_training_stopped_at_28_random_moments_loses_no_step_that_it_said_it_has(tmp_path: Path) -> None:
+    randoms, output = random.Random(8), tmp_path / "run"
+    step, said = 0, 0
+    with forked(tmp_path / "log.txt") as run:
+        for _ in range(28):
+            number = randoms.choice([*POLITE, signal.SIGKILL])
+            status, told = run(["train", str(output), *SMALL_RUN], randoms.uniform(0.0, 12.0), number)
+            assert status in (0, 128 + number, -number), told
+            checkpoint = load_checkpoint(output)
+            now = checkpoint.step if checkpoint else 0
+            assert now >= step
+            if found := re.search(r"holds (\d+) step", told):
+                said += 1
+                assert now == int(found[1]), told
+            step = now
+    print(f"train: 28 stops, {said} times it said what it holds, {step} steps at last")
+    for weights in output.glob("*.safetensors"):
+        if weights.name != "checkpoint.safetensors":
+            read_weights(weights)
