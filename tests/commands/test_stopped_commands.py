@@ -144,13 +144,15 @@ def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Ra
     acknowledged, overwrite = 0, ["--overwrite"] if campaign.name in ("calibrate", "export") else []
     for path in sorted(campaign.output.rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()
+    fresh = True
     while campaign.stops < times:
         number = randoms.choice([*POLITE, signal.SIGKILL])
         began = time.monotonic()
         status, told = run([*campaign.arguments, *overwrite], randoms.uniform(0.0, length), number)
         if status == 0:
-            # The machine was faster than before, or most was there already.
-            length = min(length, 0.8 * (time.monotonic() - began))
+            if fresh:
+                length = min(length, time.monotonic() - began)
+            fresh = True
             assert contents(campaign.output) == campaign.whole, campaign.name
             campaign.ends += 1
             if not overwrite:
@@ -158,7 +160,7 @@ def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Ra
                     path.unlink() if path.is_file() else path.rmdir()
             acknowledged = 0
             continue
-        campaign.stops += 1
+        campaign.stops, fresh = campaign.stops + 1, bool(overwrite)
         # Before `main` has set up its handlers a signal ends the process as it would any other.
         assert status in ((-number,) if number == signal.SIGKILL else (128 + number, -number)), told
         if overwrite:
