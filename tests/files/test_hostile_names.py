@@ -1,0 +1,126 @@
+"""Names in a recording that try to lead elsewhere, through every command: nothing is written outside the output."""
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from planted import contents, treasure
+
+from carts_core.cli import BAD_INPUT, main
+
+PARTS = [
+    *("..", ".", "/", "//", "\\", "~", "home", "out", "tmp", "\0", "\n", "\t", "\x1b[2J", "\x7f", "\u2028", "\u202e"),
+    *("=1+1", "-rf", "--output", "*", "?", "[red]", "%s", "{frame}", "$HOME", "`id`", ";", "|", "&", "<b>", "'", '"'),
+    *(" ", "ü", "手術", "e\u0301", "\ufeff", "\U0001f600", "CON", "a" * 120, "ü" * 130, ":", "#", "@", "+", ","),
+    *("001", "left"),
+]
+WHERE = ("sequence", "camera", "domain", "arm", "frame")
+COMMANDS: dict[str, list[str]] = {
+    "render": ["render", "--frames", "0"],
+    "optimize": ["optimize", "--frames", "0", "--solver", "none"],
+    "export masks": ["export", "out/masks", "--format", "masks"],
+    "export csv": ["export", "out/table.csv", "--format", "csv"],
+    "evaluate": ["evaluate", "--frames", "0", "--solver", "none", "--json", "out/scores.json"],
+    "calibrate": ["calibrate", "--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"],
+}
+OUTPUTS = ("runs", "out")
+"""Where commands write: the default, and what the command lines above name."""
+
+
+def hostile_names(count: int, sandbox: Path) -> Iterator[str]:
+    """Names from a seed: paths into the sandbox first, then mixtures of all that paths, consoles and tables know."""
+    dice = random.Random(21)
+    for number in range(count):
+        if number % 4 == 0:
+            up = "../" * dice.randint(1, 8)
+            yield dice.choice([f"{sandbox}/evil{number}", f"{up}evil{number}", f"a/{up}home/evil", f"{up}home/bashrc"])
+        else:
+            yield "".join(dice.choice(PARTS) for _ in range(dice.randint(1, 4)))
+
+
+def _with_name(text: str, where: str, name: str) -> str:
+    """The sequence file with a hostile name in it; images are found by a glob, so that they are there."""
+    before, after = {
+        "sequence": ('name = "tiny"', f"name = {json.dumps(name, ensure_ascii=False)}"),
+        "camera": ('name = "left"', f"name = {json.dumps(name, ensure_ascii=False)}"),
+        "domain": ("['regular']", f"[{json.dumps(name, ensure_ascii=False)}]"),
+        "arm": ('name = "PSM1"', f"name = {json.dumps(name, ensure_ascii=False)}"),
+        "frame": ('frame_id = "{frame:03d}"\n', ""),
+    }[where]
+    assert before in text
+    return text.replace(before, after).replace('"{domain}/{camera}/{frame}.png"', '"regular/left/*.png"')
+
+
+def _outside(sandbox: Path) -> dict[str, str]:
+    """Everything but the outputs."""
+    found = contents(sandbox)
+    return {name: what for name, what in found.items() if not name.startswith(tuple(f"work/{one}" for one in OUTPUTS))}
+
+
+def _run_all(recording: Path, sandbox: Path, name: str, where: str, commands: list[str]) -> int:
+    """Run commands on a recording with a hostile name; how many accepted it."""
+    work = sandbox / "work"
+    for output in OUTPUTS:
+        shutil.rmtree(work / output, ignore_errors=True)
+    file, table = work / "recording" / "sequence.toml", work / "recording" / "kinematics.csv"
+    text = (recording / "sequence.toml").read_text()
+    file.write_text(_with_name(text, where, name), encoding="utf-8", errors="surrogatepass")
+    if where == "frame":
+        header, row = (recording / "kinematics.csv").read_text().splitlines()
+        quoted = '"' + name.replace('"', '""') + '"'
+        table.write_text(f"{header}\n{quoted},{row.split(',', 1)[1]}\n", encoding="utf-8")
+    else:
+        shutil.copy(recording / "kinematics.csv", table)
+    before, accepted = _outside(sandbox), 0
+    for command in commands:
+        words = COMMANDS[command]
+        try:
+            main([words[0], "recording/sequence.toml", *words[1:]])
+            accepted += 1
+        except SystemExit as stop:
+            assert stop.code == BAD_INPUT, (command, where, name)
+        assert _outside(sandbox) == before, (command, where, name)
+    return accepted
+
+
+def _campaign(
+    recording: Path, sandbox: Path, monkeypatch: pytest.MonkeyPatch, count: int, commands: list[str]
+) -> tuple[int, int]:
+    treasure(sandbox / "home")
+    (sandbox / "work").mkdir()
+    shutil.copytree(recording, sandbox / "work" / "recording")
+    monkeypatch.chdir(sandbox / "work")
+    runs = accepted = 0
+    for number, name in enumerate(hostile_names(count, sandbox)):
+        accepted += _run_all(recording, sandbox, name, WHERE[number % len(WHERE)], commands)
+        runs += len(commands)
+        if number % 50 == 49 or number == count - 1:
+            print(f"{number + 1} names, {runs} runs, {accepted} of them to the end; 0 writes outside", flush=True)
+    return runs, accepted
+
+
+@pytest.fixture
+def recording(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=1, masks=False, truth=False).parent
+
+
+def test_hostile_names_lead_nowhere(
+    recording: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, _ = _campaign(recording, tmp_path_factory.mktemp("sandbox"), monkeypatch, 10, ["render", "export csv"])
+    assert runs == 20
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_500_hostile_names_lead_nowhere_through_any_command(
+    recording: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sandbox = tmp_path_factory.mktemp("sandbox")
+    runs, accepted = _campaign(recording, sandbox, monkeypatch, 500, list(COMMANDS))
+    assert runs == 500 * len(COMMANDS) and accepted > 100, "most names were not even tried"
+    assert sorted(os.listdir(sandbox)) == ["home", "work"]
