@@ -117,10 +117,11 @@ def test_hostile_names_lead_nowhere(
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_500_hostile_names_lead_nowhere_through_any_command(
-    recording: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    command: str, recording: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sandbox = tmp_path_factory.mktemp("sandbox")
-    runs, accepted = _campaign(recording, sandbox, monkeypatch, 500, list(COMMANDS))
-    assert runs == 500 * len(COMMANDS) and accepted > 100, "most names were not even tried"
+    runs, accepted = _campaign(recording, sandbox, monkeypatch, 500, [command])
+    assert runs == 500 and accepted > 50, "most names were not even tried"
     assert sorted(os.listdir(sandbox)) == ["home", "work"]

@@ -50,6 +50,30 @@ def test_an_earlier_export_is_never_replaced(desk: Desk) -> None:
     assert [folder.name for folder in folders] == ["masks", "masks-2"]
 
 
+@pytest.mark.parametrize("name", ["masks", "csv"])
+@pytest.mark.parametrize("kind", ["folder of exports", "temporary folder", "export", "dangling export"])
+def test_links_that_came_with_a_recording_are_not_followed(
+    desk: Desk, tmp_path: Path, name: FormatName, kind: str
+) -> None:
+    precious = tmp_path / "home" / "thesis.tex"
+    precious.parent.mkdir()
+    precious.write_text("years of work")
+    folder = desk.session.editor.project.path.with_name("sequence_exports")
+    stem = {"masks": "masks", "csv": "kinematics.csv"}[name]
+    if kind == "folder of exports":
+        folder.symlink_to(precious.parent)
+        with pytest.raises(CartsError, match="sequence_exports is a link, where a folder is needed"):
+            exported(desk, ask.Export(name, "All"))
+    else:
+        folder.mkdir()
+        place = folder / {"temporary folder": f".{stem}.part"}.get(kind, stem)
+        place.symlink_to(precious.parent if kind != "dangling export" else tmp_path / "home" / "new")
+        path = exported(desk, ask.Export(name, "All"))
+        assert not path.is_symlink() and path.parent == folder and place.is_symlink()
+    assert [path.name for path in precious.parent.iterdir()] == ["thesis.tex"]
+    assert precious.read_text() == "years of work"
+
+
 def test_only_frames_of_the_chosen_review_state_and_camera_are_written(desk: Desk) -> None:
     desk.do(ask.ShowFrame(1), ask.SetReview(ReviewState.ACCEPTED), ask.ShowCamera("right"))
     path = exported(desk, ask.Export("masks", "Accepted", shown_camera=True))
