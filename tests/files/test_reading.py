@@ -136,9 +136,7 @@ def test_a_huge_image_is_refused_before_it_is_decoded(tmp_path: Path, suffix: st
     path = tmp_path / f"huge{suffix}"
     path.write_bytes(png_header(30_000, 30_000) if suffix == ".png" else encoded_header(suffix, 30_000, 30_000))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(
-        SequenceError, match="(is 30000 x 30000 pixels|is far too large); at most 40 million pixels are read"
-    ):
+    with pytest.raises(SequenceError, match=r"is (30000 x 30000 pixels|far too large); at most 40 million pixels"):
         read_image(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
 
