@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 
 from .errors import RobotError
 from .extras import needs_extra
+from .files.reading import CALIBRATION, MESH, open_regular, read_text
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI, PsmGeometry
 from .wording import counted
@@ -61,7 +62,7 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
             "`urdf` and `meshes` (https://github.com/jhu-dvrk/dvrk_model)."
         )
     try:
-        entries = yaml.safe_load(table.read_text(encoding="utf-8"))["instruments"]
+        entries = yaml.safe_load(read_text(table, CALIBRATION))["instruments"]
         return {
             str(number): Instrument(
                 str(number),
@@ -217,5 +218,5 @@ def _relocate_meshes(root: ElementTree.Element, model: Path, folder: Path) -> No
 
 
 def _starts_with(path: Path, start: bytes) -> bool:
-    with path.open("rb") as stream:
+    with open_regular(path, MESH) as stream:
         return stream.read(len(start)) == start

@@ -244,6 +244,8 @@ class Optimizing:
             "optimizer": asdict(asked.optimizer.resolved()),
         }
         if asked.mode == "sequence":
-            keyframes = asked.keyframes and hashlib.sha256(asked.keyframes.read_bytes()).hexdigest()
+            from ..files.reading import TABLE, read_bytes
+
+            keyframes = asked.keyframes and hashlib.sha256(read_bytes(asked.keyframes, TABLE)).hexdigest()
             settings |= {"mode": asked.mode, "model": asdict(asked.model), "keyframes": keyframes}
         return settings

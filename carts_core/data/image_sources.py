@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from ..errors import SequenceError
 from ..extras import needs_extra
+from ..files.image_size import size_problem
 from .images import ImageSource, find_damage
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -136,7 +137,9 @@ def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3
     """
     if not hasattr(message, "encoding"):
         content = np.asarray(message.data, np.uint8)
-        damage = find_damage(content.tobytes())
+        data = content.tobytes()
+        if (problem := None if (damage := find_damage(data)) else size_problem(data)) is not None:
+            raise SequenceError(f"{what} {problem}. Record smaller images.")
         image = None if damage else cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise SequenceError(f"{what} is damaged: {damage or f'no {message.format} image'}. Copy the bag again.")

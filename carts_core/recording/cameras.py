@@ -1,6 +1,5 @@
 """Cameras of foreign recordings: which one a name means, and calibrations of ROS, OpenCV, Kalibr and MATLAB."""
 
-import json
 import re
 from configparser import ConfigParser
 from configparser import Error as IniError
@@ -12,6 +11,7 @@ import numpy as np
 
 from ..errors import SequenceError
 from ..extras import needs_extra
+from ..files.reading import CALIBRATION, VALUES, is_regular, parse_json, read_text
 from ..settings.importing import ImportOptions
 from .found import FoundCamera, Note
 
@@ -122,14 +122,14 @@ def with_calibration_file(camera: FoundCamera, path: Path) -> FoundCamera:
     Raises:
         SequenceError: the file is missing, damaged or of an unknown kind.
     """
-    if not path.is_file():
+    if not is_regular(path):
         raise SequenceError(f"calibration {path} of {camera.name} is missing. Correct the path.")
     try:
         if path.suffix.lower() == ".ini":
             return _from_ini(camera, path)
         if path.suffix.lower() == ".mat":
             return _from_matlab(camera, path)
-        content = json.loads(path.read_text()) if path.suffix.lower() == ".json" else _yaml(path)
+        content = parse_json(read_text(path, VALUES)) if path.suffix.lower() == ".json" else _yaml(path)
         if not isinstance(content, dict):
             raise TypeError("it holds no named values")
         return _from_names(camera, content, path)
@@ -153,7 +153,7 @@ def _yaml(path: Path) -> Any:
     import yaml  # noqa: PLC0415
 
     # OpenCV's files begin with a directive that is not YAML, and tag their matrices.
-    text = re.sub(r"^%YAML.*$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE).replace("!!opencv-matrix", "")
+    text = re.sub(r"^%YAML.*$", "", read_text(path, CALIBRATION), flags=re.MULTILINE).replace("!!opencv-matrix", "")
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -224,7 +224,7 @@ def _stereo(R: np.ndarray, T: np.ndarray) -> np.ndarray:
 def _from_ini(camera: FoundCamera, path: Path) -> FoundCamera:
     """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are millimetres."""
     parser = ConfigParser(inline_comment_prefixes=(";", "#"))
-    parser.read_string(path.read_text(encoding="utf-8"))
+    parser.read_string(read_text(path, CALIBRATION))
     left, right = parser["StereoLeft"], parser["StereoRight"]
     section = right if side_of(camera.name) == "right" else left
 

@@ -8,7 +8,6 @@
 Keys with hyphens (until dVRK 2.3) and with underscores (since 2.4) are read in all of them.
 """
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from jaxtyping import Float
 from ..camera import rigid_transform
 from ..errors import SequenceError, SettingsError
 from ..export.dvrk import T_DVRK_OPENCV
+from ..files.reading import VALUES, parse_json, read_text
 from ..settings.importing import Axes
 
 _KINDS = (
@@ -51,7 +51,7 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
         SequenceError: it is missing, of another kind, or does not say which axes it has.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(read_text(path, VALUES))
     except FileNotFoundError as error:
         raise SequenceError(f"dVRK file {path} is missing. Correct the path.") from error
     except (OSError, ValueError) as error:

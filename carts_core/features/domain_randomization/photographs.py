@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SettingsError
+from ...files.image_size import size_problem
+from ...files.reading import IMAGE, read_bytes
 
 Image = Float[np.ndarray, "h w 3"]
 
@@ -61,7 +63,11 @@ class Photographs:
 
 
 def _read(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    try:
+        content = read_bytes(path, IMAGE)
+        image = None if size_problem(content) else cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        image = None
     if image is None:
         raise SettingsError(f"photograph {path} cannot be read. Give a readable image file, or take it out.")
     scale = _LARGEST / max(image.shape[:2])

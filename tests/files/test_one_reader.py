@@ -1,0 +1,48 @@
+"""Files of others are read by `carts_core.files.reading` alone: the source is searched for calls that read a path."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import carts_core
+
+PACKAGE = Path(carts_core.__file__).parent
+READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt", "fromfile", "loadmat"}
+ALLOWED = {
+    "files": "decides what may be read",
+    "project": "reads its own database, lock and log",
+    "benchmark": "reads its own results, its source, and the machine's description",
+    "synthesis": "reads what it wrote",
+    "data/bench.py": "reads the state of its own process",
+    "commands/frame_folder.py": "reads what an earlier run of the same command wrote",
+    "recording/writing.py": "reads back the sequence that it writes",
+}
+
+
+def _modules() -> Iterator[tuple[str, ast.Module]]:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        if not any(name == allowed or name.startswith(f"{allowed}/") for allowed in ALLOWED):
+            yield name, ast.parse(path.read_text(encoding="utf-8"))
+
+
+def reading_calls(module: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and name of every call that reads a path by itself; a plain call is that of `files.reading`."""
+    for node in ast.walk(module):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr in READERS:
+                yield node.lineno, node.func.attr
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "open":
+            yield node.lineno, "open"
+
+
+@pytest.mark.parametrize("call", ["path.read_text()", "cv2.imread(name)", "open(path)", "np.loadtxt(name)"])
+def test_a_call_that_reads_a_path_is_found(call: str):
+    assert list(reading_calls(ast.parse(call)))
+
+
+def test_no_other_module_reads_files_of_others():
+    found = [f"{name}:{line} {call}" for name, module in _modules() for line, call in reading_calls(module)]
+    assert found == [], f"read through carts_core.files.reading: {found}"
