@@ -170,7 +170,10 @@ def check_path(path: str | Path) -> None:
     Raises:
         ValueError: a part of the path, or the path, is too long.
     """
-    data = os.fsencode(path)
+    text = str(path)
+    if len(text) <= LARGEST_NAME and text.isascii():
+        return
+    data = os.fsencode(text)
     if len(data) > LARGEST_PATH or any(len(part) > LARGEST_NAME for part in data.split(b"/")):
         raise ValueError(f"a name is longer than {LARGEST_NAME} bytes, or the path longer than {LARGEST_PATH}")
 
