@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 
 from ...errors import SequenceError
+from ...files.image_size import size_problem
+from ...files.reading import IMAGE, read_bytes
 from ...psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
 from ..assembling import cameras_of
@@ -73,7 +75,8 @@ def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: 
     if not shared:
         notes.append(Note("warning", f"{folder}: no mask is of a frame; they are left out."))
         return camera
-    first = cv2.imread(str(folder / masks.pattern.format(frame=shared[0])), cv2.IMREAD_GRAYSCALE)
+    content = read_bytes(folder / masks.pattern.format(frame=shared[0]), IMAGE)
+    first = None if size_problem(content) else cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
     if first is not None and 0 < first.max() < _WHITE:
         text = "are labels instead of 0 and 255; they are left out. Write masks with 255 where the instrument is."
         notes.append(Note("missing", f"masks in {folder} {text}"))
