@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
@@ -183,3 +184,16 @@ def _image_messages(make: Any, header: Any, time: int, frame: int, camera: str, 
     roi = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     info = make("sensor_msgs/msg/CameraInfo", header=header, binning_x=0, binning_y=0, roi=roi, **values)
     yield time, f"/stereo/{camera}/camera_info", info
+
+
+def write_video(path: Path, pictures: list[np.ndarray], rate: int = 25, codec: str = "libx264") -> Path:
+    """A video of RGB pictures."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        container.mux(stream.encode())
+    return path

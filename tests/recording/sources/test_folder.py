@@ -5,12 +5,11 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import av
 import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from recordings import SIZE, START, K, image, joints_at, pose_of, write_images
+from recordings import SIZE, START, K, image, joints_at, pose_of, write_images, write_video
 from scipy.io import savemat
 
 from carts_core.cli import main
@@ -99,18 +98,9 @@ def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path, unit)
     assert np.abs(sequence.frame(3).measured["PSM2"][:6] - joints_at(0.3)).max() < 1e-5
 
 
-def write_video(path: Path, frames: int, rate: int = 25) -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate)
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-        for number in range(frames):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image(number), "rgb24")))
-        container.mux(stream.encode())
-
-
 def test_a_video_with_another_clock_gets_a_guessed_offset_that_is_said(tmp_path):
     (tmp_path / "rec").mkdir()
-    write_video(tmp_path / "rec/scope.mp4", 20)
+    write_video(tmp_path / "rec/scope.mp4", [image(number) for number in range(20)])
     times = np.arange(200) / 100
     poses = np.array([pose_of(T) for T in forward(joints_at(times))])
     header = ["time", *(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]

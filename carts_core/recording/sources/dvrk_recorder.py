@@ -1,0 +1,273 @@
+"""Sessions of the dVRK's official recorder: index.json, videos with JSON sidecars, a ROS 2 bag or extracted CSV files.
+
+The time of a frame is that of its own camera or of both (mono, else the middle of left and right, else left, else
+right), else when the recorder received it. Frames are found by their number, never by their time. The latency that a
+sidecar estimates is not applied there; it is the time offset that is proposed here.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...data.image_sources import open_bag
+from ...data.video import SUFFIXES
+from ...errors import SequenceError
+from ...files.reading import VALUES, parse_json, read_text
+from ...settings.importing import ImportOptions
+from ..alignment import nearest
+from ..cameras import calibration_of, side_of
+from ..foreign_tables import ForeignTable, read_foreign_table
+from ..found import FoundCamera, FoundRecording, Note
+from ..logs import ArmLog, Track, arm_from_log, track
+from ..media import find_images
+from .bag import read_arm_logs
+from .protocol import Source
+
+_SIDES = {"LR": ("left", "right"), "RL": ("right", "left")}
+_OLD_UNITS = {"timestamps_ns": 1e-9, "timestamps_ms": 1e-3, "timestamps": 1.0}
+_FAR = 0.02
+"""[s] Images of two cameras further apart than this are said."""
+_JOINT_COLUMNS = tuple(f"position.{index}" for index in range(6))
+_POSE_COLUMNS = (
+    *(f"pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.orientation.{axis}" for axis in "xyzw"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stream:
+    """A video and the times of its frames."""
+
+    video: Path
+    name: str
+    numbers: np.ndarray
+    """Frames of the video, from 0."""
+    times: np.ndarray
+    """[s]"""
+    side_by_side: str
+    latency: float
+    """Estimated, of the images [s]."""
+
+
+def _json(path: Path, what: str) -> Any:
+    try:
+        return parse_json(read_text(path, VALUES))
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{what} {path} is not readable JSON ({error}). Copy the session again.") from error
+
+
+def _detect(path: Path) -> bool:
+    if not path.is_dir():
+        return False
+    if (path / "index.json").is_file():
+        return True
+    return any((video.with_suffix(".json")).is_file() for video in _videos(path))
+
+
+def _videos(path: Path) -> list[Path]:
+    try:
+        return sorted(each for each in path.iterdir() if each.suffix.lower() in SUFFIXES)
+    except OSError:
+        return []
+
+
+def _streams(path: Path, notes: list[Note]) -> list[_Stream]:
+    videos = _videos(path)
+    if (path / "index.json").is_file():
+        index = _json(path / "index.json", "index")
+        listed = index.get("videos") if isinstance(index, dict) else None
+        if not isinstance(listed, list) or not all(isinstance(entry, dict) and "file" in entry for entry in listed):
+            raise SequenceError(f'{path / "index.json"} has no list "videos" of entries with "file". Copy it again.')
+        videos = [path / Path(str(entry["file"])).name for entry in listed]
+    streams = []
+    for video in videos:
+        if not video.is_file():
+            raise SequenceError(f"video {video} is missing, which the session names. Copy the session again, whole.")
+        sidecar = video.with_suffix(".json")
+        if not sidecar.is_file():
+            raise SequenceError(f"{video} has no {sidecar.name} with the times of its frames. Copy it too.")
+        streams.append(_stream(video, sidecar, notes))
+    return streams
+
+
+def _stream(video: Path, sidecar: Path, notes: list[Note]) -> _Stream:
+    content = _json(sidecar, "sidecar")
+    if not isinstance(content, dict):
+        raise SequenceError(f"sidecar {sidecar} holds no named values. Copy it again.")
+    name = str(content.get("stream_name") or video.stem)
+    for key, unit in _OLD_UNITS.items():
+        if isinstance(stamps := content.get(key), list) and stamps:
+            times = _numbers(stamps, sidecar) * unit
+            return _checked(_Stream(video, name, np.arange(len(times)), times, "undefined", 0.0), sidecar, notes)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise SequenceError(f'sidecar {sidecar} has neither "frames" nor "timestamps_ns". Copy it again.')
+    try:
+        numbers = np.array([int(frame["frame_index"]) for frame in frames])
+        times = np.array([_frame_time(frame) for frame in frames])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SequenceError(
+            f"sidecar {sidecar}: a frame lacks {error}. Its frames need frame_index and cpu.realtime times."
+        ) from error
+    layout = str(content.get("side_by_side") or "undefined")
+    if layout not in ("undefined", *_SIDES):
+        raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; known are undefined, LR and RL.")
+    latency = content.get("estimated_latency_ms")
+    latency = float(latency) * 1e-3 if isinstance(latency, int | float) else 0.0
+    if (dropped := content.get("frames_dropped")) not in (0, None):
+        notes.append(Note("warning", f"{video.name}: the recorder dropped {dropped} frames."))
+    return _checked(_Stream(video, name, numbers, times, layout, latency), sidecar, notes)
+
+
+def _numbers(values: list[Any], path: Path) -> np.ndarray:
+    try:
+        return np.array(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SequenceError(f"sidecar {path}: its times are no numbers ({error}). Copy it again.") from error
+
+
+def _frame_time(frame: dict[str, Any]) -> float:
+    """The time of a frame by the rule of the recorder's documentation [s]."""
+    real = frame["cpu"]["realtime"]
+
+    def known(key: str) -> int | None:
+        value = real.get(f"{key}_ns")
+        return int(value) if isinstance(value, int | float) and value > 0 else None
+
+    if (mono := known("mono_source")) is not None:
+        return mono * 1e-9
+    left, right = known("left_source"), known("right_source")
+    if left is not None and right is not None:
+        return (left + right) / 2 * 1e-9
+    for value in (left, right, known("recorder_reception")):
+        if value is not None:
+            return value * 1e-9
+    raise KeyError("any time in cpu.realtime")
+
+
+def _checked(stream: _Stream, sidecar: Path, notes: list[Note]) -> _Stream:
+    """The stream without frames that the video does not have, in the order of their times."""
+    count = len(find_images(stream.video).ids)
+    if stream.numbers.max() >= count or len(stream.numbers) < count:
+        text = (
+            f"{stream.video.name} has {count} frames and its sidecar {len(stream.numbers)}; the common ones are used."
+        )
+        notes.append(Note("warning", text))
+    good = (stream.numbers >= 0) & (stream.numbers < count) & np.isfinite(stream.times)
+    if not good.any():
+        raise SequenceError(
+            f"sidecar {sidecar} is of another video: no frame of it is in {stream.video}. Copy both again."
+        )
+    numbers, times = stream.numbers[good], stream.times[good]
+    order = np.argsort(times, kind="stable")
+    increasing = np.concatenate([[True], np.diff(times[order]) > 0])
+    return replace(stream, numbers=numbers[order][increasing], times=times[order][increasing])
+
+
+def _cameras(
+    streams: list[_Stream], options: ImportOptions, notes: list[Note]
+) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
+    parts: dict[str, tuple[_Stream, tuple[int, int, int, int] | None, tuple[int, int]]] = {}
+    for stream in streams:
+        width, height = find_images(stream.video).size
+        layout = stream.side_by_side
+        if layout == "undefined" and width >= 3 * height:
+            layout = "LR"
+            text = f"{stream.video.name} is {width} x {height}: side-by-side stereo, the left camera at the left"
+            notes.append(Note("guessed", f"{text} (its sidecar does not say)."))
+        if layout in _SIDES:
+            half = width // 2
+            for position, side in enumerate(_SIDES[layout]):
+                parts[side] = (stream, (position * half, 0, half, height), (half, height))
+        else:
+            parts[side_of(stream.name) or side_of(stream.video.stem) or stream.name] = (stream, None, (width, height))
+    order = sorted(parts, key=lambda name: (name != "left", name))
+    leader = parts[order[0]][0]
+    cameras = []
+    for name in order:
+        stream, crop, size = parts[name]
+        rows = nearest(leader.times, stream.times)
+        if (late := np.abs(stream.times[rows] - leader.times).max()) > _FAR:
+            notes.append(Note("warning", f"images of {name} are up to {late:.3f} s from those of {order[0]}."))
+        camera = FoundCamera(name, size, stream.video, crop=crop, numbers=stream.numbers[rows])
+        cameras.append(calibration_of(camera, options, notes))
+        where = "" if crop is None else f", its part from column {crop[0]}"
+        notes.append(Note("found", f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames."))
+    return tuple(cameras), leader.times
+
+
+def _logs(path: Path, options: ImportOptions) -> list[ArmLog]:
+    bags = [each for each in sorted(path.iterdir()) if (each / "metadata.yaml").is_file()]
+    bags += sorted(path.glob("*.mcap"))
+    if bags:
+        reader = open_bag(bags[0])
+        try:
+            return read_arm_logs(reader, bags[0], options)
+        finally:
+            reader.close()
+    return _extracted(path, options)
+
+
+def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
+    """Logs from CSV files called by their topic, `_PSM1_measured_js.csv`."""
+    roles = {
+        "jaw_measured_js": "jaw",
+        "local_measured_cp": "local_poses",
+        "measured_js": "joints",
+        "measured_cp": "poses",
+    }
+    rename = {recorded: name for name, recorded in options.arms.items()}
+    found: dict[str, dict[str, Track | None]] = {}
+    for file in sorted(path.glob("*.csv")):
+        arm, _, topic = file.stem.strip("_").partition("_")
+        if not arm.startswith("PSM") or topic not in roles or (rename and arm not in rename):
+            continue
+        found.setdefault(rename.get(arm, arm), {})[roles[topic]] = _extracted_track(file, roles[topic])
+    return [
+        ArmLog(arm, tracks.get("joints"), tracks.get("jaw"), tracks.get("poses"), tracks.get("local_poses"))
+        for arm, tracks in found.items()
+    ]
+
+
+def _extracted_track(file: Path, role: str) -> Track | None:
+    table: ForeignTable = read_foreign_table(file)
+    columns = {"joints": _JOINT_COLUMNS, "jaw": _JOINT_COLUMNS[:1]}.get(role, _POSE_COLUMNS)
+    values = [table.numbers(column).astype(np.float64) for column in columns]
+    times = table.numbers("timestamp").astype(np.float64) * 1e-9
+    return track(list(zip(times, *values, strict=True)))
+
+
+def _read(path: Path, options: ImportOptions) -> FoundRecording:
+    notes: list[Note] = []
+    streams = _streams(path, notes)
+    if not streams:
+        raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the session again, whole.")
+    cameras, times = _cameras(streams, options, notes)
+    logs = _logs(path, options)
+    if not logs:
+        raise SequenceError(
+            f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
+            "from one (_PSM1_measured_js.csv). Copy the bag's folder too."
+        )
+    arms = tuple(arm_from_log(log, options, notes.append) for log in logs)
+    latency = max(stream.latency for stream in streams)
+    offset = -latency if options.time_offset is None else options.time_offset
+    if latency and options.time_offset is None:
+        notes.append(
+            Note("guessed", f"time offset {-latency:.4f} s: the recorder's estimated latency (change: --time-offset).")
+        )
+    ids = tuple(f"{number:06d}" for number in range(len(times)))
+    return FoundRecording(
+        "a session of the dVRK's recorder", path.name, cameras, arms, ids, times, tuple(notes), offset
+    )
+
+
+SOURCE = Source(
+    "dvrk",
+    "a session of the dVRK's recorder",
+    "a folder with index.json, or videos each with a .json beside it",
+    _detect,
+    _read,
+)
