@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -142,7 +142,8 @@ def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
     named = {key: column for key, column in found.items() if not key.startswith("#")}
     for number in numbers:
         if 0 <= number - start < len(names):
-            named.setdefault(names[number - start], found[f"#{number}"])
+            # Numbered joints come before names such as roll, which may be angles of the tip.
+            named[names[number - start]] = found[f"#{number}"]
     return named
 
 
@@ -207,18 +208,20 @@ def arm_log(
         values[:, angles] *= np.pi / 180 if degrees else 1.0
         values[:, 2] *= 1e-3 if millimetres else 1.0
         note(Note("guessed", f"{arm}: joints are {', '.join(columns)} (change: --columns yaw COLUMN ...)."))
-        jaw = None
-        if "jaw" in found:
-            opening = table.numbers(found["jaw"]).astype(np.float64) * (np.pi / 180 if degrees else 1.0)
-            jaw = track(list(zip(times, opening, strict=True)))
-        log = ArmLog(arm, joints=track([(time, *row) for time, row in zip(times, values, strict=True)]), jaw=jaw)
+        log = ArmLog(arm, joints=track([(time, *row) for time, row in zip(times, values, strict=True)]))
     else:
         values = np.stack([table.numbers(found[name]).astype(np.float64) for name in _POSE_ORDER], 1)
         degrees, millimetres = _units(np.zeros((1, 1)), values[:, :3], [found["x"]], options)
         values[:, :3] *= 1e-3 if millimetres else 1.0
         columns = [found[name] for name in _POSE_ORDER]
-        note(Note("guessed", f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the arm's base."))
-        log = ArmLog(arm, local_poses=track([(time, *row) for time, row in zip(times, values, strict=True)]))
+        poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
+        seen = arm in options.base
+        frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
+        note(Note("guessed", f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
+        log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses)
+    if "jaw" in found:
+        opening = table.numbers(found["jaw"]).astype(np.float64) * (np.pi / 180 if degrees else 1.0)
+        log = replace(log, jaw=track(list(zip(times, opening, strict=True))))
     note(
         Note(
             "guessed",

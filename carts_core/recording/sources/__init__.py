@@ -6,7 +6,8 @@ from .carts_layouts import CTS as _CTS
 from .carts_layouts import SEGSTRONG_C as _SEGSTRONG_C
 from .dvrk_recorder import SOURCE as _DVRK
 from .folder import SOURCE as _FOLDER
+from .lerobot import SOURCE as _LEROBOT
 from .protocol import Source as Source
 
-SOURCES: tuple[Source, ...] = (_DVRK, _BAG, _CTS, _AMBF, _SEGSTRONG_C, _FOLDER)
+SOURCES: tuple[Source, ...] = (_DVRK, _BAG, _LEROBOT, _CTS, _AMBF, _SEGSTRONG_C, _FOLDER)
 """In the order in which they are tried: those with clear signs first, what fits nearly everything last."""

@@ -1,0 +1,208 @@
+"""LeRobot data sets, v2.1 and v3.0 (Open-H-Embodiment): Parquet tables and videos, without the package `lerobot`."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import SequenceError
+from ...extras import needs_extra
+from ...files.reading import VALUES, parse_json, read_text
+from ...settings.importing import ImportOptions
+from ..assembling import by_rows
+from ..cameras import calibration_of, side_of
+from ..columns import arm_log, guess_columns
+from ..foreign_tables import ForeignTable
+from ..found import FoundArm, FoundCamera, FoundRecording, Note
+from ..logs import arm_from_log
+from ..media import find_images
+from .protocol import Source
+
+_STATE = "observation.state"
+_EPISODE = re.compile(r"episode_(\d+)\.parquet$")
+
+
+@dataclass(frozen=True, eq=False)
+class _Episode:
+    """One episode: its rows, and where its images are in the videos."""
+
+    index: int
+    table: Any
+    """pyarrow.Table with the episode's rows."""
+    videos: dict[str, tuple[Path, int]]
+    """Feature -> video, and the episode's first frame in it."""
+
+
+def _detect(path: Path) -> bool:
+    return (_root(path) / "meta/info.json").is_file()
+
+
+def _root(path: Path) -> Path:
+    """The data set's folder, also for one of its episode files."""
+    if path.is_file() and _EPISODE.search(path.name):
+        return next((parent for parent in path.parents if (parent / "meta/info.json").is_file()), path)
+    return path
+
+
+def _read(path: Path, options: ImportOptions) -> FoundRecording:
+    needs_extra("pyarrow", "import")
+    root = _root(path)
+    try:
+        info = parse_json(read_text(root / "meta/info.json", VALUES))
+        features = dict(info["features"])
+        rate = float(info["fps"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SequenceError(
+            f"{root / 'meta/info.json'} is no LeRobot description with features and fps ({error!r}). Copy it again."
+        ) from error
+    notes: list[Note] = []
+    wanted = _EPISODE.search(path.name)
+    cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
+    episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, notes)
+    rows = episode.table.num_rows
+    if not rows:
+        raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
+    if (total := info.get("total_episodes", 1)) != 1:
+        notes.append(
+            Note("found", f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
+        )
+    ids = tuple(f"{number:06d}" for number in range(rows))
+    arms = _arms(root, features, episode, options, notes)
+    arms, kept_ids, kept = by_rows(arms, ids, notes)
+    found = _cameras(root, episode, kept, rows, options, notes)
+    times = np.arange(rows) / rate
+    return FoundRecording(
+        f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})",
+        f"{root.name}-{episode.index:06d}",
+        found,
+        arms,
+        kept_ids,
+        times[kept],
+        tuple(notes),
+    )
+
+
+def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, notes: list[Note]) -> _Episode:
+    chunk = index // max(int(info.get("chunks_size", 1000)), 1)
+    old = root / f"data/chunk-{chunk:03d}/episode_{index:06d}.parquet"
+    if old.is_file():
+        videos = {key: (root / f"videos/chunk-{chunk:03d}/{key}/episode_{index:06d}.mp4", 0) for key in cameras}
+        return _Episode(index, _parquet(old), videos)
+    # v3.0: many episodes in one file; meta/episodes says where each begins.
+    listed = sorted((root / "meta/episodes").rglob("*.parquet"))
+    for file in listed:
+        for row in _parquet(file).to_pylist():
+            if row.get("episode_index") == index:
+                return _v3(root, row, cameras, float(info["fps"]), index)
+    raise SequenceError(
+        f"{root} has no episode {index}: neither {old.relative_to(root)} nor a row of meta/episodes. Copy it again."
+    )
+
+
+def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index: int) -> _Episode:
+    import pyarrow  # noqa: PLC0415
+
+    try:
+        chunk, file = int(row["data/chunk_index"]), int(row["data/file_index"])
+        table = _parquet(root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet")
+        table = table.filter(pyarrow.array(np.asarray(table.column("episode_index")) == index))
+        videos = {}
+        for key in cameras:
+            place = (
+                f"chunk-{int(row[f'videos/{key}/chunk_index']):03d}/file-{int(row[f'videos/{key}/file_index']):03d}.mp4"
+            )
+            videos[key] = (root / f"videos/{key}/{place}", round(float(row[f"videos/{key}/from_timestamp"]) * rate))
+    except (KeyError, TypeError, ValueError) as error:
+        raise SequenceError(
+            f"{root}: meta/episodes lacks {error} of episode {index}. Copy the data set again."
+        ) from error
+    return _Episode(index, table, videos)
+
+
+def _parquet(path: Path) -> Any:
+    import pyarrow  # noqa: PLC0415
+    import pyarrow.parquet  # noqa: PLC0415
+
+    try:
+        return pyarrow.parquet.read_table(path)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise SequenceError(
+            f"table {path} cannot be read ({error}). Copy it again; Git LFS pointers need a pull."
+        ) from error
+
+
+def _names(value: Any) -> list[str]:
+    """Names of a feature's columns, which may be nested in lists or under a key."""
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, dict):
+        value = list(value.values())
+    return [name for entry in value or () for name in _names(entry)]
+
+
+def _arms(
+    root: Path, features: dict[str, Any], episode: _Episode, options: ImportOptions, notes: list[Note]
+) -> tuple[FoundArm, ...]:
+    if _STATE not in features or _STATE not in episode.table.column_names:
+        raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
+    names = _names(features[_STATE].get("names"))
+    try:
+        values = np.array(episode.table.column(_STATE).to_pylist(), np.float64)
+    except (TypeError, ValueError) as error:
+        raise SequenceError(f"{root}: rows of {_STATE} differ in length ({error}). Copy the data set again.") from error
+    if values.ndim != 2 or len(names) != values.shape[1]:
+        raise SequenceError(
+            f"{root}: {_STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."
+        )
+    table = ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
+    meanings = guess_columns(table, options)
+    if not meanings.arms:
+        raise SequenceError(
+            f"{root}: {_STATE} has the columns {', '.join(names)}, among which six joints or a tip's pose are not "
+            "recognized. Name them: --columns yaw COLUMN pitch COLUMN ..."
+        )
+    rename = {recorded: name for name, recorded in options.arms.items()}
+    times = np.arange(len(values), dtype=float)
+    arms = []
+    for recorded, columns in meanings.arms.items():
+        if rename and recorded not in rename:
+            continue
+        name = rename.get(recorded, recorded or "PSM1")
+        arms.append(arm_from_log(arm_log(table, name, columns, times, options, notes.append), options, notes.append))
+    return tuple(arms)
+
+
+def _cameras(
+    root: Path, episode: _Episode, kept: np.ndarray, rows: int, options: ImportOptions, notes: list[Note]
+) -> tuple[FoundCamera, ...]:
+    chosen = {name: key for name, key in options.images.items()} or {
+        side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos
+    }
+    cameras = []
+    for name, key in sorted(chosen.items()):
+        if key not in episode.videos:
+            raise SequenceError(f"{root} has no video {key!r}. It has: {', '.join(episode.videos) or 'none'}.")
+        video, start = episode.videos[key]
+        if not video.is_file():
+            raise SequenceError(f"video {video} is missing. Copy the data set again, whole.")
+        images = find_images(video)
+        if len(images.ids) < start + rows:
+            raise SequenceError(
+                f"video {video} has {len(images.ids)} frames, but episode {episode.index} is frames {start} to "
+                f"{start + rows - 1}. Copy it again."
+            )
+        notes.append(Note("found", f"camera {name}: {key}, {images.size[0]} x {images.size[1]}."))
+        camera = FoundCamera(name, images.size, video, numbers=start + kept)
+        cameras.append(calibration_of(camera, options, notes))
+    return tuple(cameras)
+
+
+SOURCE = Source(
+    "lerobot",
+    "a LeRobot data set, v2.1 or v3.0",
+    "a folder with meta/info.json, or an episode's .parquet file in one",
+    _detect,
+    _read,
+)

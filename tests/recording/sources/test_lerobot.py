@@ -1,0 +1,175 @@
+"""LeRobot data sets of both versions, written with pyarrow and PyAV in the layouts of their owners."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from recordings import image, jaw_at, joints_at, pose_of, write_video
+
+from carts_core.cli import main
+from carts_core.data import Sequence
+from carts_core.errors import CartsError
+from carts_core.psm_kinematics import forward
+from carts_core.recording.importing import find, import_recording
+from carts_core.settings.importing import ImportOptions
+
+FRAMES = 6
+LENGTHS = (4, FRAMES)
+CAMERAS = {"observation.images.endoscope.left": "left", "observation.images.endoscope.right": "right"}
+POSES = [
+    *(f"psm1_pose.position.{axis}" for axis in "xyz"),
+    *(f"psm1_pose.orientation.{axis}" for axis in "xyzw"),
+    "psm1_jaw",
+]
+JOINTS = [*(f"PSM2_joint_{n}" for n in range(1, 7)), "PSM2_jaw", *(f"PSM2_ee_{a}" for a in "xyz")]
+JOINTS += ["PSM2_roll", "PSM2_pitch", "PSM2_yaw"]
+
+
+def states(names: list[str], start: int, count: int) -> list[list[float]]:
+    times = np.arange(start, start + count) / 30
+    if names is POSES:
+        return [[*pose_of(forward(joints_at(time))), float(jaw_at(time))] for time in times]
+    return [[*joints_at(time), float(jaw_at(time)), 0, 0, 0, 9, 9, 9] for time in times]
+
+
+def write_parquet(path: Path, columns: dict) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+
+
+def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES) -> Path:
+    """Two episodes; the second one's times go on where the first one's end."""
+    video = {"dtype": "video", "shape": [72, 96, 3], "names": ["height", "width", "channel"]}
+    state = {"dtype": "float32", "shape": [len(names)], "names": [names] if version == "v2.1" else names}
+    features = {"observation.state": state, **dict.fromkeys(CAMERAS, video)}
+    info = {"codebase_version": version, "fps": 30, "total_episodes": 2, "chunks_size": 1000, "features": features}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    starts = np.concatenate([[0], np.cumsum(LENGTHS)]).tolist()
+    tables = [
+        {
+            "observation.state": states(names, starts[episode], count),
+            "episode_index": [episode] * count,
+            "frame_index": list(range(count)),
+        }
+        for episode, count in enumerate(LENGTHS)
+    ]
+    for key, camera in CAMERAS.items():
+        pictures = [[image(starts[e] + n, camera) for n in range(count)] for e, count in enumerate(LENGTHS)]
+        if version == "v2.1":
+            for episode, part in enumerate(pictures):
+                write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", part, 30)
+        else:
+            write_video(folder / f"videos/{key}/chunk-000/file-000.mp4", [p for part in pictures for p in part], 30)
+    if version == "v2.1":
+        for episode, table in enumerate(tables):
+            write_parquet(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
+        return folder
+    write_parquet(
+        folder / "data/chunk-000/file-000.parquet", {key: tables[0][key] + tables[1][key] for key in tables[0]}
+    )
+    episodes: dict[str, list] = {"episode_index": [0, 1], "data/chunk_index": [0, 0], "data/file_index": [0, 0]}
+    for key in CAMERAS:
+        episodes |= {f"videos/{key}/chunk_index": [0, 0], f"videos/{key}/file_index": [0, 0]}
+        episodes[f"videos/{key}/from_timestamp"] = [0.0, LENGTHS[0] / 30]
+    write_parquet(folder / "meta/episodes/chunk-000/file-000.parquet", episodes)
+    return folder
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("names", [POSES, JOINTS], ids=["poses", "joints"])
+def test_a_data_set_becomes_a_sequence_by_one_command(tmp_path, version, names):
+    path = dataset(tmp_path / "set", version, names)
+    main(["import", str(path), "-o", str(tmp_path / "out")])
+    sequence = Sequence.open(tmp_path / "out/sequence.toml")
+    assert len(sequence) == LENGTHS[0] and [camera.name for camera in sequence.scene.cameras] == ["left", "right"]
+    frame = sequence.frame(3)
+    arm = "PSM1" if names is POSES else "PSM2"
+    assert np.abs(frame.measured[arm][:6] - joints_at(3 / 30)).max() < 1e-8
+    assert frame.measured[arm][6] == pytest.approx(float(jaw_at(3 / 30)))
+    assert np.abs(frame.images["right"].astype(int) - image(3, "right")).mean() < 6
+    assert frame.timestamp == pytest.approx(0.1)
+
+
+def test_another_episode_is_chosen_by_its_file(tmp_path):
+    path = dataset(tmp_path / "set")
+    file, found = import_recording(path / "data/chunk-000/episode_000001.parquet", tmp_path / "out")
+    assert len(found.frame_ids) == FRAMES
+    frame = Sequence.open(file).frame(5)
+    assert np.abs(frame.measured["PSM1"][:6] - joints_at((LENGTHS[0] + 5) / 30)).max() < 1e-8
+    assert np.abs(frame.images["left"].astype(int) - image(LENGTHS[0] + 5)).mean() < 6
+
+
+def test_a_second_episode_in_a_shared_video_begins_where_it_begins(tmp_path):
+    path = dataset(tmp_path / "set", "v3.0")
+    (path / "data/chunk-000/episode_000001.parquet").touch()
+    (path / "data/chunk-000/episode_000001.parquet").rename(path / "episode_000001.parquet")
+    found = find(path / "episode_000001.parquet")
+    assert found.cameras[0].numbers is not None and found.cameras[0].numbers.tolist() == list(range(4, 10))
+
+
+def info_changed(change: Callable[[dict], object]) -> Callable[[Path], object]:
+    def mutate(path: Path) -> None:
+        content = json.loads((path / "meta/info.json").read_text())
+        change(content)
+        (path / "meta/info.json").write_text(json.dumps(content))
+
+    return mutate
+
+
+FIRST = "data/chunk-000/episode_000000.parquet"
+VIDEO = "videos/chunk-000/observation.images.endoscope.left/episode_000000.mp4"
+MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "info is cut": (lambda p: (p / "meta/info.json").write_text("{"), "no LeRobot description"),
+    "info without rate": (info_changed(lambda c: c.pop("fps")), "no LeRobot description"),
+    "info without features": (info_changed(lambda c: c.pop("features")), "no LeRobot description"),
+    "no state": (info_changed(lambda c: c["features"].pop("observation.state")), "has no feature observation.state"),
+    "names are too few": (info_changed(lambda c: c["features"]["observation.state"].update(names=["x"])), "1 names"),
+    "no names": (info_changed(lambda c: c["features"]["observation.state"].update(names=None)), "0 names"),
+    "unknown names": (
+        info_changed(lambda c: c["features"]["observation.state"].update(names=[f"motor{c}" for c in "abcdefgh"])),
+        "not recognized",
+    ),
+    "no episode": (lambda p: (p / FIRST).unlink(), "has no episode 0"),
+    "cut table": (lambda p: (p / FIRST).write_bytes((p / FIRST).read_bytes()[:100]), "cannot be read"),
+    "pointer instead of a table": (lambda p: (p / FIRST).write_text("version https://git-lfs"), "Git LFS pointers"),
+    "no rows": (lambda p: write_parquet(p / FIRST, {"observation.state": pyarrow.array([], "float32")}), "no rows"),
+    "missing column": (lambda p: write_parquet(p / FIRST, {"state": [1.0]}), "has no feature observation.state"),
+    "ragged rows": (lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0], [1.0, 2.0]]}), "differ in length"),
+    "missing video": (lambda p: (p / VIDEO).unlink(), r"episode_000000\.mp4 is missing"),
+    "short video": (
+        lambda p: write_video(p / VIDEO, [image(0), image(1)], 30),
+        "has 2 frames, but episode 0 is frames 0 to 3",
+    ),
+    "cut video": (lambda p: (p / VIDEO).write_bytes((p / VIDEO).read_bytes()[:300]), r"episode_000000\.mp4"),
+    "poses elsewhere": (
+        lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
+        "no joint positions reach",
+    ),
+    "no orientation": (
+        lambda p: write_parquet(p / FIRST, {"observation.state": [[0.0] * 8] * 4}),
+        "no joint positions reach 4 of 4 poses .the pose is not finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_broken_data_set_is_an_error_in_words_and_leaves_nothing(tmp_path, name):
+    mutate, message = MUTATIONS[name]
+    path = dataset(tmp_path / "set")
+    mutate(path)
+    with pytest.raises(CartsError, match=message):
+        import_recording(path, tmp_path / "out")
+    assert [found.name for found in tmp_path.iterdir()] == ["set"]
+
+
+def test_a_video_is_asked_for_by_its_feature(tmp_path):
+    path = dataset(tmp_path / "set")
+    found = find(path, ImportOptions(images={"scope": "observation.images.endoscope.right"}))
+    assert [camera.name for camera in found.cameras] == ["scope"]
+    with pytest.raises(CartsError, match=r"has no video 'x'\. It has: observation"):
+        find(path, ImportOptions(images={"scope": "x"}))
