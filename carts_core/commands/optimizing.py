@@ -15,6 +15,7 @@ from ..data import Frame, Sequence
 from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
 from ..features.extractor import FeatureExtractor
+from ..files import remove_file
 from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, sequence_checkpoint
 from ..optimization.parameters import ParameterVector
@@ -98,6 +99,9 @@ class Optimizing:
         elif todo:
             # Every frame depends on all others, so one that is missing has all of them done again.
             self._as_sequence(part, now, common)
+        else:
+            # A kill between the last result and the end leaves it.
+            remove_file(output.checkpoint)
         if todo:
             self._console.print(
                 f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
