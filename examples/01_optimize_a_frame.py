@@ -12,7 +12,7 @@ import tyro
 from carts_core.data import Sequence
 from carts_core.export import image_and_mask, overlay
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer
+from carts_core.optimization import Backgrounds, FrameOptimizer
 from carts_core.perturbation import perturb
 from carts_core.process import tune_process
 from carts_core.rendering import Renderer
@@ -27,8 +27,9 @@ def main(sequence: Path | None = None, picture: Path = Path("overlay.png")) -> N
     start = perturb(recording.scene, frame.measured, degrees=2.0, seed=1)
 
     extractor = FeatureExtractor.load()
-    # The default loss needs no background; the losses of example 02 do.
-    optimizer = FrameOptimizer(recording.scene, frame, {}, extractor, start=start, cameras=[camera])
+    # The scene without arms, so that what looks like one is not taken for one; {} goes without.
+    backgrounds = Backgrounds.of(recording, [camera], frame.domain)
+    optimizer = FrameOptimizer(recording.scene, frame, backgrounds, extractor, start=start, cameras=[camera])
     for iterate in optimizer:
         print(f"iteration {iterate.index:3}  loss {iterate.loss:.4f}  {1000 * iterate.seconds:.0f} ms")
     best = optimizer.best

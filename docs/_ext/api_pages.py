@@ -12,6 +12,7 @@ _ELSEWHERE = {"settings", "commands", "cli"}
 """They have pages of their own."""
 _INTERNAL = {
     "bench",
+    "console",
     "benchmark",
     "decimation",
     "extras",
