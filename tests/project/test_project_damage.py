@@ -1,0 +1,210 @@
+"""Damaged and crafted project files: what is read is right or is reported, and the file stays as it is."""
+
+import json
+import os
+import random
+import shutil
+import sqlite3
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from project_model import FRAMES, IDENTITY, act, visible
+from sql_file import edit_file, rows
+
+from carts_core.errors import ProjectError
+from carts_core.project import Key, Project, Review, database, digests
+
+NOTE = {Key.review(0): Review(note="a")}
+
+
+def _all_states(path: Path) -> list[dict]:
+    """What a project says after each step of its history, with what undo brings back."""
+    with Project(IDENTITY, path) as project:
+        assert project.writable
+        position, states = project.state.position, []
+        states.append(visible(project.state))
+        for step in range(len(project.history()) + 1):
+            project.go_to(step)
+            states.append({**visible(project.state), "all figures": [project.state.figures(frame) for frame in FRAMES]})
+        project.go_to(position)
+    return states
+
+
+def _make(folder: Path, *, closed: bool) -> Path:
+    """A project of many kinds of values, with undone steps; closed, or as it is left by a kill."""
+    path = folder / "small.carts"
+    project = Project(IDENTITY, path)
+    for number in range(40):
+        act(216, number, project)
+    if closed:
+        project.close()
+    target = folder / "kept"
+    target.mkdir()
+    for file in folder.glob("small.carts*"):
+        shutil.copy(file, target)
+    project.close()
+    return target / "small.carts"
+
+
+def _flip_bits(folder: Path, count: int, *, closed: bool) -> dict[str, int]:
+    """Flip one bit of one file at a time; how often that was harmless, and how often it was reported."""
+    original = _make(folder, closed=closed)
+    files = sorted(original.parent.iterdir())
+    assert (len(files) == 2) is not closed
+    attempt = folder / "attempt"
+    shutil.copytree(original.parent, attempt)
+    expected = _all_states(attempt / original.name)
+    dice, tally = random.Random(count + closed), {"same": 0, "reported": 0, "rescued": 0}
+    for _ in range(count):
+        shutil.rmtree(attempt)
+        shutil.copytree(original.parent, attempt)
+        file = attempt / dice.choice(files).name
+        content = bytearray(file.read_bytes())
+        bit = dice.randrange(8 * len(content))
+        content[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(content)
+        before = {path.name: path.read_bytes() for path in attempt.iterdir()}
+        try:
+            found = _all_states(attempt / original.name)
+        except ProjectError as error:
+            tally["reported"] += 1
+            tally["rescued"] += "rescued" in str(error)
+            after = {path.name: path.read_bytes() for path in attempt.iterdir() if "rescued" not in path.name}
+            assert after == before, f"bit {bit} of {file.name}: the damaged file was changed"
+            for rescued in attempt.glob("*.rescued-*"):
+                Project(IDENTITY, rescued).close()
+        else:
+            assert found == expected, f"bit {bit} of {file.name} changed a value and nobody noticed"
+            tally["same"] += 1
+    return tally
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_flipped_bit_changes_nothing_or_is_reported(tmp_path: Path, closed: bool) -> None:
+    tally = _flip_bits(tmp_path, 40, closed=closed)
+    assert tally["reported"] > 5 and tally["rescued"] > 5, tally
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("closed", [True, False])
+def test_none_of_1000_flipped_bits_goes_unnoticed(tmp_path: Path, closed: bool) -> None:
+    print(_flip_bits(tmp_path, 500, closed=closed))
+
+
+CRAFTED: dict[str, str] = {
+    "a view in place of a table": "ALTER TABLE steps RENAME TO s; CREATE VIEW steps AS SELECT * FROM s",
+    "a view that never ends": """DROP VIEW current; CREATE VIEW current AS WITH RECURSIVE n(i) AS
+        (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT 'review' kind, i frame, '' name, 1 step, '{}' value FROM n""",
+    "a trigger that drops edits": "CREATE TRIGGER t AFTER INSERT ON changes BEGIN DELETE FROM changes; END",
+    "a trigger on the position": "CREATE TRIGGER t AFTER UPDATE ON project BEGIN DELETE FROM steps; END",
+    "another table": "CREATE TABLE more (x)",
+    "another index": "CREATE INDEX more ON changes (abs(step))",
+    "a column that computes": "ALTER TABLE steps ADD COLUMN x AS (length(zeroblob(100000000)))",
+    "a virtual table": "CREATE VIRTUAL TABLE more USING fts5(x)",
+    "a huge blob": "UPDATE changes SET value = zeroblob(140000000)",
+    "text where a number belongs": "UPDATE steps SET time = 'soon'",
+    "a number where text belongs": "UPDATE changes SET value = 7",
+    "a frame that is a float": "UPDATE changes SET frame = 1e300",
+    "a position beyond all numbers": "UPDATE project SET position = 9223372036854775807",
+    "a position that is text": "UPDATE project SET position = 'x'",
+    "an identity of another form": 'UPDATE project SET identity = \'{"name": 1, "frame_ids": 2}\'',
+    "two identities": "INSERT INTO project SELECT * FROM project",
+    "deep JSON": f"UPDATE changes SET value = '{'[' * 100_000}'",
+    "a huge number": f'UPDATE changes SET value = \'{{"joint_positions": [{"9" * 4000}], "provenance": 1}}\'',
+    "a nonce that is text": "UPDATE seal SET nonce = 'abc'",
+    "no seal": "DELETE FROM seal",
+    "an older version": "PRAGMA user_version = 1",
+    "version 0": "PRAGMA user_version = 0",
+    "a negative version": "PRAGMA user_version = -1",
+    "a step far away": "INSERT INTO steps SELECT step + 1000000000, name, time, digest FROM steps",
+}
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["as it is", "with right digests"])
+@pytest.mark.parametrize("script", CRAFTED.values(), ids=CRAFTED.keys())
+def test_a_crafted_file_is_refused_in_words_and_soon(project_path: Path, script: str, sealed: bool) -> None:
+    with Project(IDENTITY, project_path) as project:
+        project.apply("Note", NOTE)
+    edit_file(project_path, script)
+    if sealed:
+        _seal_again(project_path)
+    before = project_path.read_bytes()
+    for read_only in (True, False):
+        began = time.monotonic()
+        try:
+            with Project(IDENTITY, project_path, read_only=read_only) as project:
+                assert project.state.review(0).note == "a" or not project.history()
+        except ProjectError:
+            assert project_path.read_bytes() == before
+        assert time.monotonic() - began < 10
+
+
+def _seal_again(path: Path) -> None:
+    """What an attacker does who knows how digests are made."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        try:
+            connection.execute("BEGIN")
+            digests.seal(connection, bytes(16))
+            connection.execute("COMMIT")
+        except (sqlite3.Error, TypeError, AttributeError, OverflowError, ValueError):
+            pytest.skip("it has no place for digests")
+
+
+def test_the_seal_is_about_everything(project: Project, project_path: Path) -> None:
+    project.apply("Note", NOTE)
+    project.close()
+    assert rows(project_path, "PRAGMA user_version") == [(len(database.MIGRATIONS),)]
+    text = json.loads(rows(project_path, "SELECT identity FROM project")[0][0]) | {"name": "another"}
+    edit_file(project_path, f"UPDATE project SET identity = '{json.dumps(text)}'")
+    with pytest.raises(ProjectError, match="its position or identity was changed"):
+        Project(IDENTITY, project_path)
+
+
+@pytest.mark.parametrize("suffix", ["", "-wal", "-journal"])
+@pytest.mark.parametrize("make", ["link", "dangling link", "hard link", "pipe", "folder"])
+def test_nothing_is_followed_or_written_that_is_planted_where_a_project_writes(
+    tmp_path: Path, suffix: str, make: str
+) -> None:
+    victim, planted = tmp_path / "victim", tmp_path / f"small.carts{suffix}"
+    victim.write_text("precious")
+    if suffix:
+        Project(IDENTITY, tmp_path / "small.carts").close()
+    plant: dict[str, Callable[[], object]] = {
+        "link": lambda: planted.symlink_to(victim),
+        "dangling link": lambda: planted.symlink_to(tmp_path / "nowhere"),
+        "hard link": lambda: planted.hardlink_to(victim),
+        "pipe": lambda: os.mkfifo(planted),
+        "folder": planted.mkdir,
+    }
+    plant[make]()
+    names = {path.name for path in tmp_path.iterdir()}
+    for read_only in (True, False):
+        with pytest.raises(ProjectError, match=r"nothing was changed|Nothing was changed"):
+            Project(IDENTITY, tmp_path / "small.carts", read_only=read_only)
+    assert victim.read_text() == "precious" and {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_a_lock_file_of_any_kind_is_not_looked_at(project_path: Path) -> None:
+    victim = project_path.with_name("victim")
+    victim.write_text("precious")
+    project_path.with_name("small.carts.lock").symlink_to(victim)
+    project_path.with_name("small.carts.part").symlink_to(victim)
+    project_path.with_name("small.carts-shm").symlink_to(victim)
+    with Project(IDENTITY, project_path) as project:
+        project.apply("Note", NOTE)
+    assert victim.read_text() == "precious"
+
+
+def test_a_journal_that_names_another_file_deletes_nothing(project_path: Path) -> None:
+    """SQLite plays back a journal that it finds, and removes the file that it names as its super-journal."""
+    Project(IDENTITY, project_path).close()
+    victim = project_path.with_name("victim")
+    victim.write_text("precious")
+    project_path.with_name("small.carts-journal").write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(504))
+    with pytest.raises(ProjectError, match="carts makes no such file"):
+        Project(IDENTITY, project_path)
+    assert victim.read_text() == "precious"
