@@ -26,9 +26,7 @@ _MODULUS = 1 << (8 * _BYTES)
 def row_digest(table: str, row: Sequence[object]) -> bytes:
     """Digest of a row as SQLite gives it back."""
     # `ascii` tells texts, bytes, integers, floats and None apart, and does not change from one Python to the next.
-    # SQLite keeps no negative zero, which the sum makes a positive one.
-    parts = tuple(value + 0.0 if type(value) is float else value for value in row)
-    return blake2b(ascii((table, parts)).encode(), digest_size=_BYTES).digest()
+    return blake2b(ascii((table, tuple(row))).encode(), digest_size=_BYTES).digest()
 
 
 def as_number(digest: bytes) -> int:

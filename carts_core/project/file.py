@@ -16,7 +16,7 @@ from . import database
 from .companions import LOG, beside, open_regular
 from .lock import try_lock
 from .snapshot import verified_seal
-from .wal import FRAME_HEADER, HEADER
+from .wal import HEADER, Mark, next_mark
 
 Statements = Sequence[tuple[str, Iterable[Sequence[object]]]]
 """SQL, each with the rows of its parameters."""
@@ -48,6 +48,7 @@ class ProjectFile:
         self._seal: SealRow = (b"", b"", b"")
         self._left: tuple[object, ...] = ()
         """What file and log looked like when this process had last written."""
+        self._mark, self._header = Mark(), b""
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
@@ -93,6 +94,7 @@ class ProjectFile:
             self._log = open_regular(self._log_path)
         self._seal = seal
         self._remember()
+        self._check_since(committed=True)
         self._check_names()
 
     def commit(self, statements: Statements, seal: SealRow) -> None:
@@ -108,19 +110,18 @@ class ProjectFile:
         """
         connection = self._usable()
         self.check()
-        start = self._log_start()
         try:
             with database.errors_explained(self.path), database.transaction(connection):
                 for statement, rows in statements:
                     connection.executemany(statement, rows)
         except ProjectError as error:
-            self._check_since(start)
+            self._check_since(committed=False)
             if getattr(error.__cause__, "sqlite_errorname", "").startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
                 raise LostFile("was damaged") from error
             # The log may have grown by what does not count.
             self._remember()
             raise
-        self._check_since(start)
+        self._check_since(committed=True)
         self._seal = seal
         self._remember()
 
@@ -134,6 +135,8 @@ class ProjectFile:
             return
         with suppress(sqlite3.Error):
             self._usable().execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        if os.fstat(self._open_log()).st_size == 0:
+            self._mark, self._header = Mark(), b""
         self._check_names()
         self._check_content()
         self._remember()
@@ -221,22 +224,20 @@ class ProjectFile:
                 return
         raise LostFile("was changed by something else, and does not hold what was saved in it")
 
-    def _log_start(self) -> tuple[int, bytes]:
-        log = self._open_log()
-        return os.fstat(log).st_size, os.pread(log, HEADER, 0)
-
-    def _check_since(self, start: tuple[int, bytes]) -> None:
+    def _check_since(self, *, committed: bool) -> None:
         """See that nobody wrote to the file, or cut its log, while a transaction was being written to the log."""
         self._check_names()
-        log, (size, header) = self._open_log(), start
-        if _look(self._descriptor) != self._left[0] or os.fstat(log).st_size < size:
+        if _look(self._descriptor) != self._left[0]:
             raise LostFile("was changed by something else while an edit was being saved")
-        if size > HEADER:
-            # SQLite writes on where it was, so what was cut off is a hole; a frame's header begins with its page.
-            page = int.from_bytes(header[8:12], "big")
-            last = HEADER + ((size - HEADER) // (FRAME_HEADER + page) - 1) * (FRAME_HEADER + page)
-            if os.pread(log, HEADER, 0) != header or not any(os.pread(log, FRAME_HEADER, max(last, 0))):
-                raise LostFile("was changed by something else while an edit was being saved")
+        if not committed:
+            return
+        log = self._open_log()
+        header = os.pread(log, HEADER, 0)
+        frames = os.pread(log, max(os.fstat(log).st_size - self._mark.start, 0), self._mark.start)
+        mark = next_mark(frames, header, self._mark)
+        if mark is None or (self._mark.frames and header != self._header):
+            raise LostFile("lost an edit, or what was before it in its log (-wal), while that was being saved")
+        self._mark, self._header = mark, header
 
 
 def _look(descriptor: int) -> tuple[int, ...]:

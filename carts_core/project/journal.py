@@ -66,9 +66,9 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
         steps.append(Step(_typed(number, int), _typed(name, str), _typed(time, float)))
     for kind, frame, name, step, value, digest in checked_rows(connection, "changes"):
         total += digest
-        key = kind, frame, name
-        if step <= position and (key not in newest or newest[key][0] < step):
-            newest[key] = step, value
+        about = kind, frame, name
+        if step <= position and (about not in newest or newest[about][0] < step):
+            newest[about] = step, value
     figures: dict[tuple[int, int], Figures] = {}
     for frame, revision, *values, digest in checked_rows(connection, "figures"):
         total += digest
@@ -80,10 +80,12 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
     steps.sort(key=lambda step: step.number)
     if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
         raise DamagedProject("its history has gaps")
-    entries = {Key(Kind(kind), frame, name): value for (kind, frame, name), value in newest.items()}
-    decoded = {key: Entry(step, decode(key.kind, value)) for key, (step, value) in entries.items()}
-    for key, entry in decoded.items():
-        check_edit(identity, key, entry.value)
+    decoded: dict[Key[Any], Entry | None] = {}
+    for (kind, frame, name), (step, stored) in newest.items():
+        key = Key(Kind(kind), frame, name)
+        value = decode(key.kind, stored)
+        check_edit(identity, key, value)
+        decoded[key] = Entry(step, value)
     state = ProjectState(identity, tuple(steps), position, exports=tuple(exports))
     return state.with_entries(decoded).with_figures(figures), seal
 
@@ -146,6 +148,11 @@ def add_export(record: ExportRecord) -> Script:
     script = Script()
     script.insert("exports", [(record.time, str(record.format), record.path, int(record.frames), record.settings)])
     return script
+
+
+def _stored(figure: float | None) -> float | None:
+    """As SQLite gives it back: it keeps no negative zero."""
+    return None if figure is None else figure + 0.0
 
 
 def _record(time: Any, format: Any, path: Any, frames: Any, settings: Any) -> ExportRecord:

@@ -4,6 +4,7 @@ import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 from ..errors import ProjectError
@@ -44,6 +45,7 @@ VALUE_TYPES: dict[Kind, type] = {
 }
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.KEYFRAME, Kind.REVIEW}
+_MARKS = {Kind.KEYFRAME, Kind.REVIEW}
 _OF_NOBODY = {Kind.KEYFRAME, Kind.REVIEW, Kind.TIME_OFFSET}
 
 
@@ -113,7 +115,15 @@ def decode(kind: Kind, stored: str | bytes | None) -> Any:
     Raises:
         ValueError, TypeError, ProjectError: it is something else.
     """
-    return None if stored is None else VALUE_TYPES[kind].decode(stored)
+    if stored is None:
+        return None
+    return _decoded_mark(kind, stored) if kind in _MARKS else VALUE_TYPES[kind].decode(stored)
+
+
+@lru_cache(maxsize=1024)
+def _decoded_mark(kind: Kind, stored: str | bytes) -> Any:
+    """One object for all frames of which the same is said."""
+    return VALUE_TYPES[kind].decode(stored)
 
 
 def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None:

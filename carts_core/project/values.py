@@ -104,7 +104,7 @@ class JointCorrection(JsonValue):
     def __post_init__(self) -> None:
         _set(self, "joint_positions", _finite(self.joint_positions, "joint positions"))
         if self.standard_deviations is not None:
-            deviations = tuple(_deviation(value) for value in self.standard_deviations)
+            deviations = _deviations(self.standard_deviations)
             if len(deviations) != len(self.joint_positions):
                 raise ProjectError(
                     f"{len(deviations)} standard deviations were given for {len(self.joint_positions)} joints. "
@@ -246,12 +246,23 @@ def _choice(kind: type[_Choice], value: object, what: str) -> _Choice:
 
 def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
     try:
-        numbers = tuple(float(value) for value in values)
+        numbers = tuple(map(float, values))
     except (TypeError, ValueError) as error:
         raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
-    if not all(map(math.isfinite, numbers)):
+    # The sum is quicker to ask, and is finite unless a number is not or all are huge.
+    if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
         raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
     return numbers
+
+
+def _deviations(values: Iterable[float | None]) -> tuple[float | None, ...]:
+    given = tuple(values)
+    try:
+        if math.isfinite(sum(given)) and min(given, default=0.0) >= 0:  # pyright: ignore
+            return tuple(map(float, given))  # pyright: ignore
+    except TypeError:
+        pass  # Some are not known.
+    return tuple(_deviation(value) for value in given)
 
 
 def _deviation(value: float | None) -> float | None:

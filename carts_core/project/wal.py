@@ -67,6 +67,45 @@ def played_back(database: bytes, log: bytes) -> Playback:
     return Playback(result, damaged=False)
 
 
+@dataclass(frozen=True)
+class Mark:
+    """Where the last frame of a finished transaction begins."""
+
+    start: int = HEADER
+    """Offset of the frame in the log [bytes]."""
+    running: _Sum | None = None
+    """The checksum before it; None: the header's."""
+    frames: int = 0
+    """0: the log has no transaction yet, 1: this frame."""
+
+
+def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
+    """The last frame of the next transaction, if the frame at `mark` and all after it up to there are whole.
+
+    Args:
+        log: content of the log from `mark.start`.
+        header: the log's header.
+        mark: of the transaction before.
+    """
+    if len(header) < HEADER:
+        return None
+    magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
+    order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
+    running: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
+    commits = 0
+    for start in range(0, len(log) - FRAME_HEADER - page_size + 1, FRAME_HEADER + page_size):
+        before = running
+        _, pages, *rest = struct.unpack_from(">6I", log, start)
+        begin = start + FRAME_HEADER
+        running = _checksum(order, log[begin : begin + page_size], _checksum(order, log[start : start + 8], running))
+        if rest != [*salts, *running]:
+            return None
+        commits += bool(pages)
+        if commits > mark.frames:
+            return Mark(mark.start + start, before, 1)
+    return None
+
+
 def _checksum(order: Literal["<", ">"], data: bytes, start: _Sum) -> _Sum:
     """The running checksum of the format, continued by a multiple of 8 bytes.
 

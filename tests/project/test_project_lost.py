@@ -60,9 +60,9 @@ def _lose(folder: Path, way: str, suffix: str, seed: int) -> None:
     copy.mkdir()
     for file in folder.glob(f"{project.path.name}*"):
         shutil.copy(file, copy)
-    for place in (copy / project.path.name, None):
-        if place is None:
-            place = project.path
+    for closed in (False, True):
+        place = project.path if closed else copy / project.path.name
+        if closed:
             project.close()
         with Project(IDENTITY, place) as again:
             assert again.writable and [step.name for step in again.history()] == acknowledged

@@ -110,7 +110,7 @@ class Lives:
             else:
                 viewer_victim.check_whole(path, FRAMES)
                 self.tally.whole_exports += 1
-        project_files = {self._project_path.name + end for end in ("", "-wal", "-shm", ".lock")}
+        project_files = {self._project_path.name + end for end in ("", "-wal", "-shm")}
         new = {path.name for path in self._sequence_path.parent.iterdir()} - self._beside
         assert new <= project_files, new
 

@@ -41,6 +41,12 @@ class Widgets(NamedTuple):
 
 def serve(sequence: Path, weights: Path, tell: Connection) -> None:
     """Serve a sequence on a free port, tell where, and do what the page asks for."""
+    open_and_tell(sequence, weights, tell)
+    threading.Event().wait()
+
+
+def open_and_tell(sequence: Path, weights: Path, tell: Connection) -> ViewerApp:
+    """Open the app on a free port, and tell where it is."""
     torch.set_num_threads(1)
     app = ViewerApp.open(sequence, port=0, weights=(weights,))
     assert app.project.writable, app.notice
@@ -59,7 +65,7 @@ def serve(sequence: Path, weights: Path, tell: Connection) -> None:
         *map(app.page.find, labels),
     ]
     tell.send(Widgets(app.url, *map(app.page.element_id, found)))
-    threading.Event().wait()
+    return app
 
 
 def check_whole(path: Path, frames: int) -> None:
