@@ -2,44 +2,40 @@
 
 import importlib
 import inspect
-import pkgutil
 from collections.abc import Iterator
 from types import ModuleType
 
-import carts_core
-
-_ELSEWHERE = {"settings", "commands", "cli"}
-"""They have pages of their own."""
-_INTERNAL = {
-    "bench",
-    "console",
-    "benchmark",
-    "decimation",
-    "extras",
-    "files",
-    "kinematics",
-    "mesh_cache",
-    "mesh_files",
-    "meshes",
-    "parts",
-    "process",
-    "threads",
-    "urdf_check",
-    "wording",
-}
-"""Nobody else should lean on them."""
+PUBLIC = (
+    "camera",
+    "data",
+    "dvrk_model",
+    "errors",
+    "evaluation",
+    "export",
+    "features",
+    "keypoints",
+    "losses",
+    "optimization",
+    "perturbation",
+    "project",
+    "psm_kinematics",
+    "recording",
+    "rendering",
+    "resources",
+    "robot",
+    "scene",
+    "synthesis",
+)
+"""What others may import from `carts_core`, besides the settings, which have a page of their own."""
 
 
 def api_pages() -> dict[str, str]:
     """File name -> Markdown."""
     pages = {}
-    for info in pkgutil.iter_modules(carts_core.__path__):
-        if info.name in _ELSEWHERE | _INTERNAL or info.name.startswith("_"):
-            continue
-        module = importlib.import_module(f"carts_core.{info.name}")
-        names = list(_public_names(module, package=info.ispkg))
-        if names:
-            pages[f"api_{info.name}.md"] = _page(module, names)
+    for name in PUBLIC:
+        module = importlib.import_module(f"carts_core.{name}")
+        names = list(_public_names(module, package=hasattr(module, "__path__")))
+        pages[f"api_{name}.md"] = _page(module, names)
     return pages
 
 
