@@ -28,8 +28,6 @@ myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
 # Pages of the guide link to sources and to the README, which are no pages of the site.
 myst_url_schemes = ["http", "https", "mailto"]
-# An index ends with `*`, for pages that somebody adds; mostly there are none.
-suppress_warnings = ["toc.empty_glob"]
 
 # Docstrings are written with `code` in single backticks.
 default_role = "literal"
