@@ -4,10 +4,13 @@ from .bag import SOURCE as _BAG
 from .carts_layouts import AMBF as _AMBF
 from .carts_layouts import CTS as _CTS
 from .carts_layouts import SEGSTRONG_C as _SEGSTRONG_C
+from .datasets import ENDOVIS as _ENDOVIS
+from .datasets import JIGSAWS as _JIGSAWS
+from .datasets import SURGPOSE as _SURGPOSE
 from .dvrk_recorder import SOURCE as _DVRK
 from .folder import SOURCE as _FOLDER
 from .lerobot import SOURCE as _LEROBOT
 from .protocol import Source as Source
 
-SOURCES: tuple[Source, ...] = (_DVRK, _BAG, _LEROBOT, _CTS, _AMBF, _SEGSTRONG_C, _FOLDER)
+SOURCES: tuple[Source, ...] = (_DVRK, _BAG, _LEROBOT, _CTS, _AMBF, _SEGSTRONG_C, _SURGPOSE, _ENDOVIS, _JIGSAWS, _FOLDER)
 """In the order in which they are tried: those with clear signs first, what fits nearly everything last."""
