@@ -137,8 +137,9 @@ def _parquet(path: Path) -> dict[str, np.ndarray]:
         column = table.column(name)
         if pyarrow.types.is_list(column.type) or pyarrow.types.is_fixed_size_list(column.type):
             rows = column.to_pylist()
-            if rows and len({len(row) if row is not None else -1 for row in rows}) == 1:
-                values = np.array(rows)
+            lengths = {len(row) for row in rows if row is not None}
+            if len(lengths) == 1 and (length := lengths.pop()):
+                values = np.array([[np.nan] * length if row is None else row for row in rows])
                 columns.update({f"{name}.{index}": values[:, index] for index in range(values.shape[1])})
         else:
             columns[name] = column.to_numpy()

@@ -11,6 +11,19 @@ from .dvrk_recorder import SOURCE as _DVRK
 from .folder import SOURCE as _FOLDER
 from .lerobot import SOURCE as _LEROBOT
 from .protocol import Source as Source
+from .surgsync import SOURCE as _SURGSYNC
 
-SOURCES: tuple[Source, ...] = (_DVRK, _BAG, _LEROBOT, _CTS, _AMBF, _SEGSTRONG_C, _SURGPOSE, _ENDOVIS, _JIGSAWS, _FOLDER)
+SOURCES: tuple[Source, ...] = (
+    _DVRK,
+    _BAG,
+    _LEROBOT,
+    _SURGSYNC,
+    _CTS,
+    _AMBF,
+    _SEGSTRONG_C,
+    _SURGPOSE,
+    _ENDOVIS,
+    _JIGSAWS,
+    _FOLDER,
+)
 """In the order in which they are tried: those with clear signs first, what fits nearly everything last."""
