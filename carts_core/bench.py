@@ -17,7 +17,7 @@ from .console import Terminal
 from .data import Sequence
 from .evaluation import start_positions
 from .features import FeatureExtractor
-from .optimization import FrameOptimizer, OptimizerSettings
+from .optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
 from .process import tune_process
 from .rendering import Renderer, visibility_torch
 from .rendering.geometry import link_transforms, vertices_in_camera
@@ -78,20 +78,20 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
     extractor = FeatureExtractor.load()
     start = start_positions(sequence, frame, 2.0, 0)
 
-    def optimizer(settings: OptimizerSettings) -> FrameOptimizer:
+    def optimizer(settings: SolverSettings) -> FrameOptimizer:
         return FrameOptimizer(
             sequence.scene, frame, backgrounds, extractor, start=start, settings=settings, cameras=[camera], live=False
         )
 
-    seconds = [iterate.seconds for iterate in optimizer(OptimizerSettings.acs(iterations))][:-1]
-    *steps, edges = [iterate.seconds for iterate in optimizer(OptimizerSettings())]
+    seconds = [iterate.seconds for iterate in optimizer(DescentSolver(iterations=iterations))][:-1]
+    *steps, edges = [iterate.seconds for iterate in optimizer(SurfaceSolver())]
     return {
         "ACS iteration, median": 1e3 * statistics.median(seconds),
         "ACS iteration, 95th percentile": 1e3 * float(np.percentile(seconds, 95)),
         "Gauss-Newton iteration, median": 1e3 * statistics.median(steps),
         "drawing outlines to edges": 1e3 * edges,
         f"Gauss-Newton, a whole frame ({counted(len(steps), 'step')})": milliseconds(
-            lambda: list(optimizer(OptimizerSettings())), 5
+            lambda: list(optimizer(SurfaceSolver())), 5
         ),
     }
 

@@ -21,11 +21,13 @@ from .commands.synthesize import Synthesize
 from .commands.train import Train
 from .commands.view import View
 from .console import Terminal, log_to_stderr
-from .errors import CartsError
+from .errors import CartsError, SettingsError
 from .stopping import exit_status, message, stopped_by_signals
 
 _DESCRIPTION = (
-    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is."
+    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is. "
+    "After a command, --help-all also lists every setting of the solvers, and --print-settings writes them as a file "
+    "for --settings."
 )
 
 BAD_INPUT = 2
@@ -54,7 +56,15 @@ def main(arguments: list[str] | None = None) -> None:
             if arguments == ["--version"]:
                 print(f"carts {version('carts')}")
                 return
+            print_settings = "--print-settings" in arguments
+            if "--help-all" in arguments:
+                print_all_help(arguments)
+                return
+            arguments = [argument for argument in arguments if argument != "--print-settings"]
             command = tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+            if print_settings:
+                print(_settings_of(command))
+                return
         from .process import tune_process
 
         log_to_stderr()
@@ -67,6 +77,29 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt as stopped:
         Terminal(stderr=True).print(message(stopped), soft_wrap=True)
         sys.exit(exit_status(stopped))
+
+
+def print_all_help(arguments: list[str]) -> None:
+    """Print a command's options and then all settings that a settings file can hold."""
+    from .commands.help_all import settings_reference
+
+    try:
+        shown = [argument if argument != "--help-all" else "--help" for argument in arguments]
+        tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
+    except SystemExit:
+        print(settings_reference())
+
+
+def _settings_of(command: object) -> str:
+    """The settings that a command would use, as a settings file.
+
+    Raises:
+        SettingsError: it has none.
+    """
+    solving = getattr(command, "solving", None)
+    if solving is None:
+        raise SettingsError("--print-settings is for `carts optimize`, `carts evaluate` and `carts calibrate`.")
+    return solving.printed()
 
 
 @contextmanager

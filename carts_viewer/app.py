@@ -12,7 +12,7 @@ from typing import TextIO
 from carts_core.console import log_to_stderr, visible
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
-from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
@@ -190,7 +190,7 @@ class ViewerApp:
             pose=pose,
             layer=Layer.MASK,
             opacity=0.5,
-            settings=OptimizerSettings(),
+            settings=SurfaceSolver(),
             free=FreeParameters(),
             project=self.project.state,
         )

@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.project import Edits, Key, Review, ReviewState
+from carts_core.settings import SolverName
+from carts_core.settings import solver as named_solver
+from carts_core.settings.serialization import changed
 from carts_viewer import intents as ask
 from carts_viewer.checks import unknown
 from carts_viewer.layers import Layer
@@ -133,18 +136,19 @@ class Runner:
 
     @handle.register
     def _(self, intent: ask.SetSetting) -> None:
-        settings = self._controller.state.settings
+        state = self._controller.state
+        settings, solver = state.settings, state.solver
         try:
-            if intent.name == "loss":
-                settings = settings.with_loss(intent.value)
+            if intent.name == "solver":
+                settings, solver = named_solver(intent.value), SolverName(intent.value)
             else:
-                settings = replace(settings, **{intent.name: intent.value})
+                settings = changed(settings, {intent.name: intent.value}, "the solver")
         except SettingsError as error:
             # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
             self._controller.change(settings_error=str(error))
             return
         self.end("Settings changed; Run starts anew from here")
-        self._controller.change(settings=settings, settings_error=None, maps=None)
+        self._controller.change(settings=settings, solver=solver, settings_error=None, maps=None)
 
     @handle.register
     def _(self, intent: ask.SetFreeJoint) -> None:

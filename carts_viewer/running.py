@@ -17,14 +17,15 @@ from carts_core.optimization import (
     FrameOptimizer,
     FreeParameters,
     Iterate,
-    OptimizerSettings,
     SequenceOptimizer,
     SequenceSettings,
+    SolverSettings,
 )
-from carts_core.optimization.sight import Ignore
+from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.scene import Scene, SceneState
 from carts_core.settings import Direction
+from carts_core.settings.serialization import to_plain
 from carts_viewer.state import Pose
 
 
@@ -72,13 +73,13 @@ class OptimizerFactory:
             self._extractor = FeatureExtractor.load(*self._weights, device=self._device)
         return self._extractor
 
-    def provenance(self, cameras: Sequence[str], settings: OptimizerSettings, free: FreeParameters) -> Provenance:
+    def provenance(self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters) -> Provenance:
         """What a project keeps about a run with these settings.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
-        used = {**asdict(settings.resolved()), "free": asdict(free), "cameras": list(cameras)}
+        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras)}
         return Provenance.made_by_optimizer(used, self.prepare().sha256)
 
     def make(
@@ -88,7 +89,7 @@ class OptimizerFactory:
         domain: str,
         cameras: Sequence[str],
         pose: Pose,
-        settings: OptimizerSettings,
+        settings: SolverSettings,
         free: FreeParameters,
         ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> Optimizer:
@@ -122,7 +123,7 @@ class OptimizerFactory:
         frames: range,
         domain: str,
         cameras: Sequence[str],
-        settings: OptimizerSettings,
+        settings: SolverSettings,
         direction: Direction,
         free: FreeParameters,
         keyframes: Mapping[int, Mapping[str, np.ndarray]],
@@ -163,8 +164,8 @@ class OptimizerFactory:
             cameras=list(cameras),
         )
         used = {
-            **asdict(settings.resolved()),
-            "model": asdict(model),
+            **to_plain(settings),
+            "model": to_plain(model),
             "free": asdict(free),
             "cameras": list(cameras),
             "frames": [frames[0], frames[-1]],

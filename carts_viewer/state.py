@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 
 from carts_core.data import Frame
-from carts_core.optimization import FreeParameters, Iterate, OptimizerSettings
+from carts_core.optimization import FreeParameters, Iterate, SolverSettings
 from carts_core.optimization.keypoints import Pin
 from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
 from carts_core.scene import SceneState
-from carts_core.settings import Direction
+from carts_core.settings import Direction, SolverName
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Brush
 
@@ -139,12 +139,14 @@ class ViewState:
     pose: Pose
     layer: Layer
     opacity: float
-    settings: OptimizerSettings
+    settings: SolverSettings
     free: FreeParameters
     project: ProjectState
     """What is saved, and `unsaved` what is not."""
     unsaved: bool = False
     """Whether the last step of `project` is a gesture that is not saved yet."""
+    solver: SolverName = SolverName.SURFACE
+    """The solver that `settings` are of."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
     time_error: str | None = None

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from carts_core.losses import attention, attentional_loss, cosine_similarity, smooth_l1
+from carts_core.settings import Loss
 
 
 def square(size: int, half: int) -> torch.Tensor:
@@ -33,18 +34,18 @@ def test_opposite_features_have_similarity_minus_one() -> None:
     assert torch.allclose(cosine_similarity(features, -features), -torch.ones(1, 5, 5), atol=1e-3)
 
 
-@pytest.mark.parametrize(("loss", "expected"), [("acs_paper", -1), ("acs_reference", 1), ("acs", 0)])
-def test_only_the_normalised_form_does_not_depend_on_the_silhouettes_size(loss: str, expected: int) -> None:
+@pytest.mark.parametrize(("loss", "expected"), [(Loss.ACS_PAPER, -1), (Loss.ACS_REFERENCE, 1), (Loss.ACS, 0)])
+def test_only_the_normalised_form_does_not_depend_on_the_silhouettes_size(loss: Loss, expected: int) -> None:
     similarity = torch.full((1, 40, 40), 0.5)
-    small = attentional_loss(similarity, square(40, 5), loss)  # pyright: ignore[reportArgumentType]
-    large = attentional_loss(similarity, square(40, 10), loss)  # pyright: ignore[reportArgumentType]
+    small = attentional_loss(similarity, square(40, 5), loss)
+    large = attentional_loss(similarity, square(40, 10), loss)
     assert float(torch.sign((large - small).round(decimals=6))) == expected
 
 
 def test_the_papers_form_is_the_papers_equation() -> None:
     similarity, weight = torch.rand(1, 6, 7), torch.rand(1, 6, 7)
     expected = 1 - (similarity * weight).sum() / (6 * 7)
-    assert torch.allclose(attentional_loss(similarity, weight, "acs_paper")[0], expected)
+    assert torch.allclose(attentional_loss(similarity, weight, Loss.ACS_PAPER)[0], expected)
 
 
 def test_smooth_l1_is_zero_for_equal_predictions_only() -> None:

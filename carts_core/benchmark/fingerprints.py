@@ -1,10 +1,10 @@
 """What a measurement depends on, as a short text: a line of other settings, weights or code is not used again."""
 
 import hashlib
-from dataclasses import asdict
 
 from .. import fingerprints
 from ..features.extractor import FeatureExtractor
+from ..settings.serialization import to_plain
 from .frame import TOLERANCE
 from .methods import METHODS
 from .scope import Run, Scope
@@ -19,7 +19,9 @@ _MEASURED = (
     "settings/calibration.py",
     "settings/network.py",
     "settings/optimization.py",
+    "settings/presets.py",
     "settings/sequence.py",
+    "settings/stages.py",
     "benchmark/frame.py",
     "benchmark/occlusion.py",
     "benchmark/together.py",
@@ -41,7 +43,7 @@ def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source:
         source: fingerprint of the images and kinematics.
     """
     method = METHODS[run.method]
-    settings = asdict(method.settings(scope.steps(run))) if method.settings else {}
+    settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
     company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
     parts = (settings, company, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

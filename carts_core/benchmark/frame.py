@@ -13,7 +13,7 @@ from ..data import Frame
 from ..evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ..features.extractor import FeatureExtractor
 from ..keypoints import keypoints
-from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, OptimizerSettings
+from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, SolverSettings, SurfaceSolver
 from ..optimization.observability import Uncertainty
 from ..perturbation import perturb
 from ..rendering import Renderer
@@ -152,7 +152,7 @@ def optimize(
     frame: Frame,
     backgrounds: Backgrounds,
     extractor: FeatureExtractor,
-    settings: OptimizerSettings,
+    settings: SolverSettings,
     free: FreeParameters,
     truth: Truth,
     renderer: Renderer,
@@ -188,7 +188,7 @@ def optimize(
             break
         best.append(len(trace) if optimizer.best is iterate else best[-1])
         known, first = iterate.uncertainty, not trace
-        loss = None if settings.loss == "surface" else iterate.loss
+        loss = None if isinstance(settings, SurfaceSolver) else iterate.loss
         trace.append(truth.score(iterate.state, known, loss, renderer, seconds, depth=first))
     assert optimizer.best is not None and optimizer.stop_reason is not None
     end = optimizer.best

@@ -1,9 +1,9 @@
 """The compared methods: the rows of the paper's main table, and what the default solver does with more to go by."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from ..optimization import OptimizerSettings
+from ..settings import DescentSolver, Loss, SolverName, SolverSettings, SurfaceSolver, solver
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class Method:
 
     label: str
     """For people."""
-    settings: Callable[[int], OptimizerSettings] | None
+    settings: Callable[[int], SolverSettings] | None
     """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
     and looks at no kinematics."""
     told: bool = False
@@ -27,23 +27,23 @@ class Method:
     """Frames are corrected together, as a sequence."""
 
 
-def _ours(_: int) -> OptimizerSettings:
-    return OptimizerSettings()
+def _ours(_: int) -> SolverSettings:
+    return SurfaceSolver()
 
 
-def _start(_: int) -> OptimizerSettings:
-    return OptimizerSettings(solver="none")
+def _start(_: int) -> SolverSettings:
+    return solver(SolverName.NONE)
 
 
 METHODS = {
     "unet": Method("U-Net alone", None),
     "start": Method("CaRTS without optimization", _start),
-    "l1": Method("CaRTS L1 (paper's setting)", lambda _: replace(OptimizerSettings.paper(50), loss="l1")),
-    "paper": Method("CaRTS ACS (paper's setting)", OptimizerSettings.paper),
-    "acs": Method("CaRTS ACS, our schedule", lambda _: OptimizerSettings.acs()),
+    "l1": Method("CaRTS L1 (paper's setting)", lambda _: DescentSolver.paper(50, Loss.L1)),
+    "paper": Method("CaRTS ACS (paper's setting)", DescentSolver.paper),
+    "acs": Method("CaRTS ACS, our schedule", lambda _: DescentSolver()),
     "ours": Method("CaRTS, ours", _ours),
     "ours_told": Method("ours, occluder given", _ours, told=True),
-    "ours_proposed": Method("ours, ignore mask proposed", lambda _: OptimizerSettings(propose_ignore=True)),
+    "ours_proposed": Method("ours, ignore mask proposed", lambda _: solver(SolverName.OCCLUDED)),
     "stereo": Method("ours, all cameras", _ours, every_camera=True),
     "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),

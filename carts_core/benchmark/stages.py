@@ -8,10 +8,11 @@ from ..bench import milliseconds, optimizer_figures, render_figures
 from ..data import Sequence
 from ..features.extractor import FeatureExtractor
 from ..files import OutputPath, write_text
-from ..optimization import OptimizerSettings
 from ..optimization.inputs import working_size
 from ..resources import sample_sequence
 from ..scene import Scene
+from ..settings import SurfaceSolver
+from ..settings.stages import Observe
 from .fingerprints import code_fingerprint
 from .machine import machine
 
@@ -42,9 +43,10 @@ def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
 
 def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:
     """Times of the networks on whole images of the sizes that the optimizer compares by default [ms]."""
-    settings = OptimizerSettings()
+    settings = SurfaceSolver()
+    scale = max(stage.scale for stage in settings.stages if isinstance(stage, Observe))
     width, height = working_size(scene, settings.working_width, extractor.stride)
-    wide, high = working_size(scene, round(settings.working_width * settings.zoom), extractor.stride)
+    wide, high = working_size(scene, round(settings.working_width * scale), extractor.stride)
     image = torch.rand(1, 3, height, width, device=extractor.device)
 
     def forward() -> None:
@@ -55,10 +57,10 @@ def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, floa
         extractor.features(image.requires_grad_()).sum().backward()
 
     large = torch.rand(1, 3, high, wide, device=extractor.device)
-    believed = torch.rand(1, 6, high, wide, device=extractor.device)
+    given = torch.rand(1, 6, high, wide, device=extractor.device)
 
     return {
-        f"surface network forward, {wide}x{high}": milliseconds(lambda: extractor.surface(large, believed), _RUNS),
+        f"surface network forward, {wide}x{high}": milliseconds(lambda: extractor.surface(large, given), _RUNS),
         f"feature network forward, {width}x{height}": milliseconds(forward, _RUNS),
         f"feature network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
     }

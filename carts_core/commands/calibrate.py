@@ -10,9 +10,11 @@ from rich.console import Console
 
 from ..console import Bar, Terminal
 from ..errors import SettingsError
-from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
+from ..settings import CALIBRATION, FreeParameters
+from ..settings.serialization import to_plain
 from ..stopping import when_stopped
-from .selection import Network, Selection, SequencePath, check_second_order, output_folder
+from .selection import Network, Selection, SequencePath, output_folder
+from .solver_options import CalibrationOptions
 
 if TYPE_CHECKING:
     from ..data import Sequence
@@ -44,10 +46,7 @@ class Calibrate:
     all that is written."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
-    optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = CALIBRATION_SETTINGS
-
-    def __post_init__(self) -> None:
-        check_second_order("a calibration", self.optimizer)
+    solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
 
     def run(self) -> None:
         """Calibrate; on Ctrl-C or an error nothing is written."""
@@ -70,7 +69,7 @@ class Calibrate:
                 sequence.scene,
                 frames,
                 extractor,
-                settings=self.optimizer,
+                settings=self.solving.chosen,
                 free=self.free,
                 joint_prior_deg=self.joint_prior_deg,
                 cameras=cameras,
@@ -96,7 +95,7 @@ class Calibrate:
             "domain": self.domain,
             "joint_prior_deg": self.joint_prior_deg,
             "free": asdict(self.free),
-            "optimizer": asdict(self.optimizer.resolved()),
+            "solver": to_plain(self.solving.chosen),
         }
 
 

@@ -10,10 +10,11 @@ import tyro
 
 from ..console import Terminal, track
 from ..errors import SettingsError
-from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
+from ..settings import FreeParameters
 from ..stopping import when_stopped
 from ..wording import counted
-from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_second_order, check_writable
+from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_writable
+from .solver_options import SolverOptions
 
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
@@ -35,8 +36,7 @@ class Evaluate:
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
-    optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
-    model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:
         if self.json is not None and self.json.is_dir():
@@ -44,7 +44,7 @@ class Evaluate:
         if self.json is not None:
             check_writable(self.json.parent)
         if self.mode == "sequence":
-            check_second_order("--mode sequence", self.optimizer)
+            self.solving.check_surface("--mode sequence")
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if one is named."""
@@ -64,14 +64,14 @@ class Evaluate:
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
         extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
-        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.model)
+        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
         found = run(
             sequence,
             extractor,
             frames=frames,
             cameras=cameras,
             domains=domains,
-            settings=self.optimizer,
+            settings=self.solving.chosen,
             free=self.free,
             perturb_deg=self.start.perturb_deg,
             seed=self.start.seed,
@@ -88,7 +88,7 @@ class Evaluate:
                 kept_start_hint(where, [score.stopped for score in seen]),
                 base_frame_hint(where, [score.base_frame_gain for score in seen]),
             )
-        required = self.optimizer.needs_background
+        required = self.solving.chosen.needs_background
         for group in camera_groups(cameras, self.together):
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)

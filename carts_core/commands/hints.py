@@ -28,7 +28,7 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
         return None
     return (
         f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}, as the image hardly speaks against "
-        "it there; --keep-start 0 always moves."
+        "it there."
     )
 
 

@@ -7,8 +7,9 @@ from typing import Annotated
 import tyro
 
 from ..errors import SettingsError
-from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_second_order
+from ..settings import FreeParameters
+from .selection import Mode, Network, Perturbation, Selection, SequencePath
+from .solver_options import SolverOptions
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,13 @@ class Optimize:
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
-    optimizer: Annotated[OptimizerSettings, tyro.conf.arg(name="")] = field(default_factory=OptimizerSettings)
-    model: Annotated[SequenceSettings, tyro.conf.arg(name="")] = field(default_factory=SequenceSettings)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:
         if self.keyframes is not None and self.mode != "sequence":
             raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
         if self.mode == "sequence":
-            check_second_order("--mode sequence", self.optimizer)
+            self.solving.check_surface("--mode sequence")
 
     def run(self) -> None:
         """Optimize what is not there yet."""

@@ -18,7 +18,8 @@ from ..features.extractor import FeatureExtractor
 from ..files import remove_file
 from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, sequence_checkpoint
-from ..optimization.parameters import ParameterVector
+from ..optimization.variables import Variables
+from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
 from .frame_folder import FrameFolder, FrameResult
@@ -50,7 +51,7 @@ class Optimizing:
     """
 
     def __init__(self, asked: Optimize) -> None:
-        self._asked, self._console = asked, Terminal()
+        self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
         self._frames = asked.select.frame_indices(self._sequence)
         self._keyframes = self._read_keyframes()
@@ -79,7 +80,7 @@ class Optimizing:
         scene = sequence.scene.with_cameras(cameras)
         start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
         # Made for its errors: no name of what is free or locked may be wrong.
-        ParameterVector(scene, start, asked.free, asked.optimizer.lever)
+        Variables(scene, start, asked.free, self._solver.length_scale)
         folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
         return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
 
@@ -158,7 +159,7 @@ class Optimizing:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         if not todo:
             return
-        backgrounds = Backgrounds.of(sequence, cameras, domain, required=asked.optimizer.needs_background)
+        backgrounds = Backgrounds.of(sequence, cameras, domain, required=self._solver.needs_background)
         stopped, gains = [], []
         for index in track(todo, part.name, console=self._console, disable=not todo):
             frame = sequence.frame(index, domain, cameras)
@@ -168,7 +169,7 @@ class Optimizing:
                 backgrounds,
                 self._extractor,
                 start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
-                settings=asked.optimizer,
+                settings=self._solver,
                 free=asked.free,
                 cameras=cameras,
                 live=False,
@@ -199,8 +200,8 @@ class Optimizing:
             starts.frame,
             starts.times(frames),
             self._extractor,
-            settings=asked.optimizer,
-            model=asked.model,
+            settings=self._solver,
+            model=asked.solving.sequence,
             free=asked.free,
             keyframes=self._keyframes,
             backgrounds=backgrounds,
@@ -245,11 +246,11 @@ class Optimizing:
             "perturb_deg": asked.start.perturb_deg,
             "seed": asked.start.seed,
             "free": asdict(asked.free),
-            "optimizer": asdict(asked.optimizer.resolved()),
+            "solver": to_plain(self._solver),
         }
         if asked.mode == "sequence":
             from ..files.reading import TABLE, read_bytes
 
             keyframes = asked.keyframes and hashlib.sha256(read_bytes(asked.keyframes, TABLE)).hexdigest()
-            settings |= {"mode": asked.mode, "model": asdict(asked.model), "keyframes": keyframes}
+            settings |= {"mode": asked.mode, "model": to_plain(asked.solving.sequence), "keyframes": keyframes}
         return settings

@@ -9,7 +9,6 @@ import tyro
 
 from ..errors import SettingsError
 from ..files import OutputPath, output_path
-from ..settings import OptimizerSettings
 
 if TYPE_CHECKING:
     from ..data import Sequence
@@ -141,23 +140,6 @@ def check_device(device: str) -> None:
         return
     known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
     raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")
-
-
-def check_second_order(what: str, settings: OptimizerSettings) -> None:
-    """See that settings are of the one solver that knows how certain it is.
-
-    Args:
-        what: needs that.
-        settings: of the optimizer.
-
-    Raises:
-        SettingsError: they are of another solver or loss.
-    """
-    if settings.chosen_solver != "gauss_newton":
-        raise SettingsError(
-            f"{what} needs gauss_newton and surface; given are --solver {settings.solver} and --loss {settings.loss}. "
-            "Leave both out."
-        )
 
 
 def output_folder(named: Path | None, *default: str) -> OutputPath:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, OptimizerSettings
+from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, SolverSettings
 from ..perturbation import perturb
 from ..rendering import Renderer
 from ..scene import SceneState
@@ -45,7 +45,7 @@ def evaluate(
     frames: Names[int],
     cameras: Names[str],
     domains: Names[str],
-    settings: OptimizerSettings,
+    settings: SolverSettings,
     free: FreeParameters,
     perturb_deg: float = 0.0,
     seed: int = 0,

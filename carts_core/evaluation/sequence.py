@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import Backgrounds, FreeParameters, OptimizerSettings, SequenceOptimizer, SequenceSettings
+from ..optimization import Backgrounds, FreeParameters, SequenceOptimizer, SequenceSettings, SolverSettings
 from ..rendering import Renderer
 from .evaluate import FrameScore, camera_groups, frame_score, start_positions
 
@@ -18,7 +18,7 @@ def evaluate_sequence(
     frames: Names[int],
     cameras: Names[str],
     domains: Names[str],
-    settings: OptimizerSettings,
+    settings: SolverSettings,
     model: SequenceSettings,
     free: FreeParameters,
     perturb_deg: float = 0.0,

@@ -1,22 +1,28 @@
-"""The ACS optimizer: unknowns, settings, solvers, and one steppable object."""
+"""Solvers: unknowns, factors, stages, and the objects that can be stepped."""
 
 from ..settings import CALIBRATION as CALIBRATION
 from ..settings import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
+from ..settings import DescentSolver as DescentSolver
 from ..settings import FreeParameters as FreeParameters
-from ..settings import OptimizerSettings as OptimizerSettings
 from ..settings import SequenceSettings as SequenceSettings
+from ..settings import SolverSettings as SolverSettings
+from ..settings import SurfaceSolver as SurfaceSolver
+from .base_frame_gain import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
 from .counterfactual import Backgrounds as Backgrounds
-from .frame import BASE_FRAME_GAIN as BASE_FRAME_GAIN
+from .fit import StopReason as StopReason
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
-from .recalled import sequence_checkpoint as sequence_checkpoint
+from .predictor import NetworkPredictor as NetworkPredictor
+from .predictor import SurfacePredictor as SurfacePredictor
+from .resumable import sequence_checkpoint as sequence_checkpoint
 from .sequence import FrameEstimate as FrameEstimate
+from .sequence import Origin as Origin
 from .sequence import SequenceOptimizer as SequenceOptimizer
 
 __all__ = [
@@ -27,14 +33,20 @@ __all__ = [
     "CalibrationIterate",
     "CalibrationOptimizer",
     "CalibrationResult",
+    "DescentSolver",
     "FrameEstimate",
     "FrameOptimizer",
     "FreeParameters",
     "Iterate",
-    "OptimizerSettings",
+    "NetworkPredictor",
+    "Origin",
     "Progress",
     "SequenceOptimizer",
     "SequenceSettings",
+    "SolverSettings",
+    "StopReason",
+    "SurfacePredictor",
+    "SurfaceSolver",
     "UnknownChange",
     "propose_ignore",
 ]

@@ -13,11 +13,15 @@ from ..data import Frame
 from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
-from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, OptimizerSettings
-from .calibration_objective import CalibrationEvaluation, CalibrationObjective, Ignored
+from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver
+from ..settings.stages import Descend
+from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
+from .fit import Fit, Point, StopReason
 from .frame import Progress
-from .gauss_newton import GaussNewton
-from .parameters import ParameterVector
+from .predictor import SurfacePredictor, predictor_of
+from .sequence import surface_solver
+from .stages import run_stages
+from .variables import Variables
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class CalibrationIterate:
     stage: int
     stages: int
     loss: float
-    """Weighted mean over the frames, comparable within one look of the network at the images."""
+    """Weighted mean over the frames, comparable within one observation of the images, under one blur."""
     offsets: Float[torch.Tensor, " n"]
     """From the start, in radian-like units."""
     scene: Scene
@@ -63,11 +67,11 @@ class CalibrationResult:
     """As given, with the new calibration."""
     unknowns: tuple[UnknownChange, ...]
     frame_losses_before: Float[np.ndarray, " frames"]
-    """With joints as measured, like `frame_losses_after`, and against what the network saw last."""
+    """With joints as measured, like `frame_losses_after`, and under the last observation."""
     frame_losses_after: Float[np.ndarray, " frames"]
     frame_weights: Float[np.ndarray, " frames"]
     """How far each frame counted, in [0, 1]."""
-    stop_reason: str
+    stop_reason: StopReason
 
 
 class CalibrationOptimizer:
@@ -79,8 +83,8 @@ class CalibrationOptimizer:
     Args:
         scene: arms and cameras.
         frames: observed images and measured joint positions.
-        extractor: the networks.
-        settings: solver `gauss_newton` and loss `surface`; `frame_prior_deg` and `intrinsics_prior` are its own.
+        networks: the networks, or another predictor of surface maps.
+        settings: the solver; `frame_prior_deg` and `intrinsics_prior` are its own.
         free: what is unknown. Joints are so in every frame for itself.
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
@@ -95,20 +99,15 @@ class CalibrationOptimizer:
         self,
         scene: Scene,
         frames: Sequence[Frame],
-        extractor: FeatureExtractor,
+        networks: FeatureExtractor | SurfacePredictor,
         *,
-        settings: OptimizerSettings = CALIBRATION_SETTINGS,
+        settings: SolverSettings = CALIBRATION_SETTINGS,
         free: FreeParameters = CALIBRATION,
         joint_prior_deg: float = 0.1,
         ignore: Ignored | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        self.settings = settings
-        if self.settings.chosen_solver != "gauss_newton":
-            raise SettingsError(
-                f"a calibration was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
-                "it needs gauss_newton and surface. Leave them at their defaults."
-            )
+        self.settings = settings = surface_solver(settings, "a calibration")
         if not frames:
             raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
         if not 1e-3 <= joint_prior_deg <= 360:
@@ -117,20 +116,20 @@ class CalibrationOptimizer:
             raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
         self.free = with_fixed_gauge(self._scene, free)
-        self._objective = CalibrationObjective(
-            self._scene, frames, extractor, self.free, self.settings, joint_prior_deg, ignore
-        )
-        self.parameters = self._objective.parameters
-        self._offsets = torch.zeros(len(self.parameters), device=extractor.device)
-        self._solver = GaussNewton(self.settings, self.parameters, self._objective.stages)
-        self._epoch = 0
+        predictor = predictor_of(networks)
+        self._problem = CalibrationProblem(self._scene, frames, predictor, self.free, settings, joint_prior_deg, ignore)
+        self.variables = self._problem.variables
+        self._fit = Fit(self._problem, torch.zeros_like(self.variables.lower), settings.iterations)
+        self._points = run_stages(settings.stages, self._fit)
+        self._stages = sum(isinstance(stage, Descend) for stage in settings.stages)
+        self._best_point: Point | None = None
         self.history: list[Progress] = []
         self.best: CalibrationIterate | None = None
-        self.stop_reason: str | None = None
+        self.stop_reason: StopReason | None = None
 
     def cancel(self) -> None:
         """Stop; what was reached stays in `best` and `history`."""
-        self.stop_reason = self.stop_reason or "cancelled"
+        self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> CalibrationIterate | None:
         """Evaluate the present calibration and move on; None once the optimization has stopped.
@@ -140,24 +139,26 @@ class CalibrationOptimizer:
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
-        offsets, stage = self._offsets, self._solver.stage
-        epoch = self._objective.epoch(stage)
-        evaluation = self._objective(offsets, stage, gradient=True)
-        self._offsets = self._solver(offsets, evaluation)
+        point = next(self._points, None)
+        if point is None:
+            self.stop_reason = self._fit.stop_reason
+            return None
+        evaluation = point.evaluation
+        assert isinstance(evaluation, CalibrationEvaluation)
         iterate = CalibrationIterate(
             index=len(self.history),
-            stage=stage,
-            stages=self._objective.stages,
+            stage=self._problem.stage,
+            stages=self._stages,
             loss=evaluation.loss,
-            offsets=offsets.clone(),
-            scene=_calibrated(self._whole_scene, self._scene, self.parameters, offsets),
+            offsets=point.offsets.clone(),
+            scene=_calibrated(self._whole_scene, self._scene, self.variables, point.offsets),
             frame_losses=evaluation.frame_losses.numpy().copy(),
             seconds=time.perf_counter() - began,
         )
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
-        if self.best is None or epoch != self._epoch or iterate.loss < self.best.loss:
-            self.best, self._epoch = iterate, epoch
-        self.stop_reason = self.stop_reason or self._solver.finished
+        best = self._best_point
+        if best is None or point.epoch != best.epoch or iterate.loss < best.evaluation.loss:
+            self.best, self._best_point = iterate, point
         return iterate
 
     def __iter__(self) -> Iterator[CalibrationIterate]:
@@ -171,17 +172,17 @@ class CalibrationOptimizer:
         Raises:
             SettingsError: no step was made yet.
         """
-        if self.best is None:
+        if self.best is None or self._problem.present is None:
             raise SettingsError("no step was made yet. Call `step` first.")
         offsets = self.best.offsets
-        evaluation = self._objective(offsets, self._solver.stage, gradient=True)
+        evaluation = self._problem.evaluate(offsets, self._problem.present)
         return CalibrationResult(
             scene=self.best.scene,
-            unknowns=_changes(self.parameters, offsets, evaluation, self.settings),
-            frame_losses_before=self._objective.frame_losses(torch.zeros_like(offsets)),
-            frame_losses_after=self._objective.frame_losses(offsets),
+            unknowns=_changes(self.variables, offsets, evaluation, self.settings),
+            frame_losses_before=self._problem.frame_losses(torch.zeros_like(offsets)),
+            frame_losses_after=self._problem.frame_losses(offsets),
             frame_weights=evaluation.frame_weights.numpy().copy(),
-            stop_reason=self.stop_reason or "cancelled",
+            stop_reason=self.stop_reason or StopReason.CANCELLED,
         )
 
 
@@ -197,9 +198,9 @@ def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
     return replace(free, locked_cameras=(*free.locked_cameras, names[0]))
 
 
-def _calibrated(whole: Scene, part: Scene, parameters: ParameterVector, offsets: torch.Tensor) -> Scene:
+def _calibrated(whole: Scene, part: Scene, variables: Variables, offsets: torch.Tensor) -> Scene:
     """The whole scene with the calibration of its calibrated part; what did not move keeps its exact value."""
-    start, state = parameters.start, parameters.state(offsets)
+    start, state = variables.start, variables.state(offsets)
     arms = tuple(
         replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
         for index, arm in enumerate(whole.arms)
@@ -227,23 +228,22 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
 
 
 def _changes(
-    parameters: ParameterVector,
+    variables: Variables,
     offsets: torch.Tensor,
     evaluation: CalibrationEvaluation,
-    settings: OptimizerSettings,
+    settings: SurfaceSolver,
 ) -> tuple[UnknownChange, ...]:
-    assert evaluation.curvature is not None and evaluation.frame_gradients is not None
-    covariance = torch.linalg.inv(evaluation.curvature.double().cpu())
+    assert evaluation.hessian is not None and evaluation.frame_gradients is not None
+    covariance = torch.linalg.inv(evaluation.hessian.double().cpu())
     # The sandwich estimator with frames as clusters: pixels of one frame share their errors, frames do not.
     pulled = covariance @ evaluation.frame_gradients.T
     between = pulled.square().sum(1).sqrt()
     alone, prior = (
         covariance.diagonal().sqrt(),
-        parameters.prior_precision(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
-        ** -0.5,
+        variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu(),
     )
     changes = []
-    for index, (name, unit, scale) in enumerate(parameters.units()):
+    for index, (name, unit, scale) in enumerate(variables.units()):
         values = (offsets[index].cpu(), alone[index], between[index], prior[index])
         changes.append(UnknownChange(name, unit, *(scale * float(value) for value in values)))
     return tuple(changes)

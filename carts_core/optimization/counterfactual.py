@@ -18,11 +18,12 @@ from torch.nn import functional
 
 from ..data import MeanBackground
 from ..errors import SequenceError
-from ..features.extractor import FeatureExtractor
 from ..scene import Scene
 from ..surface import COVERAGE, SURFACE_CHANNELS
+from .haze import dehazed, transmission
 from .inputs import pixel_weights, stacked_images
-from .veil import transmission, unveiled
+from .predictor import SurfacePredictor
+from .window import Window
 
 _PATCH = 3
 """Side of the patches over which differences are averaged [px of the working image]."""
@@ -62,22 +63,22 @@ class Background:
         """Whether the network takes much of what is there for arms."""
         return float(self.seen.mean()) > _DECEPTIVE
 
-    def changed(self, images: Float[Tensor, "cameras 3 h w"], zoom: float) -> Float[Tensor, "cameras 1 h w"]:
+    def changed(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> Float[Tensor, "cameras 1 h w"]:
         """How surely each pixel of images, RGB in [0, 1], differs from the background under their light, in [0, 1].
 
         What is not known to be background counts as different.
 
         Args:
             images: of the same cameras.
-            zoom: times the working size [1].
+            scale: times the working size [1].
         """
-        found = [self._changed(background, image, zoom) for background, image in zip(self.images, images, strict=True)]
+        found = [self._changed(background, image, scale) for background, image in zip(self.images, images, strict=True)]
         return 1.0 - self.known * (1.0 - torch.stack(found))
 
-    def _changed(self, background: Tensor, image: Tensor, zoom: float) -> Float[Tensor, "1 h w"]:
+    def _changed(self, background: Tensor, image: Tensor, scale: float) -> Float[Tensor, "1 h w"]:
         """How surely each pixel differs from the background under the image's light, in [0, 1]."""
         difference = (image - _lit_as(background, image)).abs().amax(0, keepdim=True)
-        side = 2 * round(_PATCH * zoom / 2) + 1
+        side = 2 * round(_PATCH * scale / 2) + 1
         difference = functional.avg_pool2d(difference, side, stride=1, padding=side // 2, count_include_pad=False)
         usual = float(difference.median())
         if usual > _FOREIGN:
@@ -178,18 +179,19 @@ class Backgrounds:
         """Whether the background of each camera of a scene is there."""
         return all(camera.name in self.images for camera in scene.cameras)
 
-    def at(self, scene: Scene, size: tuple[int, int], unveil: float, extractor: FeatureExtractor) -> Background:
+    def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: SurfacePredictor) -> Background:
         """The backgrounds of a scene's cameras in a width and height [px].
 
         Raises:
             SettingsError: one is missing, or of another size than its camera.
         """
-        key = tuple(camera.name for camera in scene.cameras), size, unveil, id(extractor)
+        key = tuple(camera.name for camera in scene.cameras), size, dehaze, predictor
         if key not in self._found:
-            stacked = stacked_images(scene, self.images, size, "background").to(extractor.device)
+            stacked = stacked_images(scene, self.images, size, "background").to(predictor.device)
             nothing = stacked.new_zeros(len(stacked), SURFACE_CHANNELS, *stacked.shape[-2:])
-            clear = unveiled(stacked, transmission(stacked, unveil))
-            seen = extractor.surface(clear, nothing)[:, COVERAGE].sum(1, keepdim=True).clamp(0.0, 1.0)
+            clear = dehazed(stacked, transmission(stacked, dehaze))
+            predicted = predictor.predict(clear, nothing, Window(0, 0, *size))
+            seen = predicted[:, COVERAGE].sum(1, keepdim=True).clamp(0.0, 1.0)
             unknown = {name: ~mask for name, mask in self._known.items()}
             known = pixel_weights(scene, unknown, size).to(seen)
             self._found[key] = Background(stacked, known, seen * known)

@@ -35,7 +35,7 @@ class Information:
 
     @staticmethod
     def nothing(n: int) -> "Information":
-        """Of a frame that is not believed."""
+        """Of a frame whose image is left out."""
         return Information(np.zeros((n, n)), np.zeros(n))
 
     @staticmethod
@@ -46,11 +46,14 @@ class Information:
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
     def scaled(self, share: float) -> "Information":
-        """The same, believed less."""
+        """The same with a share of the weight."""
         return Information(share * self.precision, share * self.vector)
 
-    def surprise(self, expected: Gaussian) -> float:
-        """Squared distance from what was expected, in standard deviations, mean over the unknowns [1]; about 1."""
+    def __add__(self, other: "Information") -> "Information":
+        return Information(self.precision + other.precision, self.vector + other.vector)
+
+    def mahalanobis(self, expected: Gaussian) -> float:
+        """Squared Mahalanobis distance from what was expected, mean over the unknowns [1]; about 1 if all is well."""
         n = len(self.vector)
         residual = self.vector - self.precision @ expected.mean
         difference = np.linalg.solve(self.precision + np.eye(n), residual)
@@ -63,7 +66,7 @@ _EXACT = 1e14
 
 
 class ErrorModel:
-    """Beliefs about the parts of n corrections, [3 n]: all constants, all drifts, all noises.
+    """States of n corrections, [3 n]: all constants, all drifts, all noises.
 
     Args:
         settings: of joints; other unknowns have as much less drift and noise as they have a smaller constant.
@@ -78,58 +81,58 @@ class ErrorModel:
         self._sum = np.tile(np.eye(n), 3)
 
     def initial(self) -> Gaussian:
-        """Before any frame."""
+        """The prior, before any frame."""
         return Gaussian(np.zeros(3 * self._n), np.diag(self._variance))
 
-    def predicted(self, belief: Gaussian, seconds: float) -> Gaussian:
-        """The belief about a frame that many seconds later (infinitely many: as if nothing was known)."""
+    def predicted(self, state: Gaussian, seconds: float) -> Gaussian:
+        """The state that many seconds later (infinitely many: as if nothing was known)."""
         kept = self._kept(seconds)
         noise = np.diag(self._variance * (1.0 - kept**2))
-        return Gaussian(kept * belief.mean, kept[:, None] * belief.covariance * kept + noise)
+        return Gaussian(kept * state.mean, kept[:, None] * state.covariance * kept + noise)
 
     def _kept(self, seconds: float) -> Float[np.ndarray, " 3n"]:
         constant = 1.0 if math.isfinite(seconds) else 0.0
         return np.repeat([constant, math.exp(-seconds / self._drift_seconds), 0.0], self._n)
 
-    def correction(self, belief: Gaussian) -> Gaussian:
+    def correction(self, state: Gaussian) -> Gaussian:
         """The sum of the parts."""
-        return Gaussian(self._sum @ belief.mean, self._sum @ belief.covariance @ self._sum.T)
+        return Gaussian(self._sum @ state.mean, self._sum @ state.covariance @ self._sum.T)
 
-    def updated(self, belief: Gaussian, information: Information) -> Gaussian:
-        """The belief after what a frame says."""
-        return combined(belief, information, self._sum)
+    def updated(self, state: Gaussian, information: Information) -> Gaussian:
+        """The state after a measurement."""
+        return combined(state, information, self._sum)
 
-    def smoothed(self, beliefs: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
+    def smoothed(self, filtered: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
         """Corrections of all frames, each in the light of all others (Rauch, Tung and Striebel, 1965).
 
         Args:
-            beliefs: after each frame, from what it and those before it say.
+            filtered: filtered states, after each frame.
             seconds: from the frame before to each frame [s].
         """
-        if not beliefs:
+        if not filtered:
             return []
-        result = [beliefs[-1]]
-        for belief, later in zip(reversed(beliefs[:-1]), reversed(seconds[1:]), strict=True):
-            ahead = self.predicted(belief, later)
-            gain = np.linalg.solve(ahead.covariance, self._kept(later)[:, None] * belief.covariance).T
-            mean = belief.mean + gain @ (result[-1].mean - ahead.mean)
-            covariance = belief.covariance + gain @ (result[-1].covariance - ahead.covariance) @ gain.T
+        result = [filtered[-1]]
+        for state, later in zip(reversed(filtered[:-1]), reversed(seconds[1:]), strict=True):
+            ahead = self.predicted(state, later)
+            gain = np.linalg.solve(ahead.covariance, self._kept(later)[:, None] * state.covariance).T
+            mean = state.mean + gain @ (result[-1].mean - ahead.mean)
+            covariance = state.covariance + gain @ (result[-1].covariance - ahead.covariance) @ gain.T
             result.append(Gaussian(mean, 0.5 * (covariance + covariance.T)))
-        return [self.correction(belief) for belief in reversed(result)]
+        return [self.correction(state) for state in reversed(result)]
 
 
-def combined(belief: Gaussian, information: Information, C: Float[np.ndarray, "m n"] | None = None) -> Gaussian:
-    """The belief about x after what is said of C x (of x itself by default)."""
-    C = np.eye(len(belief.mean)) if C is None else C
-    precision, cross = information.precision, belief.covariance @ C.T
+def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m n"] | None = None) -> Gaussian:
+    """The state x after a measurement of C x (of x itself by default)."""
+    C = np.eye(len(state.mean)) if C is None else C
+    precision, cross = information.precision, state.covariance @ C.T
     # K = P C^T (1 + L C P C^T)^-1 L needs no inverse of L, which may be singular.
     gain = cross @ np.linalg.inv(np.eye(len(C)) + precision @ C @ cross)
-    covariance = belief.covariance - gain @ precision @ cross.T
-    mean = belief.mean + gain @ (information.vector - precision @ C @ belief.mean)
+    covariance = state.covariance - gain @ precision @ cross.T
+    mean = state.mean + gain @ (information.vector - precision @ C @ state.mean)
     return Gaussian(mean, 0.5 * (covariance + covariance.T))
 
 
-def news(gaps: Sequence[float], memory: float) -> list[float]:
+def information_shares(gaps: Sequence[float], memory: float) -> list[float]:
     """Share of each frame's information that counts for the others, because errors of images are alike for a while [1].
 
     They are taken for an autoregressive process of first order. The mean of many of its values, a gap apart, is as
@@ -146,8 +149,8 @@ def news(gaps: Sequence[float], memory: float) -> list[float]:
     return [0.5 * (before + after) for before, after in zip([shares[0], *shares], [*shares, shares[-1]], strict=True)]
 
 
-def without(smoothed: Gaussian, own: Information) -> Gaussian:
-    """What the other frames say of a correction, from what all say and what its own frame says."""
+def remove_measurement(smoothed: Gaussian, own: Information) -> Gaussian:
+    """The smoothed correction of a frame without its own measurement."""
     precision = np.linalg.inv(smoothed.covariance)
     values, vectors = np.linalg.eigh(precision - own.precision)
     # Rounding must not make a direction less certain than nothing.

@@ -1,9 +1,7 @@
-"""What an objective says of one point, and what a solver makes of it."""
+"""What a problem says of one point: the objective, its quadratic model, and what it looks like."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,16 +13,19 @@ class Evaluation:
     """An objective at one point. Maps are at the resolution of comparison, and nothing carries autograd."""
 
     value: float
-    """What is descended, in the stage that was asked for: the loss there, and the prior."""
+    """What is descended: the sum of all factors, the prior included."""
     loss: float
-    """Without the prior, and comparable through all stages of the same epoch."""
+    """Without the prior, per pixel of the arms. Comparable among evaluations of one observation if somebody watches,
+    else of one observation under one blur."""
+    stage_loss: float
+    """The same under the blur that is descended in."""
     prior: float
     gradient: Float[Tensor, " n"]
     """Of `value`; zero if it was not asked for."""
-    curvature: Float[Tensor, "n n"] | None
+    hessian: Float[Tensor, "n n"] | None
     """Gauss-Newton's approximation of the second derivative of `value`; None where there is none."""
     uncertainty: Uncertainty | None
-    """Standard deviations that follow from the curvature."""
+    """Standard deviations that follow from the hessian."""
     image: Float[Tensor, "cameras 3 h w"]
     """Rendered arms, RGB, black elsewhere."""
     silhouette: Float[Tensor, "cameras h w"]
@@ -32,42 +33,3 @@ class Evaluation:
     """At most 1; 1 where nothing was compared."""
     attention: Float[Tensor, "cameras h w"]
     """Weight of each pixel, in [0, 1]."""
-
-
-class Objective(Protocol):
-    """A function of the unknowns, in stages from coarse to fine."""
-
-    stages: int
-
-    def epoch(self, stage: int) -> int:
-        """Losses compare among stages of the same epoch."""
-        ...
-
-    def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> Evaluation:
-        """Evaluate at the given offsets, without a gradient if none is needed."""
-        ...
-
-
-class Solver(Protocol):
-    """Decides where to evaluate next."""
-
-    stage: int
-    """Stage of the objective to evaluate in."""
-    finished: str | None
-    """Why it has stopped; None while it goes on."""
-
-    def __call__(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Float[Tensor, " n"]:
-        """The next offsets, from an evaluation at the present ones."""
-        ...
-
-
-class Stay:
-    """The solver that evaluates the start and stops ("CaRTS without optimization")."""
-
-    def __init__(self, stages: int) -> None:
-        self.stage, self.finished = stages - 1, None
-
-    def __call__(self, offsets: torch.Tensor, evaluation: Evaluation) -> torch.Tensor:
-        """The same offsets."""
-        self.finished = "not optimized"
-        return offsets

@@ -5,8 +5,8 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,20 +19,31 @@ from ..data.background import spread
 from ..errors import CartsError, SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
-from ..settings import FreeParameters, OptimizerSettings, SequenceSettings
-from .beginning import best_beginning
+from ..settings import FreeParameters, SequenceSettings, SolverSettings, SurfaceSolver
 from .counterfactual import Backgrounds
-from .error_model import ErrorModel, Gaussian, Information, combined, news, without
+from .error_model import ErrorModel, Gaussian, Information, combined, information_shares, remove_measurement
+from .initialization import initial_correction
+from .measurement import FrameSolver, Ignore, Measurement
 from .observability import Uncertainty
-from .parameters import ParameterVector
-from .recalled import RecallingEye
-from .sight import Eye, Ignore, Sight
+from .predictor import SurfacePredictor, predictor_of
+from .resumable import ResumableFrameSolver
+from .variables import Variables
 
-Start = Literal["warm", "cold", "keyframe", "carried"]
-"""Where a frame's values come from: an optimization from the neighbour's correction or from the measured values, a
-person, or the other frames alone, because the image contradicts them and is not to be believed."""
 
-_SURPRISE = 9.0
+class Origin(StrEnum):
+    """Where a frame's values come from."""
+
+    WARM = "warm"
+    """An optimization from the neighbour's correction."""
+    COLD = "cold"
+    """An optimization from the measured values."""
+    KEYFRAME = "keyframe"
+    """A person."""
+    CARRIED = "carried"
+    """The other frames alone: the image contradicts them and is left out."""
+
+
+_CONTRADICTS = 9.0
 """A correction three deviations off what was expected, on average, contradicts it."""
 
 
@@ -50,8 +61,8 @@ class FrameEstimate:
     uncertainty: Uncertainty
     """Of every unknown, with what was expected of it before any image."""
     loss: float
-    """Of the surface objective, where the frame was last looked at; high where the image does not fit."""
-    start: Start
+    """Of the surface factor, when the frame was last solved; high where the image does not fit."""
+    start: Origin
     iterations: int
     """Steps of the optimization, over all visits."""
     seconds: float
@@ -60,19 +71,19 @@ class FrameEstimate:
 
 @dataclass(frozen=True)
 class _Visit:
-    """What is kept of a frame that was seen, or asked for its opinion."""
+    """What is kept of a frame that was solved."""
 
     frame_id: str
-    parameters: ParameterVector
-    sight: Sight
-    start: Start
+    variables: Variables
+    measurement: Measurement
+    start: Origin
     seconds: float
 
 
 class SequenceOptimizer:
     """Corrects the frames of a sequence one after another.
 
-    A few frames, evenly spread, are looked at alone first, and what suits all of them best is where the first frame
+    A few frames, evenly spread, are solved alone first, and what suits all of them best is where the first frame
     starts. A later frame starts at the correction that the frames before it let expect, and is held there as firmly as
     they know it. After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what
     came of it is visited again. Frames in `keyframes` stay exactly as given, and everything else follows them.
@@ -81,8 +92,8 @@ class SequenceOptimizer:
         scene: arms and cameras.
         load: the frame at a position of the sequence; its `measured` is what is corrected.
         times: position of each frame to be corrected -> its time [s], or None where times are not known.
-        extractor: the networks.
-        settings: of a cold start; a warm one uses its fine stages. The loss is `surface`.
+        networks: the networks, or another predictor of surface maps.
+        settings: noise, weights and working size; the stages are those of `model`.
         model: of the measurement error, and the direction.
         free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] that a person set.
@@ -94,7 +105,7 @@ class SequenceOptimizer:
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
         SettingsError: there are no frames, a keyframe is none of them, times do not increase, nothing is free, or
-            the settings are of another solver or loss.
+            the settings are those of another solver.
     """
 
     def __init__(
@@ -102,9 +113,9 @@ class SequenceOptimizer:
         scene: Scene,
         load: Callable[[int], Frame],
         times: Mapping[int, float | None],
-        extractor: FeatureExtractor,
+        networks: FeatureExtractor | SurfacePredictor,
         *,
-        settings: OptimizerSettings | None = None,
+        settings: SolverSettings | None = None,
         model: SequenceSettings | None = None,
         free: FreeParameters | None = None,
         keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
@@ -113,14 +124,9 @@ class SequenceOptimizer:
         cameras: Sequence[str] | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:
-        self.settings, self.model = settings or OptimizerSettings(), model or SequenceSettings()
-        self._scene, self._load, self._extractor = scene.with_cameras(cameras), load, extractor
+        self.settings, self.model = surface_solver(settings, "sequence mode"), model or SequenceSettings()
+        self._scene, self._load, self._predictor = scene.with_cameras(cameras), load, predictor_of(networks)
         self._free = free or FreeParameters()
-        if self.settings.chosen_solver != "gauss_newton":
-            raise SettingsError(
-                f"sequence mode was given the solver {self.settings.chosen_solver} and the loss {self.settings.loss}; "
-                "it needs gauss_newton and surface. Leave them at their defaults, or optimize each frame alone."
-            )
         self._keyframes = {
             index: {name: np.asarray(values, np.float64) for name, values in positions.items()}
             for index, positions in (keyframes or {}).items()
@@ -131,28 +137,28 @@ class SequenceOptimizer:
         strangers = set(self._keyframes) - set(self._gaps)
         if strangers:
             raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
-        self._eye = Eye(
-            self._scene, extractor, self.settings, self.model.sight_noise, ignore or (lambda _: {}), backgrounds
+        self._solver = FrameSolver(
+            self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds
         )
         if checkpoint is not None:
-            self._eye = RecallingEye(self._eye, checkpoint)
+            self._solver = ResumableFrameSolver(self._solver, checkpoint)
         self._queue = list(self._gaps)
-        self._told = self._shares()
-        asked = {self._queue[place] for place in spread(len(self._queue), self.model.opinions)}
-        asked.update([index for index in self._queue if index in self._keyframes][:1])
-        # A frame that is alone, or that a person began with, needs no other opinion.
-        alone = len(asked) == 1 or self._queue[0] in self._keyframes
-        self._to_ask = [] if alone else [index for index in self._queue if index in asked]
-        self._asked: dict[int, _Visit] = {}
-        self._begin_at: np.ndarray | None = None
-        _, parameters = self._open(self._queue[0])
-        precision = parameters.prior_precision(
+        self._shares = self._information_shares()
+        initial = {self._queue[place] for place in spread(len(self._queue), self.model.initial_frames)}
+        initial.update([index for index in self._queue if index in self._keyframes][:1])
+        # A frame that is alone, or that a person began with, needs no others.
+        alone = len(initial) == 1 or self._queue[0] in self._keyframes
+        self._initial_queue = [] if alone else [index for index in self._queue if index in initial]
+        self._initial: dict[int, _Visit] = {}
+        self._initial_correction: np.ndarray | None = None
+        _, variables = self._open(self._queue[0])
+        expected = variables.expected(
             self.model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
         )
-        self._errors = ErrorModel(self.model, precision.cpu().double().numpy() ** -0.5)
+        self._errors = ErrorModel(self.model, expected.cpu().double().numpy())
         self._fresh = self._errors.correction(self._errors.initial())
         self._visits: dict[int, _Visit] = {}
-        self._beliefs: list[Gaussian] = []
+        self._filtered: list[Gaussian] = []
         self._stale = False
         self._revisits: list[tuple[int, Gaussian]] | None = None
         self._estimates: dict[int, FrameEstimate] | None = None
@@ -160,7 +166,7 @@ class SequenceOptimizer:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Frames that were visited, and all frames; some are looked at before, and contradicted ones again after."""
+        """Frames that were visited, and all frames; some are solved before, and contradicted ones again after."""
         return len(self._visits), len(self._gaps)
 
     @property
@@ -197,14 +203,14 @@ class SequenceOptimizer:
     def step(self) -> FrameEstimate | None:
         """Visit the next frame; None once all is done.
 
-        The first steps look at a few frames alone, and what they return is not among `estimates`. After them the
+        The first steps solve a few frames alone, and what they return is not among `estimates`. After them the
         estimate knows the frames visited before it; those in `estimates` know all others.
         """
         if self.stop_reason is not None:
             return None
-        while self._to_ask:
-            if (opinion := self._ask(self._to_ask.pop(0))) is not None:
-                return opinion
+        while self._initial_queue:
+            if (alone := self._solve_alone(self._initial_queue.pop(0))) is not None:
+                return alone
         if self._queue:
             return self._visit(self._queue.pop(0))
         if self._revisits is None:
@@ -214,91 +220,92 @@ class SequenceOptimizer:
         self.stop_reason = "finished"
         return None
 
-    def _ask(self, index: int) -> FrameEstimate | None:
-        """What a frame alone says; None if it is not usable, which is told when its turn comes."""
+    def _solve_alone(self, index: int) -> FrameEstimate | None:
+        """What a frame alone measures; None if it is not usable, which is told when its turn comes."""
         began = time.perf_counter()
-        start: Start = "keyframe" if index in self._keyframes else "cold"
+        start = Origin.KEYFRAME if index in self._keyframes else Origin.COLD
         try:
-            frame, parameters = self._open(index)
-            if start == "keyframe":
-                sight = self._keyframe(frame, parameters, self._fresh)
+            frame, variables = self._open(index)
+            if start is Origin.KEYFRAME:
+                measurement = self._keyframe(frame, variables, self._fresh)
             else:
-                sight = self._eye.cold(frame, parameters, self._fresh, quick=True)
+                measurement = self._solver.cold(frame, variables, self._fresh, quick=True)
         except CartsError:
             return None
-        visit = self._asked[index] = _Visit(frame.frame_id, parameters, sight, start, time.perf_counter() - began)
-        return self._estimate(index, visit, combined(self._fresh, sight.information))
+        visit = _Visit(frame.frame_id, variables, measurement, start, time.perf_counter() - began)
+        self._initial[index] = visit
+        return self._estimate(index, visit, combined(self._fresh, measurement.information))
 
     def _visit(self, index: int) -> FrameEstimate:
         began = time.perf_counter()
-        if self._asked and not self._visits:
-            opinions = {asked: visit.sight.correction for asked, visit in self._asked.items()}
-            self._begin_at = best_beginning(opinions, self._eye, self._open, self.model.cold_factor)
-        frame, parameters = self._open(index)
+        if self._initial and not self._visits:
+            corrections = {alone: visit.measurement.correction for alone, visit in self._initial.items()}
+            self._initial_correction = initial_correction(corrections, self._solver, self._open, self.model.cold_factor)
+        frame, variables = self._open(index)
         errors = self._errors
         expected = errors.initial()
-        if self._beliefs:
-            expected = errors.predicted(self._beliefs[-1], self._gaps[index])
-        hoped = errors.correction(expected)
+        if self._filtered:
+            expected = errors.predicted(self._filtered[-1], self._gaps[index])
+        predicted = errors.correction(expected)
         if index in self._keyframes:
-            start: Start = "keyframe"
-            sight = self._keyframe(frame, parameters, hoped)
+            start = Origin.KEYFRAME
+            measurement = self._keyframe(frame, variables, predicted)
         else:
-            start, sight, lost = self._look(frame, parameters, hoped)
-            if self._beliefs and sight.information.surprise(hoped) > _SURPRISE:
+            start, measurement, lost = self._measure(frame, variables, predicted)
+            if self._filtered and measurement.information.mahalanobis(predicted) > _CONTRADICTS:
                 # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
                 if lost:
-                    start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
+                    start, measurement = Origin.CARRIED, _left_out(measurement)
                 else:
                     self._gaps[index], expected = math.inf, errors.initial()
-                    self._told, self._stale = self._shares(), True
-        self._beliefs.append(errors.updated(expected, sight.information.scaled(self._told[index])))
+                    self._shares, self._stale = self._information_shares(), True
+        self._filtered.append(errors.updated(expected, measurement.information.scaled(self._shares[index])))
         self._estimates = None
         seconds = time.perf_counter() - began
         if not self._visits:
-            seconds += sum(visit.seconds for visit in self._asked.values())
-            asked = sum(visit.sight.iterations for visit in self._asked.values())
-            sight = replace(sight, iterations=sight.iterations + asked)
-        visit = self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
-        return self._estimate(index, visit, combined(errors.correction(expected), sight.information))
+            seconds += sum(visit.seconds for visit in self._initial.values())
+            before = sum(visit.measurement.iterations for visit in self._initial.values())
+            measurement = replace(measurement, iterations=measurement.iterations + before)
+        visit = self._visits[index] = _Visit(frame.frame_id, variables, measurement, start, seconds)
+        return self._estimate(index, visit, combined(errors.correction(expected), measurement.information))
 
-    def _look(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> tuple[Start, Sight, bool]:
-        """Look warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
-        if not self._beliefs:
-            return "cold", self._first_look(frame, parameters), False
-        losses = [visit.sight.loss for visit in self._visits.values() if visit.start != "carried"]
+    def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
+        """Start warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
+        if not self._filtered:
+            return Origin.COLD, self._first_measurement(frame, variables), False
+        losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
         usual = self.model.cold_factor * statistics.median(losses or [math.inf])
-        warm = self._eye.warm(frame, parameters, expected, expected.mean)
+        warm = self._solver.warm(frame, variables, expected, expected.mean)
         if warm.loss <= usual:
-            return "warm", warm, False
-        cold = self._eye.cold(frame, parameters, self._fresh)
-        best = min(warm, cold, key=lambda sight: sight.loss)
+            return Origin.WARM, warm, False
+        cold = self._solver.cold(frame, variables, self._fresh)
+        best = min(warm, cold, key=lambda measurement: measurement.loss)
         best = replace(best, iterations=warm.iterations + cold.iterations)
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
-        return "warm" if best.loss == warm.loss else "cold", best, lost
+        return Origin.WARM if best.loss == warm.loss else Origin.COLD, best, lost
 
-    def _first_look(self, frame: Frame, parameters: ParameterVector) -> Sight:
-        if self._begin_at is None:
-            return self._eye.cold(frame, parameters, self._fresh)
-        return self._eye.warm(frame, parameters, self._fresh, self._begin_at)
+    def _first_measurement(self, frame: Frame, variables: Variables) -> Measurement:
+        if self._initial_correction is None:
+            return self._solver.cold(frame, variables, self._fresh)
+        return self._solver.warm(frame, variables, self._fresh, self._initial_correction)
 
-    def _keyframe(self, frame: Frame, parameters: ParameterVector, expected: Gaussian) -> Sight:
+    def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
         given = self._keyframes[frame.index]
-        correction = parameters.joint_offsets([given[arm.name] for arm in self._scene.arms])
+        correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
         here = np.where(np.isfinite(correction), correction, expected.mean)
-        seen = self._eye.at(frame, parameters, expected, here)
+        seen = self._solver.at(frame, variables, expected, here)
         return replace(seen, information=Information.exact(correction))
 
-    def _open(self, index: int) -> tuple[Frame, ParameterVector]:
+    def _open(self, index: int) -> tuple[Frame, Variables]:
         frame = self._load(index)
-        state = self._scene.state(frame.measured, self._extractor.device)
-        return frame, ParameterVector(self._scene, state, self._free, self.settings.lever)
+        state = self._scene.state(frame.measured, self._predictor.device)
+        return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
-    def _shares(self) -> dict[int, float]:
-        """Position -> share of a frame's information that it tells the others; a person's word counts whole."""
-        told = news(list(self._gaps.values()), self.model.image_seconds)
+    def _information_shares(self) -> dict[int, float]:
+        """Position -> share of a frame's information that counts for the others; that of a keyframe counts whole."""
+        shares = information_shares(list(self._gaps.values()), self.model.correlation_seconds)
         return {
-            index: 1.0 if index in self._keyframes else share for index, share in zip(self._gaps, told, strict=True)
+            index: 1.0 if index in self._keyframes else share for index, share in zip(self._gaps, shares, strict=True)
         }
 
     def _smoothed(self) -> dict[int, Gaussian]:
@@ -307,16 +314,16 @@ class SequenceOptimizer:
             return {}
         gaps = [self._gaps[index] for index in self._visits]
         if self._stale:
-            self._beliefs, belief = [], self._errors.initial()
+            self._filtered, state = [], self._errors.initial()
             for (index, visit), gap in zip(self._visits.items(), gaps, strict=True):
-                told = visit.sight.information.scaled(self._told[index])
-                belief = self._errors.updated(self._errors.predicted(belief, gap), told)
-                self._beliefs.append(belief)
+                shared = visit.measurement.information.scaled(self._shares[index])
+                state = self._errors.updated(self._errors.predicted(state, gap), shared)
+                self._filtered.append(state)
             self._stale = False
-        smoothed = zip(self._visits.items(), self._errors.smoothed(self._beliefs, gaps), strict=True)
+        smoothed = zip(self._visits.items(), self._errors.smoothed(self._filtered, gaps), strict=True)
         return {
-            index: combined(belief, visit.sight.information.scaled(1.0 - self._told[index]))
-            for (index, visit), belief in smoothed
+            index: combined(state, visit.measurement.information.scaled(1.0 - self._shares[index]))
+            for (index, visit), state in smoothed
         }
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
@@ -325,35 +332,36 @@ class SequenceOptimizer:
         for index, smoothed in self._smoothed().items():
             visit = self._visits[index]
             certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
-            if visit.start == "carried" or visit.sight.information.surprise(certain) > _SURPRISE:
-                chosen.append((index, without(smoothed, visit.sight.information)))
+            distance = visit.measurement.information.mahalanobis(certain)
+            if visit.start is Origin.CARRIED or distance > _CONTRADICTS:
+                chosen.append((index, remove_measurement(smoothed, visit.measurement.information)))
         return chosen
 
     def _visit_again(self, index: int, expected: Gaussian) -> FrameEstimate:
         began = time.perf_counter()
-        frame, parameters = self._open(index)
+        frame, variables = self._open(index)
         earlier = self._visits[index]
-        sight = self._eye.warm(frame, parameters, expected, expected.mean)
-        start: Start = "warm"
-        if sight.information.surprise(expected) > _SURPRISE:
-            start, sight = "carried", replace(sight, information=Information.nothing(len(parameters)))
-        sight = replace(sight, iterations=earlier.sight.iterations + sight.iterations)
+        measurement = self._solver.warm(frame, variables, expected, expected.mean)
+        start = Origin.WARM
+        if measurement.information.mahalanobis(expected) > _CONTRADICTS:
+            start, measurement = Origin.CARRIED, _left_out(measurement)
+        measurement = replace(measurement, iterations=earlier.measurement.iterations + measurement.iterations)
         seconds = earlier.seconds + time.perf_counter() - began
-        visit = self._visits[index] = _Visit(frame.frame_id, parameters, sight, start, seconds)
+        visit = self._visits[index] = _Visit(frame.frame_id, variables, measurement, start, seconds)
         self._stale, self._estimates = True, None
-        return self._estimate(index, visit, combined(expected, sight.information))
+        return self._estimate(index, visit, combined(expected, measurement.information))
 
     def _estimate(self, index: int, visit: _Visit, correction: Gaussian) -> FrameEstimate:
-        offsets = torch.from_numpy(correction.mean).to(visit.parameters.lower)
-        state = visit.parameters.state(visit.parameters.clamp(offsets)).detached()
-        known = self._uncertainty(visit.parameters, correction)
+        offsets = torch.from_numpy(correction.mean).to(visit.variables.lower)
+        state = visit.variables.state(visit.variables.clamp(offsets)).detached()
+        known = self._uncertainty(visit.variables, correction)
         names = [arm.name for arm in self._scene.arms]
         deviation = [known.joint_std(arm.name, arm.robot.joint_names) for arm in self._scene.arms]
         joints = [values.cpu().double().numpy() for values in state.joint_positions]
         if index in self._keyframes:
             joints = [self._keyframes[index][name] for name in names]
             deviation = [np.zeros_like(values) for values in joints]
-            given = self._scene.state(self._keyframes[index], self._extractor.device)
+            given = self._scene.state(self._keyframes[index], self._predictor.device)
             state = replace(state, joint_positions=given.joint_positions)
         return FrameEstimate(
             index=index,
@@ -362,16 +370,35 @@ class SequenceOptimizer:
             joint_positions={name: values.copy() for name, values in zip(names, joints, strict=True)},
             joint_std=dict(zip(names, deviation, strict=True)),
             uncertainty=known,
-            loss=visit.sight.loss,
+            loss=visit.measurement.loss,
             start=visit.start,
-            iterations=visit.sight.iterations,
+            iterations=visit.measurement.iterations,
             seconds=visit.seconds,
         )
 
-    def _uncertainty(self, parameters: ParameterVector, correction: Gaussian) -> Uncertainty:
-        scales = parameters.scales.cpu().double().numpy()
+    def _uncertainty(self, variables: Variables, correction: Gaussian) -> Uncertainty:
+        scales = variables.scales.cpu().double().numpy()
         std, expected = (np.sqrt(g.covariance.diagonal().clip(min=0.0)) * scales for g in (correction, self._fresh))
-        return Uncertainty(tuple(parameters.names), tuple(std.tolist()), tuple(expected.tolist()))
+        return Uncertainty(tuple(variables.names), tuple(std.tolist()), tuple(expected.tolist()))
+
+
+def _left_out(measurement: Measurement) -> Measurement:
+    """Without the information of its image."""
+    return replace(measurement, information=Information.nothing(len(measurement.correction)))
+
+
+def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
+    """The settings, or the default ones.
+
+    Raises:
+        SettingsError: they are those of another solver.
+    """
+    if settings is None or isinstance(settings, SurfaceSolver):
+        return settings or SurfaceSolver()
+    raise SettingsError(
+        f"{what} was given a solver for the loss {settings.loss.value!r}; it needs the solver `surface`. "
+        "Leave it at its default, or optimize each frame alone."
+    )
 
 
 def _gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:

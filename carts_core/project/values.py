@@ -60,7 +60,7 @@ class Provenance:
         """Provenance of an optimizer's result.
 
         Args:
-            settings: what JSON can hold, say `asdict(OptimizerSettings())`.
+            settings: what JSON can hold, say what `carts_core.settings.serialization.to_plain` makes of a solver's.
             weights_sha256: of the weights file.
             source: OPTIMIZER, or PROPAGATED for a frame that was solved between keyframes.
         """

@@ -12,10 +12,13 @@ from .export import Parts as Parts
 from .loss_weights import ObjectiveWeights as ObjectiveWeights
 from .loss_weights import SurfaceWeights as SurfaceWeights
 from .network import Architecture as Architecture
+from .optimization import DescentSolver as DescentSolver
 from .optimization import FreeParameters as FreeParameters
 from .optimization import Loss as Loss
-from .optimization import OptimizerSettings as OptimizerSettings
 from .optimization import SolverName as SolverName
+from .optimization import SolverSettings as SolverSettings
+from .optimization import SurfaceSolver as SurfaceSolver
+from .optimization import solver as solver
 from .sequence import Direction as Direction
 from .sequence import SequenceSettings as SequenceSettings
 from .synthesis import DOMAINS as DOMAINS

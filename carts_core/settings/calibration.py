@@ -1,18 +1,17 @@
 """What a calibration frees, and how it goes about it."""
 
-from .optimization import FreeParameters, OptimizerSettings
+from . import presets
+from .optimization import FreeParameters, SurfaceSolver
 
 CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
 """What a calibration frees unless told otherwise."""
 
-CALIBRATION_SETTINGS = OptimizerSettings(
+CALIBRATION_SETTINGS = SurfaceSolver(
+    stages=presets.CALIBRATION,
     noise=0.5,
     normals_weight=0.0,
     frame_prior_deg=3.0,
     intrinsics_prior=0.05,
-    glance=False,
-    coarse_robust=0.5,
-    coarse_tolerance=0.01,
 )
 """How a calibration goes about it unless told otherwise. Normals are left out: where they are wrong by the same angle
 in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from ..errors import SettingsError
+from . import presets
+from .checks import require
+from .stages import Stage
 
 Direction = Literal["forward", "backward"]
 """In which direction corrections are handed on from frame to frame."""
@@ -11,39 +13,40 @@ Direction = Literal["forward", "backward"]
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Model of the measurement error and the way through the frames; defaults are measured
-    (docs/explanation/sequences.md)."""
+    """Model of the measurement error and the way through the frames (docs: explanation/sequences)."""
 
     constant_deg: float = 2.0
-    """Deviation of the constant part of the error [deg]; `lever` turns it into metres."""
+    """Deviation of the constant part of the error [deg]; `length_scale` turns it into metres."""
     drift_deg: float = 0.2
     """Deviation of the slow drift about it [deg]."""
     drift_seconds: float = 4.0
-    """Time after which the drift has forgotten all but 1/e of itself [s]."""
+    """Time constant of the drift's autocorrelation [s]."""
     jitter_deg: float = 0.05
-    """Deviation of the error that is new in every frame [deg]."""
-    sight_noise: float = 4.0
-    """As `noise`, for what a frame tells; larger, since the errors of neighbouring pixels are alike [1]."""
-    image_seconds: float = 0.5
-    """Time after which errors of images are no longer alike (a correlation of 1/e); frames that follow each other
-    faster tell the others less [s]."""
-    opinions: int = 5
-    """How many frames, evenly spread, are looked at alone before the first one, which starts where suits all of them
-    best; 1 asks the first frame only [1]."""
+    """Deviation of the error that is independent in every frame [deg]."""
+    measurement_noise: float = 4.0
+    """As `SurfaceSolver.noise`, for a frame's measurement in the smoother; larger, since the errors of neighbouring
+    pixels are correlated [1]."""
+    correlation_seconds: float = 0.5
+    """Time constant of the autocorrelation of image errors; frames that follow each other faster count less for the
+    others [s]."""
+    initial_frames: int = 5
+    """How many frames, evenly spread, are solved alone to find where the first one starts; 1 takes the first frame
+    only [1]."""
     cold_factor: float = 2.0
-    """A loss of that many times the usual one has a frame start cold [1]."""
+    """A loss of that many times the median has a frame start cold [1]."""
     direction: Direction = "forward"
     """Where the first pass begins: at the first frame, or at the last one."""
     frame_seconds: float = 0.25
-    """Time between frames, where the sequence does not tell; images without times are mostly a few per second [s]."""
+    """Time between frames, where the sequence does not tell [s]."""
+    cold: tuple[Stage, ...] = presets.COLD
+    """Stages from measured kinematics; `warm` follows."""
+    warm: tuple[Stage, ...] = presets.WARM
+    """Stages from what the other frames let expect."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise SettingsError(f"{name} is {value!r}; allowed is {low:g} to {high:g}. Leave it at its default.")
-        if self.direction not in get_args(Direction):
-            raise SettingsError(f"direction is {self.direction!r}; allowed is {' or '.join(get_args(Direction))}.")
+            require(low <= getattr(self, name) <= high, name, getattr(self, name), f"{low:g} to {high:g}")
+        require(self.direction in get_args(Direction), "direction", self.direction, " or ".join(get_args(Direction)))
 
 
 _RANGES = {
@@ -51,9 +54,9 @@ _RANGES = {
     "drift_deg": (1e-3, 360.0),
     "drift_seconds": (1e-3, 1e6),
     "jitter_deg": (1e-3, 360.0),
-    "sight_noise": (1e-3, 100.0),
-    "image_seconds": (1e-6, 1e6),
-    "opinions": (1, 20),
+    "measurement_noise": (1e-3, 100.0),
+    "correlation_seconds": (1e-6, 1e6),
+    "initial_frames": (1, 20),
     "cold_factor": (1.0, 100.0),
     "frame_seconds": (1e-6, 1e6),
 }

@@ -1,25 +1,25 @@
-"""Run, Pause, Step, Reset, how it is going, and which loss."""
-
-from typing import get_args
+"""Run, Pause, Step, Reset, how it is going, and which solver."""
 
 import viser
 
 from carts_core.optimization import BASE_FRAME_GAIN
-from carts_core.settings import Loss
+from carts_core.settings import SolverName
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
 
-LOSS_LABELS = {
-    "surface": "Surface, Gauss-Newton",
-    "acs": "ACS, per attended area",
-    "acs_paper": "ACS as in the paper",
-    "acs_reference": "ACS as in the paper's code",
-    "l1": "L1 on predictions",
+SOLVER_LABELS = {
+    SolverName.SURFACE: "Surface maps (default)",
+    SolverName.OCCLUDED: "Surface maps, past occluders",
+    SolverName.ACS: "ACS, per attended area",
+    SolverName.PAPER: "ACS as in the paper",
+    SolverName.ACS_REFERENCE: "ACS as in the paper's code",
+    SolverName.L1: "L1 on predictions",
+    SolverName.NONE: "None: compare only",
 }
-"""What people read for the losses; one that is not listed goes by its own name."""
+"""What people read for the solvers."""
 
 
 class OptimizePanel:
@@ -34,18 +34,15 @@ class OptimizePanel:
         self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
         page.row(self._step, self._reset)
         self._status = gui.add_html("")
-        losses: tuple[str, ...] = get_args(Loss)
-        self._losses = {LOSS_LABELS.get(name, name): name for name in losses}
-        self._loss = gui.add_dropdown(
-            "Loss", list(self._losses), initial_value=_label(self._losses, state.settings.loss)
-        )
+        self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
+        self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["Shown camera", "All cameras"], visible=len(cameras) > 1)
         on_click(self._run, lambda _: ask.Run(), emit)
         on_click(self._pause, lambda _: ask.Pause(), emit)
         on_click(self._step, lambda _: ask.Step(), emit)
         on_click(self._reset, lambda _: ask.Reset(), emit)
-        on_input(self._loss, lambda label: ask.SetSetting("loss", self._losses[label]), emit)
+        on_input(self._solver, lambda label: ask.SetSetting("solver", self._solvers[label]), emit)
         on_input(self._cameras, lambda label: ask.SetCameras(label == "All cameras"), emit)
 
     def show(self, state: ViewState) -> None:
@@ -56,7 +53,7 @@ class OptimizePanel:
         self._pause.disabled = not running
         self._step.disabled = running
         self._reset.disabled = not state.run.curves.loss
-        write(self._loss, _label(self._losses, state.settings.loss))
+        write(self._solver, SOLVER_LABELS[state.solver])
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
         self._status.content = (
             f'<p class="carts-status">{status_line(state)}</p>{observability_lines(state)}{calibration_line(state)}'
@@ -109,7 +106,3 @@ def calibration_line(state: ViewState) -> str:
 def _spoken(unknown: str) -> str:
     owner, _, name = unknown.partition("/")
     return f"{owner} {humanized(name).lower()}"
-
-
-def _label(labels: dict[str, str], name: str) -> str:
-    return next(label for label, known in labels.items() if known == name)

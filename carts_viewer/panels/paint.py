@@ -2,6 +2,7 @@
 
 import viser
 
+from carts_core.settings import DescentSolver
 from carts_viewer import intents as ask
 from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR
 from carts_viewer.page import Page
@@ -67,8 +68,8 @@ class PaintPanel:
         self._clear.label = "Clear the correction" if brush.target is Target.MASK else "Clear the ignore region"
         self._clear.disabled = layer is None
         hint = f"{_HINTS[brush.tool]} {_MOVING}" if brush.tool is not Tool.OFF else _HINTS[brush.tool]
-        if brush.target is Target.IGNORE and state.settings.loss != "surface":
-            hint += f" The loss <b>{state.settings.loss}</b> does not use the ignore region; <b>surface</b> does."
+        if brush.target is Target.IGNORE and isinstance(state.settings, DescentSolver):
+            hint += " This solver does not use the ignore region; <b>Surface maps</b> does."
         self._text.content = f'<p class="carts-caption">{hint}<br>{_counts(state)}</p>'
         message = self._message(state)
         if message != self._told:

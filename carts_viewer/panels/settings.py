@@ -1,48 +1,54 @@
 """The optimizer's settings and free parameters, built from the dataclasses that declare them."""
 
-import ast
-import inspect
 import math
 import re
-import textwrap
 from dataclasses import fields
-from functools import cache
+from enum import StrEnum
 from typing import Any, get_args, get_type_hints
 
-from carts_core.optimization import OptimizerSettings
+from carts_core.settings import DescentSolver, SurfaceSolver
+from carts_core.settings.docstrings import field_docstrings
 from carts_viewer import intents as ask
 from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
-_ELSEWHERE = ("loss",)
-"""Fields that have a widget of their own in another panel."""
 _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsics": "Camera intrinsics"}
 
 
 class SettingsPanel:
-    """One widget per field of `OptimizerSettings`; the field's own docstring is its hint."""
+    """One widget per number of the chosen solver's settings; the field's own docstring is its hint.
+
+    Stages are not edited here: a settings file holds them (`carts evaluate --settings`).
+    """
 
     def __init__(self, page: Page, state: ViewState, emit: Emit) -> None:
         gui = page.server.gui
-        hints = field_docstrings(OptimizerSettings)
-        self._widgets: dict[str, Any] = {}
+        self._widgets: dict[type, dict[str, Any]] = {}
         with gui.add_folder("Solver settings", expand_by_default=False):
             self._error = gui.add_html("", visible=False)
-            for field in fields(OptimizerSettings):
-                if field.name not in _ELSEWHERE:
-                    self._widgets[field.name] = _widget(gui, field.name, getattr(state.settings, field.name), hints)
-                    on_input(self._widgets[field.name], _setter(field.name, getattr(state.settings, field.name)), emit)
+            for example in (SurfaceSolver(), DescentSolver()):
+                kind, shown = type(example), type(state.settings)
+                self._widgets[kind] = {
+                    field.name: _widget(gui, kind, field.name, getattr(example, field.name))
+                    for field in fields(kind)
+                    if field.name != "stages"
+                }
+                for name, widget in self._widgets[kind].items():
+                    widget.visible = kind is shown
+                    on_input(widget, _setter(name), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
         self._error.visible = state.settings_error is not None
         self._error.content = f'<p class="carts-error">{escaped(state.settings_error or "")}</p>'
-        if state.settings_error is None:
-            for name, widget in self._widgets.items():
-                value = getattr(state.settings, name)
-                write(widget, _listed(value) if isinstance(value, tuple) else value)
+        for kind, widgets in self._widgets.items():
+            chosen = isinstance(state.settings, kind)
+            for name, widget in widgets.items():
+                widget.visible = chosen
+                if chosen and state.settings_error is None:
+                    write(widget, getattr(state.settings, name))
 
 
 class FreePanel:
@@ -82,53 +88,25 @@ def is_free(state: ViewState, arm: str, joint: str) -> bool:
     return state.free.joints and chosen and joint not in locked and f"{arm}/{joint}" not in locked
 
 
-@cache
-def field_docstrings(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass, which Python itself throws away."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    found = {}
-    for field, text in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            found[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
-    return found
-
-
-def _widget(gui: Any, name: str, value: Any, hints: dict[str, str]) -> Any:
-    choices = get_args(get_type_hints(OptimizerSettings)[name])
-    hint = hints.get(name)
+def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
+    hint = field_docstrings(kind).get(name)
     unit = re.search(r"\[([^\]]*)\]", hint or "")
     # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
     short = unit.group(1).split()[0] if unit else "1"
     # `prior_deg` in degrees needs its unit once only.
     words = humanized(name.removesuffix(f"_{short}"))
     label = words if short == "1" else f"{words} [{short.replace('^2', '²')}]"
-    if isinstance(value, tuple):
-        return gui.add_text(label, _listed(value), hint=hint)
-    if choices:
-        return gui.add_dropdown(label, list(choices), initial_value=value, hint=hint)
+    if isinstance(value, str):
+        choices = list(type(value)) if isinstance(value, StrEnum) else get_args(get_type_hints(kind)[name])
+        return gui.add_dropdown(label, [str(choice) for choice in choices], initial_value=str(value), hint=hint)
     if isinstance(value, bool):
         return gui.add_checkbox(label, value, hint=hint)
     step = 1 if isinstance(value, int) else 10.0 ** (math.floor(math.log10(value)) - 1 if value > 0 else -5)
     return gui.add_number(label, value, step=step, hint=hint)
 
 
-def _setter(name: str, example: Any):
-    if isinstance(example, tuple):
-        return lambda text: ask.SetSetting(name, _numbers(text))
+def _setter(name: str):
     return lambda value: ask.SetSetting(name, value)
-
-
-def _listed(values: tuple[float, ...]) -> str:
-    return ", ".join(f"{value:g}" for value in values)
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    """Numbers from a text field; none at all, which no setting takes, when it is not a list of them."""
-    try:
-        return tuple(float(part) for part in text.replace(",", " ").split())
-    except ValueError:
-        return ()
 
 
 def _free_joint(arm: str, joint: str):

@@ -10,7 +10,7 @@ from carts_core.benchmark import Benchmark, ResultsFile, Scope, Source, methods,
 from carts_core.data import Sequence
 from carts_core.features import FeatureExtractor
 from carts_core.files import output_path
-from carts_core.optimization import OptimizerSettings
+from carts_core.optimization import SolverSettings
 from carts_core.synthesis import DOMAINS
 
 TINY = Scope(
@@ -41,7 +41,7 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
         if method.settings is not None:
             make = method.settings
 
-            def short(steps: int, make: Callable[[int], OptimizerSettings] = make) -> OptimizerSettings:
+            def short(steps: int, make: Callable[[int], SolverSettings] = make) -> SolverSettings:
                 return replace(make(steps), iterations=2)
 
             monkeypatch.setitem(methods.METHODS, name, replace(method, settings=short))

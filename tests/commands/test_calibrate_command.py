@@ -13,7 +13,7 @@ from carts_core.cli import BAD_INPUT, main
 from carts_core.data import Sequence, calibrated_sequence_file
 
 CAUTION = "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame"
-QUICK = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
+QUICK = ["--frames", "spread:2", "--settings", "iterations=3"]
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(
 def test_a_calibration_that_moved_nothing_says_so(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--iterations", "1"])
+    main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK[:3], "iterations=1"])
     page = (tmp_path / "out" / "README.md").read_text()
     for text in (page, " ".join(capsys.readouterr().out.split())):
         assert "The start was kept" in text and CAUTION not in text

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,7 +27,9 @@ def sequence(tiny_sequence: Callable[..., Path]) -> str:
 
 def test_evaluate_writes_scores_of_every_frame_into_a_folder_that_it_makes(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "scores" / "out.json"
-    main(["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--iterations", "2"])
+    main(
+        ["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--settings", "iterations=2"]
+    )
     scores = json.loads(file.read_text())
     assert [(s["frame"], s["domain"]) for s in scores["frames"]] == [
         ("001", "regular"),
@@ -44,7 +47,7 @@ def test_evaluate_writes_scores_of_every_frame_into_a_folder_that_it_makes(seque
 
 def test_evaluate_without_truth_gives_null(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     path, file = tiny_sequence(frames=1, masks=False, truth=False, width=160, height=128), tmp_path / "out.json"
-    main(["evaluate", str(path), "--json", str(file), "--iterations", "1"])
+    main(["evaluate", str(path), "--json", str(file), "--settings", "iterations=1"])
     (score,) = json.loads(file.read_text())["frames"]
     assert score["dice_before"] is None and score["joint_mae_deg_after"] is None
 
@@ -78,7 +81,7 @@ def test_a_start_that_was_kept_is_told(
 def test_optimize_writes_masks_and_kinematics_and_resumes(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--iterations", "2"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--settings", "iterations=2"]
     main([*command, "--frames", "0-1"])
     folder = tmp_path / "out" / "regular" / "left"
     first = (folder / "masks" / "001.png").stat().st_mtime_ns
@@ -99,7 +102,17 @@ def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], mode: str
 ) -> None:
     stereo = str(tiny_sequence(frames=2, cameras=("left", "right"), width=160, height=128))
-    command = ["optimize", stereo, "--together", "--mode", mode, "--output", str(tmp_path), "--iterations", "2"]
+    command = [
+        "optimize",
+        stereo,
+        "--together",
+        "--mode",
+        mode,
+        "--output",
+        str(tmp_path),
+        "--settings",
+        "iterations=2",
+    ]
     main(command)
     folder = tmp_path / "regular" / "left+right"
     rows = list(csv.DictReader((folder / "kinematics.csv").open()))
@@ -155,28 +168,44 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert stop.value.code == BAD_INPUT and "needs --mode sequence" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("loss", ["acs", "l1"])
-def test_a_loss_that_is_given_alone_gets_a_solver_that_can_descend_it(sequence: str, tmp_path: Path, loss: str) -> None:
+@pytest.mark.parametrize("solver", ["acs", "l1"])
+def test_a_solver_is_chosen_by_its_name(sequence: str, tmp_path: Path, solver: str) -> None:
     file = tmp_path / "out.json"
-    main(["evaluate", sequence, "--loss", loss, "--iterations", "2", "--frames", "0", "--json", str(file)])
+    command = ["evaluate", sequence, "--solver", solver, "--settings", "iterations=2", "--frames", "0"]
+    main([*command, "--json", str(file)])
     (score,) = json.loads(file.read_text())["frames"]
     assert (score["iterations"], score["stopped"]) == (2, "iterations")
 
 
-def test_a_solver_that_cannot_descend_the_loss_is_told_with_what_can(
-    sequence: str, capsys: pytest.CaptureFixture[str]
+def test_all_settings_are_printed_as_a_file_and_explained_on_request(
+    sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", sequence, "--loss", "acs", "--solver", "gauss_newton"])
-    assert stop.value.code == BAD_INPUT
-    assert "allowed is auto, adam, gradient_descent or none for the loss" in " ".join(capsys.readouterr().err.split())
+    main(["evaluate", sequence, "--print-settings"])
+    path = tmp_path / "settings.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    main(["evaluate", sequence, "--settings", str(path), "iterations=1", "--frames", "0"])
+    capsys.readouterr()
+    main(["evaluate", "--help-all"])
+    text = capsys.readouterr().out
+    assert "prior_deg = 2.5: Expected error of a joint position" in text and "RandomRestart: " in text
+    with pytest.raises(SystemExit):
+        main(["render", sequence, "--print-settings"])
+    assert "--print-settings is for" in capsys.readouterr().err
+
+
+def test_the_help_of_a_command_shows_at_most_twenty_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, most in (("evaluate", 20), ("calibrate", 20), ("optimize", 22)):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        flags = re.findall(r"^│ (-[-\w]+)", capsys.readouterr().out, re.MULTILINE)
+        assert 10 < len(flags) <= most, flags
 
 
 def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--settings", "iterations=1"]
     main(command)
     main(command)
-    main(["evaluate", sequence, "--frames", "0", "--iterations", "1"])
+    main(["evaluate", sequence, "--frames", "0", "--settings", "iterations=1"])
     main(["export", sequence, str(tmp_path / "export"), "--frames", "0", "--format", "masks"])
     told = " ".join(capsys.readouterr().out.split())
     for words in (
@@ -191,12 +220,12 @@ def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: p
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0"]
-    main([*command, "--iterations", "1"])
+    main([*command, "--settings", "iterations=1"])
     with pytest.raises(SystemExit) as stop:
-        main([*command, "--iterations", "2"])
+        main([*command, "--settings", "iterations=2"])
     assert stop.value.code == BAD_INPUT
     assert "--overwrite" in capsys.readouterr().err
-    main([*command, "--iterations", "2", "--overwrite"])
+    main([*command, "--settings", "iterations=2", "--overwrite"])
 
 
 @pytest.mark.parametrize(
@@ -223,14 +252,14 @@ def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
 def test_results_are_replaced_by_frames_and_not_by_an_error(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--iterations", "1"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--settings", "iterations=1"]
     main([*command, "--domain", "smoke"])
     folder = tmp_path / "out" / "smoke" / "left"
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(SystemExit):
         main([*command, "--domain", "smoke", "--overwrite", "--arms", "PSM9"])
     with pytest.raises(SystemExit):
-        main([*command, "--domain", "all", "--looks", "1"])
+        main([*command, "--domain", "all", "--settings", "dehaze=0.5"])
     assert "smoke/left holds results of other settings" in " ".join(capsys.readouterr().err.split())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert not (tmp_path / "out" / "regular").exists(), "the first domain is not begun if the second is refused"

@@ -8,7 +8,7 @@ import pytest
 from carts_core.data import Sequence
 from carts_core.evaluation import evaluate, evaluate_sequence
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FreeParameters, OptimizerSettings, SequenceSettings
+from carts_core.optimization import FreeParameters, SequenceSettings, SurfaceSolver
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -21,7 +21,7 @@ def test_every_camera_of_a_frame_has_a_score(tiny_sequence: Callable[..., Path],
             frames=[0],
             cameras=["left", "right"],
             domains=["regular"],
-            settings=OptimizerSettings(iterations=3),
+            settings=SurfaceSolver(iterations=3),
             free=FreeParameters(),
             together=together,
         )
@@ -41,7 +41,7 @@ def test_every_camera_of_a_sequence_has_its_scores(tiny_sequence: Callable[..., 
             frames=[0, 1],
             cameras=["left", "right"],
             domains=["regular"],
-            settings=OptimizerSettings(iterations=3),
+            settings=SurfaceSolver(iterations=3),
             model=SequenceSettings(),
             free=FreeParameters(),
             together=together,

@@ -1,4 +1,4 @@
-"""Calibration over many frames, with a network that sees exactly what is there."""
+"""Calibration over many frames, with a predictor that sees exactly what is there."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,23 +12,31 @@ from torch.nn import functional
 
 from carts_core.data import Frame, Sequence
 from carts_core.errors import RobotError, SettingsError
-from carts_core.features import FeatureExtractor
-from carts_core.optimization import CALIBRATION, CALIBRATION_SETTINGS, CalibrationOptimizer, FreeParameters
+from carts_core.optimization import (
+    CALIBRATION,
+    CALIBRATION_SETTINGS,
+    CalibrationOptimizer,
+    DescentSolver,
+    FreeParameters,
+)
 from carts_core.optimization.calibration import with_fixed_gauge
-from carts_core.optimization.calibration_objective import trust_of_frames
+from carts_core.optimization.calibration_problem import frame_weights
 from carts_core.optimization.elimination import eliminate
 from carts_core.optimization.window import Window
 from carts_core.rendering import Renderer
 from carts_core.scene import Scene
+from carts_core.settings.stages import Descend, Observe
 
 FRAMES, SIZE = 6, (320, 240)
 # Cameras that are given wrong ought to be found as wrong: a loose prior, and fewer stages than for real images. Colours
 # stay as they are, because they number the frames.
-SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, blurs=(6.0, 2.0, 0.8), looks=1, unveil=0.0)
+FAR = Observe(margin=27, attention=27)
+DESCENTS = (Descend(6.0), Descend(2.0), Descend(0.8))
+SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, stages=(FAR, *DESCENTS), dehaze=0.0)
 
 
-class PerfectSight:
-    """Stands in for the networks: knows a frame by its images' colour, and sees the surface map of its truth."""
+class PerfectPredictor:
+    """Knows a frame by its images' colour, and predicts the surface map of its truth."""
 
     device = torch.device("cpu")
     stride = 16
@@ -38,11 +46,10 @@ class PerfectSight:
         self.maps = [
             functional.avg_pool2d(renderer.surface(scene.state(frame.truth or {})).maps, 2) for frame in frames
         ]
-        self.window = Window(0, 0, *SIZE)
 
-    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
+    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
         """The truth of the frame whose images these are."""
-        return self.window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
+        return window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
 
 
 @pytest.fixture
@@ -62,16 +69,8 @@ def frames(sequence: Sequence) -> list[Frame]:
 
 
 @pytest.fixture
-def sight(sequence: Sequence, frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> FeatureExtractor:
-    seen = PerfectSight(sequence.scene, frames)
-    around = Window.around
-
-    def remembered(*arguments) -> Window:
-        seen.window = around(*arguments)
-        return seen.window
-
-    monkeypatch.setattr(Window, "around", staticmethod(remembered))
-    return seen  # pyright: ignore[reportReturnType]
+def predictor(sequence: Sequence, frames: list[Frame]) -> PerfectPredictor:
+    return PerfectPredictor(sequence.scene, frames)
 
 
 def rigid(degrees: list[float], millimetres: list[float]) -> np.ndarray:
@@ -109,10 +108,10 @@ def worst_error(scene: Scene, truth: Scene, joint_positions: np.ndarray) -> tupl
 
 
 def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
 ) -> None:
     wrong = with_wrong_right_camera(with_wrong_base(sequence.scene))
-    optimizer = CalibrationOptimizer(wrong, frames, sight, settings=SETTINGS)
+    optimizer = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
     list(optimizer)
     result = optimizer.result()
     positions = frames[1].measured["PSM1"]
@@ -128,7 +127,7 @@ def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
 
 
 def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
 ) -> None:
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (FRAMES, 2))
     shaken = [
@@ -139,7 +138,7 @@ def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
 
     def loss(free: FreeParameters) -> float:
         optimizer = CalibrationOptimizer(
-            wrong, shaken, sight, settings=SETTINGS, free=free, joint_prior_deg=1.0, cameras=["left"]
+            wrong, shaken, predictor, settings=SETTINGS, free=free, joint_prior_deg=1.0, cameras=["left"]
         )
         list(optimizer)
         assert optimizer.best is not None
@@ -150,14 +149,14 @@ def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
 
 
 def test_a_frame_with_wrong_kinematics_hardly_matters(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
 ) -> None:
     broken = {"PSM1": frames[0].measured["PSM1"] + np.deg2rad([4, -4, 0, 0, 0, 0, 0])}
     mixed = [replace(frames[0], measured=broken), *frames[1:]]
     free = FreeParameters(joints=False, base_frames=True)
-    settings = replace(SETTINGS, looks=2)
+    settings = replace(SETTINGS, stages=(FAR, DESCENTS[0], Observe(), *DESCENTS[1:]))
     wrong = with_wrong_base(sequence.scene)
-    optimizer = CalibrationOptimizer(wrong, mixed, sight, settings=settings, free=free, cameras=["left"])
+    optimizer = CalibrationOptimizer(wrong, mixed, predictor, settings=settings, free=free, cameras=["left"])
     list(optimizer)
     result = optimizer.result()
     assert result.frame_weights[0] < 0.1 and result.frame_weights[1:].min() > 0.5
@@ -193,9 +192,9 @@ def test_nothing_own_leaves_a_model_as_it_is() -> None:
 
 
 def test_frames_are_trusted_by_their_loss_beside_the_median() -> None:
-    weights = trust_of_frames(torch.tensor([0.1, 0.1, 0.12, 0.0, 1.5], dtype=torch.float64))
+    weights = frame_weights(torch.tensor([0.1, 0.1, 0.12, 0.0, 1.5], dtype=torch.float64))
     assert weights[:4].tolist() == [1.0] * 4 and float(weights[4]) == pytest.approx(0.01)
-    assert trust_of_frames(torch.zeros(2)).tolist() == [1.0, 1.0]
+    assert frame_weights(torch.zeros(2)).tolist() == [1.0, 1.0]
 
 
 def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequence) -> None:
@@ -207,9 +206,9 @@ def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequen
 
 
 def test_the_best_calibration_is_kept_when_it_is_cancelled(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
 ) -> None:
-    optimizer = CalibrationOptimizer(with_wrong_base(sequence.scene), frames[:1], sight, settings=SETTINGS)
+    optimizer = CalibrationOptimizer(with_wrong_base(sequence.scene), frames[:1], predictor, settings=SETTINGS)
     first, second = optimizer.step(), optimizer.step()
     optimizer.cancel()
     assert optimizer.step() is None and optimizer.stop_reason == "cancelled"
@@ -221,25 +220,25 @@ def test_the_best_calibration_is_kept_when_it_is_cancelled(
     ("changes", "message"),
     [
         ({"free": FreeParameters()}, "nothing of the calibration is free"),
-        ({"settings": replace(CALIBRATION_SETTINGS, solver="adam")}, "needs gauss_newton"),
+        ({"settings": DescentSolver()}, "needs the solver `surface`"),
         ({"joint_prior_deg": 0.0}, "joint_prior_deg is 0.0"),
         ({"free": FreeParameters(joints=False, extrinsics=True, locked_cameras=("left", "right"))}, "nothing is free"),
     ],
 )
 def test_what_makes_no_calibration_is_refused(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor, changes: dict, message: str
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor, changes: dict, message: str
 ) -> None:
     with pytest.raises(SettingsError, match=message):
-        CalibrationOptimizer(sequence.scene, frames, sight, **changes)
+        CalibrationOptimizer(sequence.scene, frames, predictor, **changes)
 
 
 def test_no_frame_and_unknown_cameras_are_refused(
-    sequence: Sequence, frames: list[Frame], sight: FeatureExtractor
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
 ) -> None:
     with pytest.raises(SettingsError, match="no frame was given"):
-        CalibrationOptimizer(sequence.scene, [], sight)
+        CalibrationOptimizer(sequence.scene, [], predictor)
     with pytest.raises(RobotError, match="no camera is called 'third'"):
-        CalibrationOptimizer(sequence.scene, frames, sight, free=replace(CALIBRATION, locked_cameras=("third",)))
-    optimizer = CalibrationOptimizer(sequence.scene, frames, sight)
+        CalibrationOptimizer(sequence.scene, frames, predictor, free=replace(CALIBRATION, locked_cameras=("third",)))
+    optimizer = CalibrationOptimizer(sequence.scene, frames, predictor)
     with pytest.raises(SettingsError, match="no step was made"):
         optimizer.result()

@@ -12,9 +12,10 @@ from carts_core.benchmark.rooms import made_rooms
 from carts_core.data import Sequence
 from carts_core.evaluation import dice
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import Backgrounds, FrameOptimizer, OptimizerSettings
+from carts_core.optimization import Backgrounds, FrameOptimizer
 from carts_core.optimization.counterfactual import Background, without_background
-from carts_core.optimization.scale import Scale, scaled
+from carts_core.optimization.frame_images import FrameImages
+from carts_core.optimization.window import Window
 from carts_core.rendering import Renderer
 from carts_core.scene import Scene
 
@@ -24,14 +25,14 @@ BAR, ARM = (slice(40, 120), slice(20, 200)), (slice(150, 200), slice(100, 240))
 
 
 class DarkIsArm:
-    """A network that takes whatever is dark for an arm."""
+    """A predictor that takes whatever is dark for an arm."""
 
-    device, stride, sha256 = torch.device("cpu"), 16, ""
+    device, stride = torch.device("cpu"), 16
 
-    def surface(self, images: torch.Tensor, believed: torch.Tensor) -> torch.Tensor:
-        found = torch.zeros_like(believed)
+    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
+        found = torch.zeros_like(given)
         found[:, 0] = (images.amax(1) < 0.3).float()
-        return found
+        return window.of(found)
 
 
 @pytest.fixture
@@ -53,10 +54,19 @@ def _with_arm(room: np.ndarray) -> np.ndarray:
     return image
 
 
-def _seen(scene: Scene, image: np.ndarray, backgrounds: Backgrounds | None) -> tuple[Scale, np.ndarray]:
-    extractor = DarkIsArm()
-    found = scaled(scene, {"left": image}, {}, 1.0, OptimizerSettings(unveil=0.0), extractor, backgrounds)  # pyright: ignore[reportArgumentType]
-    seen = extractor.surface(found.images, torch.zeros(1, 6, 240, 320))[0, 0]
+def _seen(scene: Scene, image: np.ndarray, backgrounds: Backgrounds | None) -> tuple[FrameImages, np.ndarray]:
+    predictor = DarkIsArm()
+    found = FrameImages.of(
+        scene,
+        {"left": image},
+        {},
+        scale=1.0,
+        working_width=320,
+        dehaze=0.0,
+        predictor=predictor,
+        backgrounds=backgrounds,
+    )
+    seen = predictor.predict(found.images, torch.zeros(1, 6, 240, 320), Window(0, 0, 320, 240))[0, 0]
     if found.explained is not None:
         seen = seen * (1 - found.explained[0, 0])
     return found, seen.numpy()

@@ -1,22 +1,27 @@
 """Outlines drawn to edges: on images that a renderer made, and with the shipped networks on the shipped sequence."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from perfect_sight import PerfectSight
+from perfect_predictor import PerfectPredictor, with_stage, without
 
 from carts_core.data import Sequence
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice, start_positions
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
-from carts_core.optimization.edges import Drawn, EdgeRefinement
-from carts_core.optimization.parameters import ParameterVector
+from carts_core.optimization import FrameOptimizer, FreeParameters
+from carts_core.optimization.edge_alignment import align_edges
+from carts_core.optimization.factors import Linearization, Prior
+from carts_core.optimization.factors.edges import EdgeFactor
+from carts_core.optimization.variables import Variables
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
+from carts_core.settings import SurfaceSolver
+from carts_core.settings.stages import AlignEdges
 
 ARM = "PSM1"
 OFF = np.deg2rad([0.3, -0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -28,33 +33,51 @@ def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
     return Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=640, height=480))
 
 
-def draw(sequence: Sequence, image: np.ndarray | None = None, **given) -> tuple[Drawn, ParameterVector]:
-    """Draw to edges from `OFF` the truth, knowing nothing else but that joints are right within 3 degrees."""
+@dataclass(frozen=True)
+class Aligned:
+    """Outlines on edges."""
+
+    offsets: torch.Tensor
+    edges: Linearization
+    variables: Variables
+    prior: Prior
+
+
+def align(sequence: Sequence, image: np.ndarray | None = None, **given) -> Aligned:
+    """Align from `OFF` the truth, knowing nothing else but that joints are right within 3 degrees."""
     frame = sequence.frame(0)
     images = frame.images if image is None else {"left": image}
     start = sequence.scene.state({ARM: (frame.truth or {})[ARM] + OFF})
-    parameters = ParameterVector(sequence.scene, start, FreeParameters(), 0.15)
-    settings = OptimizerSettings(**given.pop("settings", {"edge_steps": 20, "unveil": 0.0}))
+    variables = Variables(sequence.scene, start, FreeParameters(), 0.15)
     seen = given.pop("seen", torch.ones(1, 360, 480))
-    refinement = EdgeRefinement(sequence.scene, images, parameters, settings, given.pop("ignore", {}), seen.device)
-    curvature = torch.diag(parameters.prior_precision(3.0))
-    return refinement(torch.zeros(len(parameters)), torch.zeros(len(parameters)), curvature, seen), parameters
+    edges = EdgeFactor(
+        sequence.scene,
+        images,
+        variables,
+        given.pop("ignore", {}),
+        working_width=320,
+        dehaze=given.pop("dehaze", 0.0),
+        device=seen.device,
+    )
+    prior, origin = variables.prior(SurfaceSolver(prior_deg=3.0)), torch.zeros(len(variables))
+    stage = AlignEdges(steps=given.pop("steps", 20))
+    return Aligned(*align_edges(edges, stage, origin, prior.linearize(origin), seen), variables, prior)
 
 
 def test_outlines_come_to_lie_on_the_edges_of_the_image(sequence: Sequence) -> None:
-    drawn, parameters = draw(sequence)
+    drawn = align(sequence)
     scene = sequence.scene
     renderer = Renderer(scene)
     truth = renderer.segment(scene.state(sequence.frame(0).truth or {}))[0] >= 0
     before, after = (
-        dice(renderer.segment(parameters.state(offsets))[0] >= 0, truth)
+        dice(renderer.segment(drawn.variables.state(offsets))[0] >= 0, truth)
         for offsets in (torch.zeros_like(drawn.offsets), drawn.offsets)
     )
     assert 1.0 - after < 0.3 * (1.0 - before)
     # What pulls at the end is held by what was known before.
-    held = parameters.prior_precision(3.0) * drawn.offsets
-    pulled = (drawn.gradient.abs() + held.abs()).max()
-    assert (drawn.gradient + held).abs().max() < 0.1 * pulled
+    held = drawn.prior.gradient(drawn.offsets)
+    pulled = (drawn.edges.gradient.abs() + held.abs()).max()
+    assert (drawn.edges.gradient + held).abs().max() < 0.1 * pulled
 
 
 def test_moving_outlines_as_they_say_is_as_good_as_rendering_them(
@@ -62,81 +85,75 @@ def test_moving_outlines_as_they_say_is_as_good_as_rendering_them(
 ) -> None:
     rendered, render = [], Renderer.outline
     monkeypatch.setattr(Renderer, "outline", lambda *given: rendered.append(render(*given)) or rendered[-1])
-    moved, _ = draw(sequence)
+    moved = align(sequence)
     few = len(rendered)
-    monkeypatch.setattr("carts_core.optimization.edges._RENDERED_ANEW", 0.0)
-    always, _ = draw(sequence)
+    monkeypatch.setattr("carts_core.optimization.factors.edges._RENDERED_ANEW", 0.0)
+    always = align(sequence)
     assert few < 0.8 * (len(rendered) - few)
     assert (moved.offsets - always.offsets)[:2].abs().max() < 0.05 * OFF.max()
 
 
 def test_where_there_is_no_edge_nothing_moves(sequence: Sequence) -> None:
-    drawn, _ = draw(sequence, np.full((480, 640, 3), 128, np.uint8))
+    drawn = align(sequence, np.full((480, 640, 3), 128, np.uint8))
     assert drawn.offsets.abs().max() == 0
-    assert drawn.curvature.abs().max() == 0
+    assert drawn.edges.hessian.abs().max() == 0
 
 
 def test_edges_of_an_occluder_do_not_count(sequence: Sequence) -> None:
-    drawn, _ = draw(sequence, ignore={"left": np.ones((480, 640), bool)})
+    drawn = align(sequence, ignore={"left": np.ones((480, 640), bool)})
     assert drawn.offsets.abs().max() == 0
 
 
-def test_edges_under_a_veil_count_by_the_square_of_what_comes_through(
+def test_edges_behind_haze_count_by_the_square_of_what_comes_through(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("carts_core.optimization.edges.unveiled", lambda images, _: images)
+    monkeypatch.setattr("carts_core.optimization.factors.edges.dehazed", lambda images, _: images)
     found = []
     for through in (1.0, 0.5):
         monkeypatch.setattr(
-            "carts_core.optimization.edges.transmission",
+            "carts_core.optimization.factors.edges.transmission",
             lambda images, _, t=through: t * torch.ones_like(images[:, :1]),
         )
-        found.append(draw(sequence, settings={"edge_steps": 1})[0].curvature)
-    clear, veiled = found
+        found.append(align(sequence, steps=1, dehaze=0.8).edges.hessian)
+    clear, hazy = found
     assert clear.abs().max() > 0
-    torch.testing.assert_close(veiled, 0.25 * clear)
+    torch.testing.assert_close(hazy, 0.25 * clear)
 
 
 def test_edges_where_the_network_sees_no_arm_do_not_count(sequence: Sequence) -> None:
-    drawn, _ = draw(sequence, seen=torch.zeros(1, 360, 480))
+    drawn = align(sequence, seen=torch.zeros(1, 360, 480))
     assert drawn.offsets.abs().max() == 0
 
 
 def test_edges_further_away_than_they_are_looked_for_do_not_pull(sequence: Sequence) -> None:
     image = sequence.frame(0).images["left"].copy()
     far = np.roll(image, (40, 40), (0, 1))
-    near, _ = draw(sequence)
-    drawn, _ = draw(sequence, far)
-    assert drawn.curvature.diagonal().sum() < 0.5 * near.curvature.diagonal().sum()
+    near = align(sequence)
+    drawn = align(sequence, far)
+    assert drawn.edges.hessian.diagonal().sum() < 0.5 * near.edges.hessian.diagonal().sum()
 
 
 def test_an_image_of_another_size_is_refused(sequence: Sequence) -> None:
     with pytest.raises(SettingsError, match="has shape"):
-        draw(sequence, np.zeros((240, 320, 3), np.uint8))
+        align(sequence, np.zeros((240, 320, 3), np.uint8))
 
 
-def test_the_last_iterate_is_the_one_on_edges(
-    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_last_iterate_is_the_one_on_edges(tiny_sequence: Callable[..., Path]) -> None:
     sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
     frame = sequence.frame(0)
-    sight = PerfectSight(sequence, sequence.scene.state(frame.truth or {}))
-    sight.follow_windows(monkeypatch)
+    predictor = PerfectPredictor(sequence, sequence.scene.state(frame.truth or {}))
 
-    def run(**settings) -> FrameOptimizer:
-        chosen = OptimizerSettings(**settings)
-        optimizer = FrameOptimizer(sequence.scene, frame, {}, sight, settings=chosen)  # pyright: ignore
+    def run(settings: SurfaceSolver) -> FrameOptimizer:
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, settings=settings)
         list(optimizer)
         return optimizer
 
-    plain, drawn = run(edge_steps=0), run()
+    plain, drawn = run(without(AlignEdges)), run(SurfaceSolver())
     assert drawn.stop_reason == plain.stop_reason
     assert drawn.best is not None and drawn.best.index == len(drawn.history) - 1
-    assert plain.best is not None and plain.best.index < len(plain.history)
+    assert plain.best is not None
     np.testing.assert_allclose(drawn.best.joint_std()[ARM], plain.best.joint_std()[ARM], rtol=0.2)
-    monkeypatch.setattr(FrameOptimizer, "_last_look_after", lambda *_: False)  # else other steps lead to the end
-    assert len(run().history) == len(plain.history) + 1
-    short = run(iterations=3)
+    short = run(SurfaceSolver(iterations=3))
     assert short.stop_reason == "iterations" and len(short.history) == 3, "no step more than was asked for"
 
 
@@ -152,7 +169,7 @@ def test_edges_bring_masks_nearer_to_the_truth(domain: str) -> None:
         frame = sequence.frame(index, domain, [camera])
         start = start_positions(sequence, frame, 2.0, 0)
         for steps, dices in found.items():
-            settings = OptimizerSettings(edge_steps=steps)
+            settings = with_stage(AlignEdges, steps=steps) if steps else without(AlignEdges)
             optimizer = FrameOptimizer(scene, frame, {}, extractor, start=start, settings=settings, live=False)
             list(optimizer)
             assert optimizer.best is not None and frame.masks is not None

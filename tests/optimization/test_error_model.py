@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, combined, news, without
+from carts_core.optimization.error_model import (
+    ErrorModel,
+    Gaussian,
+    Information,
+    combined,
+    information_shares,
+    remove_measurement,
+)
 from carts_core.settings import SequenceSettings
 
 N, FRAMES = 3, 5
@@ -39,11 +46,11 @@ def everything_at_once(seen: list[Information]) -> tuple[np.ndarray, np.ndarray]
 
 def smoothed(seen: list[Information]) -> list[Gaussian]:
     model = ErrorModel(SETTINGS, CONSTANT)
-    beliefs, belief = [], model.initial()
+    filtered, state = [], model.initial()
     for gap, one in zip(GAPS, seen, strict=True):
-        belief = model.updated(model.predicted(belief, gap), one)
-        beliefs.append(belief)
-    return model.smoothed(beliefs, GAPS.tolist())
+        state = model.updated(model.predicted(state, gap), one)
+        filtered.append(state)
+    return model.smoothed(filtered, GAPS.tolist())
 
 
 def test_smoothing_is_the_same_as_all_frames_at_once() -> None:
@@ -58,7 +65,7 @@ def test_smoothing_is_the_same_as_all_frames_at_once() -> None:
 
 def test_what_the_others_say_leaves_out_the_frame_itself() -> None:
     seen = [information(seed, 2) for seed in range(FRAMES)]
-    others = without(smoothed(seen)[2], seen[2])
+    others = remove_measurement(smoothed(seen)[2], seen[2])
     mean, covariance = everything_at_once([*seen[:2], Information.nothing(N), *seen[3:]])
     assert np.allclose(others.mean, mean[2], rtol=1e-5, atol=1e-8)
     assert np.allclose(others.covariance, covariance[6:9, 6:9], rtol=1e-5, atol=1e-11)
@@ -84,45 +91,45 @@ def test_after_an_endless_gap_nothing_is_known() -> None:
     assert np.allclose(forgotten.mean, 0)
 
 
-def test_surprise_is_about_one_where_the_model_holds_and_large_elsewhere() -> None:
+def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_and_large_elsewhere() -> None:
     rng = np.random.default_rng(4)
     expected = Gaussian(np.zeros(N), np.diag(CONSTANT**2))
     precision = information(1, 3).precision
     deviation = np.linalg.cholesky(expected.covariance + np.linalg.inv(precision))
     draws = (deviation @ rng.standard_normal(N) for _ in range(400))
-    values = [Information(precision, precision @ draw).surprise(expected) for draw in draws]
+    values = [Information(precision, precision @ draw).mahalanobis(expected) for draw in draws]
     assert np.mean(values) == pytest.approx(1.0, abs=0.15)
     far = Information(precision, precision @ np.full(N, 0.5))
-    assert far.surprise(expected) > 50
-    assert Information.nothing(N).surprise(expected) == 0
+    assert far.mahalanobis(expected) > 50
+    assert Information.nothing(N).mahalanobis(expected) == 0
 
 
 def test_a_combination_is_the_weighted_mean() -> None:
-    belief = Gaussian(np.array([0.1]), np.array([[0.01]]))
-    found = combined(belief, Information(np.array([[300.0]]), np.array([300.0 * 0.3])))
+    prior = Gaussian(np.array([0.1]), np.array([[0.01]]))
+    found = combined(prior, Information(np.array([[300.0]]), np.array([300.0 * 0.3])))
     assert found.mean[0] == pytest.approx((100 * 0.1 + 300 * 0.3) / 400)
     assert found.covariance[0, 0] == pytest.approx(1 / 400)
 
 
-def test_what_is_believed_less_says_the_same_less_firmly() -> None:
+def test_information_with_less_weight_says_the_same_less_firmly() -> None:
     seen = information(2, 2)
     less = seen.scaled(0.25)
-    belief = Gaussian(np.zeros(N), 1e6 * np.eye(N))
-    free, held = combined(belief, less), combined(belief, seen)
+    prior = Gaussian(np.zeros(N), 1e6 * np.eye(N))
+    free, held = combined(prior, less), combined(prior, seen)
     shown = seen.precision @ np.linalg.pinv(seen.precision)
     np.testing.assert_allclose(shown @ free.mean, shown @ held.mean, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(less.precision, 0.25 * seen.precision)
 
 
-def test_news_of_correlated_errors_is_what_their_mean_becomes_certain_by() -> None:
+def test_shares_of_correlated_errors_are_what_their_mean_becomes_certain_by() -> None:
     frames, memory, gap = 2000, 0.5, 0.25
     times = gap * np.arange(frames)
     correlation = np.exp(-np.abs(times[:, None] - times) / memory)
-    shares = news([0.0] + [gap] * (frames - 1), memory)
+    shares = information_shares([0.0] + [gap] * (frames - 1), memory)
     assert correlation.mean() == pytest.approx(1.0 / sum(shares), rel=2e-3)
 
 
-def test_news_is_the_same_in_both_directions_and_whole_for_a_frame_that_is_far_from_others() -> None:
-    forward, backward = news([9.9, 0.1, 2.0, 0.4], 0.5), news([0.0, 0.4, 2.0, 0.1], 0.5)
+def test_shares_are_the_same_in_both_directions_and_whole_for_a_frame_that_is_far_from_others() -> None:
+    forward, backward = information_shares([9.9, 0.1, 2.0, 0.4], 0.5), information_shares([0.0, 0.4, 2.0, 0.1], 0.5)
     assert forward == pytest.approx(backward[::-1])
-    assert news([0.0], 0.5) == [1.0] and news([0.0, math.inf, math.inf], 0.5) == [1.0] * 3
+    assert information_shares([0.0], 0.5) == [1.0] and information_shares([0.0, math.inf, math.inf], 0.5) == [1.0] * 3

@@ -12,11 +12,13 @@ from carts_core.data import Frame, Sequence
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, FreeParameters, OptimizerSettings
+from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.rendering import Renderer
+from carts_core.settings import Loss, solver
+from carts_core.settings.optimization import Method
 
-SURFACE = OptimizerSettings(iterations=8)
-SHORT = OptimizerSettings.acs(iterations=6)
+SURFACE = SurfaceSolver(iterations=8)
+SHORT = DescentSolver(iterations=6)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def test_the_first_iterate_is_the_start_and_the_last_one_says_why_it_stopped(
 def test_the_first_step_in_the_papers_setting_is_a_milliradian_or_a_tenth_of_a_millimetre(
     sequence: Sequence, extractor: FeatureExtractor
 ) -> None:
-    first, second = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings.paper(1))
+    first, second = optimizer_of(sequence, extractor, cameras=["left"], settings=DescentSolver.paper(1))
     step = np.abs(second.joint_positions()["PSM1"] - first.joint_positions()["PSM1"])
     insertion = sequence.scene.arms[0].robot.joint_names.index("insertion")
     assert step[insertion] == pytest.approx(1e-4, rel=1e-2)
@@ -59,7 +61,7 @@ def test_the_first_step_in_the_papers_setting_is_a_milliradian_or_a_tenth_of_a_m
 
 
 def test_loss_falls_and_dice_rises(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings.acs(iterations=20))
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=DescentSolver(iterations=20))
     first, *_ = list(optimizer)
     assert optimizer.best is not None
     assert optimizer.best.loss < first.loss
@@ -106,13 +108,13 @@ def test_cancel_keeps_what_was_reached(sequence: Sequence, extractor: FeatureExt
 
 
 def test_no_optimization_evaluates_the_start_only(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings(solver="none"))
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=solver("none"))
     assert len(list(optimizer)) == 1
     assert optimizer.stop_reason == "not optimized"
 
 
-def test_gauss_newton_needs_few_steps_and_stops_by_itself(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=OptimizerSettings())
+def test_the_default_solver_stops_after_few_steps(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=SurfaceSolver())
     first, *_ = list(optimizer)
     assert optimizer.best is not None and optimizer.stop_reason == "converged"
     assert optimizer.best.loss < first.loss and len(optimizer.history) < 40
@@ -120,7 +122,7 @@ def test_gauss_newton_needs_few_steps_and_stops_by_itself(sequence: Sequence, ex
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_the_default_solver_raises_dice_on_every_device(sequence: Sequence, device: str) -> None:
-    optimizer = optimizer_of(sequence, FeatureExtractor.load(device=device), settings=OptimizerSettings())
+    optimizer = optimizer_of(sequence, FeatureExtractor.load(device=device), settings=SurfaceSolver())
     first, *_, last = list(optimizer)
     renderer, masks = Renderer(sequence.scene), sequence.frame(0).masks or {}
     for index, camera in enumerate(("left", "right")):
@@ -143,12 +145,12 @@ def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: Fe
         optimizer_of(sequence, extractor, cameras=["left"], ignore={"left": np.ones((3, 3), bool)}, settings=SURFACE)
 
 
-@pytest.mark.parametrize("loss", ["surface", "acs", "acs_paper", "acs_reference", "l1"])
-@pytest.mark.parametrize("solver", ["adam", "gradient_descent"])
-def test_every_loss_and_solver_lowers_its_loss(
-    sequence: Sequence, extractor: FeatureExtractor, loss: str, solver: str
+@pytest.mark.parametrize("loss", list(Loss))
+@pytest.mark.parametrize("method", ["adam", "gradient_descent"])
+def test_every_loss_and_method_lowers_its_loss(
+    sequence: Sequence, extractor: FeatureExtractor, loss: Loss, method: Method
 ) -> None:
-    settings = OptimizerSettings(loss=loss, solver=solver, iterations=8, learning_rate=2e-3)  # pyright: ignore
+    settings = DescentSolver(loss=loss, method=method, iterations=8, learning_rate=2e-3)
     optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
     first, *_ = list(optimizer)
     assert optimizer.best is not None and optimizer.best.loss < first.loss
@@ -163,7 +165,7 @@ def test_only_what_is_free_moves(sequence: Sequence, extractor: FeatureExtractor
 
 
 def test_a_tolerance_stops_early(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    settings = replace(OptimizerSettings.acs(iterations=200), tolerance=0.9, patience=3)
+    settings = replace(DescentSolver(iterations=200), tolerance=0.9, patience=3)
     optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
     assert len(list(optimizer)) == 4
     assert optimizer.stop_reason == "converged"

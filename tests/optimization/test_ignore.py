@@ -1,17 +1,16 @@
 """Proposed ignore masks: what is taken for an occluder, and what becomes of a frame that is solved again."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from carts_core.data import Sequence
-from carts_core.errors import SettingsError
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, OptimizerSettings, propose_ignore
+from carts_core.optimization import FrameOptimizer, SurfaceSolver, propose_ignore
 from carts_core.scene import Scene
+from carts_core.settings import presets
 
 WIDTH, HEIGHT = 320, 240
 
@@ -63,36 +62,30 @@ def test_a_frame_is_solved_again_without_what_contradicts_and_reset_forgets_it(
     height, width = frame.images["left"].shape[:2]
     left_half = np.arange(width) < width // 2
     proposal = {"left": np.broadcast_to(left_half, (height, width))}
-    settings = OptimizerSettings(propose_ignore=True)
+    settings = SurfaceSolver(stages=presets.OCCLUDED)
     given = {"left": np.zeros((height, width), bool)}
 
-    def optimizer(chosen: OptimizerSettings, ignore: dict[str, np.ndarray]) -> FrameOptimizer:
+    def optimizer(chosen: SurfaceSolver, ignore: dict[str, np.ndarray]) -> FrameOptimizer:
         return FrameOptimizer(sequence.scene, frame, {}, extractor, ignore=ignore, settings=chosen, cameras=["left"])
 
-    monkeypatch.setattr("carts_core.optimization.frame.propose_ignore", lambda *_: proposal)
+    monkeypatch.setattr("carts_core.optimization.frame_problem.propose_ignore", lambda *_: proposal)
     proposing = optimizer(settings, given)
     steps = len(list(proposing))
     assert proposing.best is not None and np.array_equal(proposing.proposed["left"], proposal["left"])
-    told = optimizer(replace(settings, propose_ignore=False), proposal)
-    list(told)
-    assert told.best is not None and len(told.history) < steps
-    assert proposing.best.loss == told.best.loss
+    given_at_once = optimizer(SurfaceSolver(), proposal)
+    list(given_at_once)
+    assert given_at_once.best is not None and len(given_at_once.history) < steps
+    assert proposing.best.loss == given_at_once.best.loss
     proposing.reset()
     assert proposing.proposed == {} and len(list(proposing)) == steps
 
 
 def test_without_a_proposal_a_frame_is_solved_once(sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("carts_core.optimization.frame.propose_ignore", lambda *_: {})
+    monkeypatch.setattr("carts_core.optimization.frame_problem.propose_ignore", lambda *_: {})
     sequence, extractor = Sequence.open(sample_sequence_path), FeatureExtractor.load()
     frame = sequence.frame(0, cameras=["left"])
     runs = [
         list(FrameOptimizer(sequence.scene, frame, {}, extractor, settings=settings, cameras=["left"]))
-        for settings in (OptimizerSettings(), OptimizerSettings(propose_ignore=True))
+        for settings in (SurfaceSolver(), SurfaceSolver(stages=presets.OCCLUDED))
     ]
     assert [iterate.loss for iterate in runs[0]] == [iterate.loss for iterate in runs[1]]
-
-
-def test_a_loss_that_knows_no_ignore_masks_cannot_propose_them() -> None:
-    with pytest.raises(SettingsError, match="propose_ignore is True; allowed is False for the loss acs"):
-        replace(OptimizerSettings.acs(), propose_ignore=True)
-    assert OptimizerSettings(propose_ignore=True).with_loss("acs").propose_ignore is False

@@ -10,7 +10,7 @@ from torch.nn import functional
 from carts_core.data import Sequence
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.inputs import smoothed
-from carts_core.optimization.parameters import APART, ParameterVector
+from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Renderer, jacobian
 from carts_core.scene import Scene, SceneState
 
@@ -30,7 +30,7 @@ def test_the_compiled_kernel_agrees_with_torch(
     right, blind = replace(left, name="right", T_camera_world=beside), replace(left, name="blind", T_camera_world=away)
     scene = replace(sequence.scene, cameras=(left, right, blind))
     chosen = replace(FreeParameters(joints=False), **{free: True})
-    parameters = ParameterVector(scene, scene.state(sequence.frame(0).measured), chosen, 0.15)
+    parameters = Variables(scene, scene.state(sequence.frame(0).measured), chosen, 0.15)
     renderer, around = Renderer(scene, width=160, height=120), parameters.around(torch.zeros(len(parameters)))
     compiled = renderer.surface(around, APART, margin=4).jacobian
 
@@ -50,7 +50,7 @@ def test_the_compiled_kernel_agrees_with_torch(
 @pytest.mark.parametrize("free", ["joints", "base_frames", "extrinsics", "intrinsics"])
 def test_the_jacobian_agrees_with_finite_differences(close_up: tuple[Scene, SceneState], free: str) -> None:
     scene, state = close_up
-    parameters = ParameterVector(scene, state, replace(FreeParameters(joints=False), **{free: True}), 0.15)
+    parameters = Variables(scene, state, replace(FreeParameters(joints=False), **{free: True}), 0.15)
     renderer = Renderer(scene)
     fine = Renderer(scene, width=8 * renderer.width, height=8 * renderer.height)
     count, at = len(parameters), torch.zeros(len(parameters))

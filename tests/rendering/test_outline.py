@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from tiny import tiny_scene
 
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.parameters import APART, ParameterVector
+from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Outline, Renderer
 from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
 from carts_core.robot import Robot
@@ -26,7 +26,7 @@ def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
     return tiny.scene, tiny.scene.state({"PSM1": joint_positions})
 
 
-def outline(renderer: Renderer, parameters: ParameterVector, offsets: torch.Tensor) -> Outline:
+def outline(renderer: Renderer, parameters: Variables, offsets: torch.Tensor) -> Outline:
     tangents = renderer.tangents(parameters.around(offsets), APART)
     return renderer.outline(parameters.state(offsets), tangents)
 
@@ -41,7 +41,7 @@ def rims(renderer: Renderer, state: SceneState) -> np.ndarray:
 
 def test_outlines_are_where_a_finer_rendering_has_them(scene_and_state: tuple[Scene, SceneState]) -> None:
     scene, state = scene_and_state
-    parameters = ParameterVector(scene, state, FreeParameters(), 0.15)
+    parameters = Variables(scene, state, FreeParameters(), 0.15)
     found = outline(Renderer(scene), parameters, torch.zeros(len(parameters)))
     true = rims(Renderer(scene, width=FINER * WIDTH, height=FINER * HEIGHT), state)
     distance, nearest = KDTree(true).query(found.position.numpy().T)
@@ -65,7 +65,7 @@ def test_outlines_are_where_a_finer_rendering_has_them(scene_and_state: tuple[Sc
 def test_outlines_move_as_they_say(free: str, scene_and_state: tuple[Scene, SceneState]) -> None:
     scene, state = scene_and_state
     chosen = replace(FreeParameters(joints=False), **{free: True})
-    parameters = ParameterVector(scene, state, chosen, 0.15)
+    parameters = Variables(scene, state, chosen, 0.15)
     renderer, fine = Renderer(scene), Renderer(scene, width=FINER * WIDTH, height=FINER * HEIGHT)
     zero = torch.zeros(len(parameters))
     found = outline(renderer, parameters, zero)
@@ -116,6 +116,6 @@ def test_a_straight_outline_is_between_its_pixels() -> None:
 def test_an_empty_view_has_no_outline(scene_and_state: tuple[Scene, SceneState]) -> None:
     scene, state = scene_and_state
     away = replace(state, T_world_base=state.T_world_base + torch.tensor([[[0, 0, 0, 9.0]] * 3 + [[0, 0, 0, 0]]]))
-    parameters = ParameterVector(scene, away, FreeParameters(), 0.15)
+    parameters = Variables(scene, away, FreeParameters(), 0.15)
     found = outline(Renderer(scene), parameters, torch.zeros(len(parameters)))
     assert found.position.shape == (2, 0) and found.motion.shape == (len(parameters), 0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.parameters import ParameterVector
+from carts_core.optimization.variables import Variables
 from carts_core.parts import PARTS, link_parts
 from carts_core.rendering import Renderer
 from carts_core.resources import shipped_robot
@@ -62,7 +62,7 @@ def test_many_states_at_once_look_as_each_alone(close_up: tuple[Scene, SceneStat
     T_camera_world[0, 3] -= 0.004
     scene = replace(scene, cameras=(left, replace(left, name="right", T_camera_world=T_camera_world)))
     start = scene.state({"PSM1": state.joint_positions[0]})
-    parameters, renderer = ParameterVector(scene, start, FreeParameters(), 0.15), Renderer(scene)
+    parameters, renderer = Variables(scene, start, FreeParameters(), 0.15), Renderer(scene)
     offsets = torch.linspace(-0.03, 0.03, 3)[:, None] * torch.ones(len(parameters))
     together = renderer.surface_maps(parameters.state(offsets))
     assert together.shape == (3, 2, SURFACE_CHANNELS, left.height, left.width)

@@ -1,21 +1,96 @@
-"""Settings of the optimizer."""
+"""Settings of the solvers."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from carts_core.commands.solver_options import SolverOptions
 from carts_core.errors import SettingsError
-from carts_core.settings import OptimizerSettings
+from carts_core.settings import DescentSolver, SequenceSettings, SolverName, SurfaceSolver, presets, solver
+from carts_core.settings.serialization import changed, to_plain
+from carts_core.settings.stages import Descend, FirstOrder, Observe, RandomRestart
 
 
-def test_gauss_newton_refuses_a_loss_without_residuals() -> None:
-    with pytest.raises(SettingsError, match="solver is 'gauss_newton'; allowed is auto, adam, gradient_descent or"):
-        OptimizerSettings(loss="acs", solver="gauss_newton")
+@pytest.mark.parametrize("name", list(SolverName))
+def test_what_print_settings_writes_gives_the_same_solver_back(name: SolverName, tmp_path: Path) -> None:
+    options = SolverOptions(solver=name)
+    path = tmp_path / "settings.toml"
+    path.write_text(options.printed(), encoding="utf-8")
+    again = SolverOptions(solver=name, settings=(str(path),))
+    assert again.chosen == options.chosen and again.sequence == options.sequence
 
 
-def test_a_solver_that_is_not_chosen_follows_the_loss() -> None:
-    assert OptimizerSettings().chosen_solver == "gauss_newton"
-    assert OptimizerSettings(loss="l1").chosen_solver == "adam"
-    assert OptimizerSettings(loss="l1", solver="gradient_descent").chosen_solver == "gradient_descent"
-    chosen = OptimizerSettings(solver="gauss_newton").with_loss("acs")
-    assert chosen.chosen_solver == "adam" and chosen.with_loss("surface").chosen_solver == "gauss_newton"
-    assert OptimizerSettings(solver="none").with_loss("acs").chosen_solver == "none"
-    assert OptimizerSettings().resolved() == OptimizerSettings(solver="gauss_newton"), "what is kept of a run"
+def test_a_settings_file_changes_only_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[solver]\nprior_deg = 4\n[sequence]\ninitial_frames = 2\n", encoding="utf-8")
+    options = SolverOptions(settings=(str(path),))
+    assert options.chosen == replace(SurfaceSolver(), prior_deg=4.0)
+    assert options.sequence == SequenceSettings(initial_frames=2)
+
+
+def test_single_settings_need_no_file() -> None:
+    options = SolverOptions(settings=("iterations=7", "prior_deg = 4", "sequence.direction=backward"))
+    assert options.chosen == SurfaceSolver(iterations=7, prior_deg=4.0)
+    assert options.sequence.direction == "backward"
+    with pytest.raises(SettingsError, match="iterations is 0; allowed is 1 to 10000"):
+        SolverOptions(settings=("iterations=0",))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[solver]\npriors = 1", r"\[solver\] has no setting 'priors'\. .*Its settings are: .*prior_deg"),
+        ("[solver]\nprior_deg = 'wide'", r"\[solver\]\.prior_deg is 'wide'; it must be a value such as 2\.5"),
+        ("[solver]\nprior_deg = 1e9", "prior_deg is .*; allowed is 0.001 to 360 deg"),
+        ("[solver]\nprior_deg = nan", "prior_deg is nan; allowed is"),
+        ("[[solver.stages]]\nstage = 'Dance'", "has the stage 'Dance'; allowed is Observe, Descend"),
+        ("[[solver.stages]]\nstage = 'Descend'", "needs a blur"),
+        ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no 'speed'; it has blur"),
+        ("[solver]\nstages = 3", "must be a list of tables"),
+        ("[slover]\nprior_deg = 1", "has slover; allowed are the tables"),
+        ("prior_deg = 1", "has prior_deg; allowed are the tables"),
+        ("[solver", "is not TOML"),
+    ],
+)
+def test_a_wrong_settings_file_is_told_in_words(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SettingsError, match=message):
+        SolverOptions(settings=(str(path),))
+
+
+def test_a_solver_of_another_name_is_refused() -> None:
+    with pytest.raises(SettingsError, match="solver is 'magic'; allowed is surface"):
+        solver("magic")
+
+
+def test_stages_of_another_solver_are_refused() -> None:
+    with pytest.raises(SettingsError, match=r"stages is .*; allowed is stages of the surface solver"):
+        SurfaceSolver(stages=(FirstOrder(),))
+    with pytest.raises(SettingsError, match=r"stages is .*; allowed is one or more FirstOrder"):
+        DescentSolver(stages=(Observe(),))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("iterations", 0), ("learning_rate", -1.0), ("method", "magic"), ("loss", "l7"), ("length_scale", 0.0)],
+)
+def test_a_setting_out_of_range_says_what_is_allowed(name: str, value: object) -> None:
+    with pytest.raises(SettingsError, match=f"{name} is .*; allowed is "):
+        DescentSolver(**{name: value})  # pyright: ignore[reportArgumentType]
+
+
+def test_a_smaller_preset_observes_smaller_images_and_changes_nothing_else() -> None:
+    small = presets.reduced(presets.COLD, 1.0)
+    assert max(stage.scale for stage in small if isinstance(stage, Observe)) == 1.0
+    assert [type(stage) for stage in small] == [type(stage) for stage in presets.COLD]
+
+
+def test_nested_stages_keep_their_kind() -> None:
+    plain = to_plain(SurfaceSolver())
+    restart = next(stage for stage in plain["stages"] if stage["stage"] == "RandomRestart")
+    assert [stage["stage"] for stage in restart["then"]] == ["Descend", "Observe", "Descend"]
+    back = changed(DescentSolver(), {"iterations": 3}, "[solver]")
+    assert back.iterations == 3
+    assert RandomRestart(then=(Descend(1.0),)).then[0] == Descend(1.0)

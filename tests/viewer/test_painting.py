@@ -8,7 +8,7 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.evaluation.metrics import dice
-from carts_core.optimization import OptimizerSettings
+from carts_core.optimization import SurfaceSolver
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
 from carts_viewer import intents as ask
 from carts_viewer.running import OptimizerFactory
@@ -132,7 +132,7 @@ def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, mon
 
 
 def test_ignored_pixels_change_the_surface_loss(desk: Desk) -> None:
-    settings = OptimizerSettings(iterations=2, working_width=96)
+    settings = SurfaceSolver(iterations=2, working_width=96)
     desk.controller.change(settings=settings)
     desk.do(ask.Step())
     loss = desk.state.run.curves.loss[0]

@@ -10,7 +10,7 @@ from viewer_desk import Desk
 from carts_core.data import Sequence
 from carts_core.errors import CartsError, ProjectError
 from carts_core.evaluation.metrics import dice
-from carts_core.optimization import OptimizerSettings
+from carts_core.optimization import SurfaceSolver
 from carts_core.project import (
     CorrectedIntrinsics,
     IgnoreRegion,
@@ -42,7 +42,7 @@ def opened(recording: Path) -> Desk:
     """A desk with the settings that a user begins with."""
     sequence = Sequence.open(recording)
     desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
-    desk.controller.change(settings=OptimizerSettings())
+    desk.controller.change(settings=SurfaceSolver())
     return desk
 
 
@@ -170,7 +170,7 @@ def test_closing_saves_what_is_solved(desk: Desk) -> None:
     ("before", "message"),
     [
         ((), "no keyframe yet"),
-        ((ask.SetSetting("loss", "acs"), ask.HoldKeyframe(True)), "needs gauss_newton and surface"),
+        ((ask.SetSetting("solver", "acs"), ask.HoldKeyframe(True)), "needs the solver"),
         ((ask.Solve(whole=True),), "already"),
     ],
 )

@@ -1,8 +1,10 @@
 """A controller at work without threads or a page, with the real optimizer."""
 
 from carts_core.data import Sequence
-from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_core.optimization import DescentSolver, FreeParameters
 from carts_core.project import Project, ProjectState
+from carts_core.settings import SolverName
+from carts_core.settings.stages import FirstOrder
 from carts_viewer import intents as ask
 from carts_viewer.controller import Controller
 from carts_viewer.layers import Layer
@@ -28,15 +30,10 @@ class Desk:
             pose=self.session.pose(frame),
             layer=Layer.MASK,
             opacity=0.5,
-            settings=OptimizerSettings(
-                solver="adam",
-                loss="acs",
-                iterations=4,
-                working_width=96,
-                attention_radius=4,
-                wide_attention_radius=8,
-                tolerance=0.0,
+            settings=DescentSolver(
+                stages=(FirstOrder(attention=8, blur=1.6), FirstOrder(attention=4)), iterations=4, working_width=96
             ),
+            solver=SolverName.ACS,
             free=FreeParameters(),
             project=self.session.editor.view,
         )

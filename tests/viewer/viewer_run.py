@@ -4,14 +4,7 @@ from carts_viewer import intents as ask
 from carts_viewer.app import ViewerApp
 
 # The default solver converges on a tiny frame within seconds, whatever the other settings say.
-_SETTINGS = {
-    "loss": "acs",
-    "tolerance": 0.0,
-    "iterations": 10_000,
-    "working_width": 96,
-    "attention_radius": 4,
-    "wide_attention_radius": 8,
-}
+_SETTINGS = {"solver": "acs", "iterations": 10_000, "working_width": 96}
 
 
 def run_without_end(app: ViewerApp) -> None:
@@ -19,4 +12,4 @@ def run_without_end(app: ViewerApp) -> None:
     for name, value in _SETTINGS.items():
         app.mailbox.put(ask.SetSetting(name, value))
     state = app.wait_until_shown()
-    assert state.settings.chosen_solver == "adam" and state.settings_error is None, state.settings_error
+    assert state.solver == "acs" and state.settings_error is None, state.settings_error

@@ -1,4 +1,4 @@
-"""The paper's objective for one frame: rendered features against observed ones."""
+"""The paper's objective for one frame: features of the image against those of the background with rendered arms."""
 
 from collections.abc import Mapping
 
@@ -12,17 +12,18 @@ from ..features.hybrid import hybrid
 from ..losses import attention, attentional_loss, cosine_similarity, smooth_l1
 from ..rendering import Renderer
 from ..scene import Scene
-from ..settings import OptimizerSettings
+from ..settings import DescentSolver, Loss
+from ..settings.stages import FirstOrder, Observe, Stage
 from .evaluation import Evaluation
 from .inputs import blurred, stacked_images, working_size
-from .parameters import ParameterVector
+from .variables import Variables
 from .window import Window
 
 _SURROUNDINGS = 16
 """What the network sees beyond the attention [px of the working image]."""
 
 
-class FeatureObjective:
+class FeatureProblem:
     """Compares a frame's observed features with rendered ones (f_L of the paper).
 
     Args:
@@ -30,7 +31,7 @@ class FeatureObjective:
         images: camera name -> observed RGB image.
         backgrounds: camera name -> mean background BG_m, of the same size.
         extractor: the feature network.
-        parameters: the unknowns.
+        variables: the unknowns.
         settings: loss, attention and working size.
 
     Raises:
@@ -43,12 +44,11 @@ class FeatureObjective:
         images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
         backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]],
         extractor: FeatureExtractor,
-        parameters: ParameterVector,
-        settings: OptimizerSettings,
+        variables: Variables,
+        settings: DescentSolver,
     ) -> None:
-        self.stages = 2
         self.settings = settings
-        self.parameters = parameters
+        self.variables = variables
         self._extractor = extractor
         width, height = working_size(scene, settings.working_width, extractor.stride)
         self.renderer = Renderer(scene, width=width, height=height, device=extractor.device)
@@ -60,34 +60,46 @@ class FeatureObjective:
 
     def _represent(self, images: Tensor) -> Tensor:
         """Features for ACS, predictions for L1."""
-        if self.settings.loss == "l1":
+        if self.settings.loss is Loss.L1:
             return self._extractor.probability(images)[:, 0]
         return self._extractor.features(images)
 
-    def epoch(self, stage: int) -> int:
-        """All losses compare: each is of the final attention."""
-        return 0
+    def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
+        """Observed features are computed when a window is compared first."""
 
-    def __call__(self, offsets: Float[Tensor, " n"], stage: int, *, gradient: bool) -> Evaluation:
-        """Evaluate at the given offsets; stage 0 descends in the wide attention, stage 1 in the final one."""
-        settings, wide = self.settings, stage == 0
+    def epoch(self, blur: float) -> tuple[int, float]:
+        """All losses compare: each is of the final attention."""
+        return 0, 0.0
+
+    @property
+    def final(self) -> FirstOrder:
+        """The last stage: losses of all stages are of its attention, and so compare."""
+        stage = self.settings.stages[-1]
+        assert isinstance(stage, FirstOrder)
+        return stage
+
+    def evaluate(self, offsets: Float[Tensor, " n"], stage: Stage, *, gradient: bool = True) -> Evaluation:
+        """Evaluate a point in a stage's attention."""
+        assert isinstance(stage, FirstOrder)
+        settings, final = self.settings, self.final
+        wide = stage.attention > final.attention
         unknowns = offsets.detach().clone().requires_grad_(gradient)
         with torch.set_grad_enabled(gradient):
-            rendering = self.renderer(self.parameters.state(unknowns))
-            window = self._look_at(rendering.silhouette.detach(), wide)
+            rendering = self.renderer(self.variables.state(unknowns))
+            window = self._observed_around(rendering.silhouette.detach(), stage.attention)
             silhouette = window.of(rendering.silhouette)
             layers = torch.cat([window.of(rendering.image), silhouette[:, None]], 1)
-            layers = blurred(layers, settings.wide_blur if wide else settings.blur)
+            layers = blurred(layers, stage.blur)
             represented = self._represent(hybrid(layers[:, :3], layers[:, 3], window.of(self._background)))
-            fine = attention(silhouette, settings.attention_radius)
-            if settings.loss == "l1":
+            fine = attention(silhouette, final.attention)
+            if settings.loss is Loss.L1:
                 similarity = 1.0 - (represented - self._observed).abs()
                 value = smooth_l1(self._observed, represented).mean()
                 loss, used = value, fine
             else:
                 pixels = self.renderer.width * self.renderer.height
                 similarity = cosine_similarity(self._observed, represented)
-                used = attention(silhouette, settings.wide_attention_radius) if wide else fine
+                used = attention(silhouette, stage.attention) if wide else fine
                 value = attentional_loss(similarity, used, settings.loss, pixels).mean()
                 loss = attentional_loss(similarity.detach(), fine, settings.loss, pixels).mean() if wide else value
             prior = settings.prior_weight * unknowns.square().sum()
@@ -95,9 +107,10 @@ class FeatureObjective:
         return Evaluation(
             value=float((value + prior).detach()),
             loss=float(loss.detach()),
+            stage_loss=float(value.detach()),
             prior=float(prior.detach()),
             gradient=torch.nan_to_num(slope),
-            curvature=None,
+            hessian=None,
             uncertainty=None,
             image=rendering.image.detach(),
             silhouette=rendering.silhouette.detach(),
@@ -105,16 +118,15 @@ class FeatureObjective:
             attention=window.paste(used, torch.zeros_like(rendering.silhouette)),
         )
 
-    def _look_at(self, silhouette: Float[Tensor, "cameras h w"], wide: bool) -> Window:
+    def _observed_around(self, silhouette: Float[Tensor, "cameras h w"], radius: int) -> Window:
         """The window that is compared: all that the attention covers, with some surroundings for the network.
 
         It stays where it is as long as it holds the attention, so that observed features are computed once.
         """
         size = (self.renderer.width, self.renderer.height)
-        if self.settings.loss == "l1":
+        if self.settings.loss is Loss.L1:
             wanted = tight = Window(0, 0, *size)
         else:
-            radius = self.settings.wide_attention_radius if wide else self.settings.attention_radius
             tight = Window.around(silhouette, radius, 1, size)
             wanted = Window.around(silhouette, radius + _SURROUNDINGS, self._extractor.stride, size)
         outgrown = self._window is not None and self._window.area > 1.5 * wanted.area

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..errors import SettingsError
 from ..scene import Scene, SceneState
-from ..settings import FreeParameters
-from .prior import Prior
+from ..settings import FreeParameters, SurfaceSolver
+from .factors import Prior
 
 STEP = 1e-3
 """Distance of an unknown's two neighbouring states from its value [rad]."""
@@ -39,30 +39,28 @@ class _Block:
     size: int
 
 
-class ParameterVector:
+class Variables:
     """Unknowns as one vector of offsets from a start, in radian-like units.
 
-    A prismatic joint or a translation counts `lever` metres as one radian, so that one step size suits all.
+    A prismatic joint or a translation counts `length_scale` metres as one radian, so that one step size suits all.
 
     Args:
         scene: arms and cameras.
         start: where all offsets are 0.
         free: what is unknown.
-        lever: [m/rad].
+        length_scale: [m/rad].
 
     Attributes:
         names: what each unknown is.
-        prior: what is known of the unknowns, if it is other than that they are near 0.
 
     Raises:
         SettingsError: nothing is free, or `free` names a joint that does not exist.
         RobotError: `free` names an arm or a camera that does not exist.
     """
 
-    def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, lever: float) -> None:
+    def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, length_scale: float) -> None:
         self.start = start
-        self.prior: Prior | None = None
-        self._lever = lever
+        self._length_scale = length_scale
         self._joint_types = [arm.robot.joint_types for arm in scene.arms]
         self.names: list[str] = []
         self._blocks: list[_Block] = []
@@ -128,7 +126,7 @@ class ParameterVector:
         self._joint_scales[block.start] = scales
 
     def _joint_scale(self, scene: Scene, index: int, column: int) -> float:
-        return self._lever if scene.arms[index].robot.joint_types[column] == "prismatic" else 1.0
+        return self._length_scale if scene.arms[index].robot.joint_types[column] == "prismatic" else 1.0
 
     def __len__(self) -> int:
         return len(self.names)
@@ -136,7 +134,8 @@ class ParameterVector:
     def units(self) -> list[tuple[str, str, float]]:
         """Per unknown its name, the unit that a person reads (deg, mm, px; % of a focal length), and that unit's number
         per radian-like unit."""
-        radian, length, focal = ("deg", math.degrees(1.0)), ("mm", 1000.0 * self._lever), ("%", 100.0 * _FOCAL_SCALE)
+        radian, length = ("deg", math.degrees(1.0)), ("mm", 1000.0 * self._length_scale)
+        focal = ("%", 100.0 * _FOCAL_SCALE)
         read: list[tuple[str, float]] = []
         for block in self._blocks:
             if block.kind == "joints":
@@ -166,7 +165,12 @@ class ParameterVector:
         return [range(block.start, block.start + block.size) for block in self._blocks]
 
     @property
-    def sliding(self) -> list[int]:
+    def moves_calibration(self) -> bool:
+        """Whether base frames, cameras or intrinsics are unknown."""
+        return any(block.kind != "joints" for block in self._blocks)
+
+    @property
+    def prismatic(self) -> list[int]:
         """Unknowns that are prismatic joints."""
         return [
             block.start + place
@@ -177,37 +181,35 @@ class ParameterVector:
 
     @property
     def scales(self) -> Float[Tensor, " n"]:
-        """What an offset of 1 is in units of its unknown: 1 for angles and intrinsics, `lever` metres for lengths."""
+        """What an offset of 1 is in its unit: 1 for angles and intrinsics, `length_scale` metres for lengths."""
         scales = torch.ones_like(self.lower)
         for block in self._blocks:
             part = scales[block.start : block.start + block.size]
             if block.kind == "joints":
                 part.copy_(self._joint_scales[block.start])
             elif block.kind != "intrinsics":
-                part[3:] = self._lever
+                part[3:] = self._length_scale
         return scales
 
-    def prior_precision(
-        self, joints_deg: float, frames_deg: float = 0.5, intrinsics: float = 0.01
-    ) -> Float[Tensor, " n"]:
-        """Inverse variance of each unknown [1/rad^2].
+    def expected(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Float[Tensor, " n"]:
+        """Expected error of each unknown [rad].
 
         Args:
-            joints_deg: expected error of joint positions at the start [deg]; `lever` makes it metres.
-            frames_deg: the same of base frames and camera extrinsics [deg].
-            intrinsics: the same of focal lengths and principal points, as a share of the focal length [1].
+            joints_deg: of joint positions at the start [deg]; `length_scale` makes it metres.
+            frames_deg: of base frames and camera extrinsics [deg].
+            intrinsics: of focal lengths and principal points, as a share of the focal length [1].
         """
         expected = torch.full_like(self.lower, intrinsics)
         for block in self._blocks:
             if block.kind != "intrinsics":
                 degrees = joints_deg if block.kind == "joints" else frames_deg
                 expected[block.start : block.start + block.size] = math.radians(degrees)
-        return expected**-2
+        return expected
 
-    def expected(self, joints_deg: float, frames_deg: float, intrinsics: float) -> Prior:
-        """`prior`, or if there is none, errors around 0 as in `prior_precision`."""
-        precision = self.prior_precision(joints_deg, frames_deg, intrinsics)
-        return self.prior or Prior(torch.zeros_like(precision), torch.diag(precision))
+    def prior(self, settings: SurfaceSolver) -> Prior:
+        """Independent errors around the start, as large as the settings expect."""
+        expected = self.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
+        return Prior.around_start(expected**-2)
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         """Offsets that respect the joint limits."""
@@ -241,7 +243,7 @@ class ParameterVector:
 
     def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
         rotation = roma.rotvec_to_rotmat(step[..., :3])
-        translation = step[..., 3:] * self._lever
+        translation = step[..., 3:] * self._length_scale
         top = torch.cat([rotation, translation[..., None]], -1)
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], device=step.device).expand(*step.shape[:-1], 1, 4)
         return torch.cat([top, bottom], -2)

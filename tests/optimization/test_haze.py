@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from carts_core.data import Sequence
-from carts_core.optimization.veil import certainty, transmission, unveiled
+from carts_core.optimization.haze import certainty, dehazed, transmission
 
 
 def image_of(sequence: Sequence, domain: str) -> torch.Tensor:
@@ -14,7 +14,7 @@ def image_of(sequence: Sequence, domain: str) -> torch.Tensor:
 
 
 def cleared(images: torch.Tensor, share: float) -> torch.Tensor:
-    return unveiled(images, transmission(images, share))
+    return dehazed(images, transmission(images, share))
 
 
 def contrast(image: torch.Tensor) -> float:
@@ -31,16 +31,16 @@ def test_a_smoky_frame_comes_closer_to_the_clear_one(sample_sequence_path: Path)
     assert contrast(result) > 0.9 * contrast(clear)
 
 
-def test_a_veil_over_colours_that_are_full_of_contrast_is_taken_off() -> None:
+def test_haze_over_colours_that_are_full_of_contrast_is_taken_off() -> None:
     generator = torch.Generator().manual_seed(0)
     patches = torch.rand(2, 3, 60, 80, generator=generator)
     clear = patches.repeat_interleave(8, -2).repeat_interleave(8, -1)
-    veil = torch.linspace(0.0, 0.6, clear.shape[-1])
-    whole = cleared(clear * (1.0 - veil) + 0.75 * veil, 1.0)
+    haze = torch.linspace(0.0, 0.6, clear.shape[-1])
+    whole = cleared(clear * (1.0 - haze) + 0.75 * haze, 1.0)
     torch.testing.assert_close(whole, clear, atol=0.1, rtol=0.0)
 
 
-def test_without_a_veil_or_a_share_images_stay_as_they_are() -> None:
+def test_without_haze_or_a_share_images_stay_as_they_are() -> None:
     images = torch.rand(1, 3, 60, 80, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(cleared(images, 0.0), images)
     images[:, 2] = 0.0
@@ -53,11 +53,11 @@ def test_noise_is_not_amplified_without_bounds() -> None:
     assert float(cleared(white, 1.0).amax() - cleared(white, 1.0).amin()) <= 0.01 / 0.25 + 1e-5
 
 
-def test_less_is_believed_behind_a_veil_by_as_much_as_noise_grows(sample_sequence_path: Path) -> None:
+def test_information_falls_behind_haze_by_as_much_as_noise_grows(sample_sequence_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     through = torch.tensor([1.0, 0.5, 0.25]).view(3, 1, 1, 1)
     noise = 0.01 * torch.randn(3, 3, 200, 200, generator=generator)
-    grown = unveiled(0.75 + noise, through).var((1, 2, 3))
+    grown = dehazed(0.75 + noise, through).var((1, 2, 3))
     torch.testing.assert_close(grown[0] / grown, certainty(through).flatten(), atol=0.02, rtol=0.0)
     sequence = Sequence.open(sample_sequence_path)
     clear, smoky = (certainty(transmission(image_of(sequence, domain), 0.8)).mean() for domain in ("regular", "smoke"))

@@ -1,0 +1,210 @@
+"""Many frames that share one calibration: the same factors, with shared variables.
+
+Every frame contributes its own residuals. The prior on the calibration counts once. Joint offsets, where they are free,
+belong to one frame each, have a tight prior, and are eliminated by the Schur complement, so that a solver sees the
+calibration alone.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..data import Frame
+from ..scene import Scene
+from ..settings import FreeParameters, SurfaceSolver
+from ..settings.stages import Descend, Observe
+from .elimination import Eliminated, eliminate
+from .evaluation import Evaluation
+from .factors import Prior
+from .frame_problem import FrameProblem
+from .predictor import SurfacePredictor
+from .variables import Variables
+
+Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]
+"""Per frame: camera name -> pixels that show an occluder."""
+
+_GOOD = 1.5
+"""A frame whose loss is at most this many times the median counts in full, and less beyond it [1]."""
+
+
+@dataclass(frozen=True)
+class CalibrationEvaluation(Evaluation):
+    """All frames at one calibration; the maps are those of the first frame."""
+
+    frame_losses: Float[Tensor, " frames"]
+    frame_weights: Float[Tensor, " frames"]
+    """How far each frame counts, in [0, 1]."""
+    frame_gradients: Float[Tensor, "frames n"] | None
+    """Each frame's part of the gradient, without the prior."""
+
+
+class _FramePart:
+    """One frame: its problem in its own unknowns (joint offsets) and the shared ones, and where its own ones are."""
+
+    def __init__(self, problem: FrameProblem, own: int) -> None:
+        self.problem = problem
+        self.own = torch.zeros(own, device=problem.variables.lower.device)
+        self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
+
+    def follow(self, shared: Float[Tensor, " n"]) -> None:
+        """Move the own unknowns to where the anchor's model has them for a calibration."""
+        if self._anchor is not None and len(self.own):
+            at, own, model = self._anchor
+            moved = own + model.own_step(shared - at).to(own)
+            self.own = self.problem.variables.clamp(torch.cat([moved, shared]))[: len(own)]
+
+    def anchor(self, shared: Float[Tensor, " n"], model: Eliminated) -> None:
+        """Remember a model, made at the present own unknowns."""
+        self._anchor = (shared, self.own, model)
+
+    def observe(self, stage: Observe, shared: Float[Tensor, " n"]) -> None:
+        """Observe this frame."""
+        self.problem.observe(stage, torch.cat([self.own, shared]))
+
+    def evaluate(self, shared: Float[Tensor, " n"], own: Tensor, stage: Descend, *, gradient: bool) -> Evaluation:
+        """Evaluate this frame."""
+        return self.problem.evaluate(torch.cat([own, shared]), stage, gradient=gradient)
+
+
+class CalibrationProblem:
+    """Sum of the frames' factors as a function of the calibration alone. Implements `Problem`.
+
+    Args:
+        scene: with the cameras that take part.
+        frames: observed images and measured joint positions.
+        predictor: predicts surface maps.
+        free: what is unknown; joints are so in every frame for itself.
+        settings: noise, and the prior on the calibration.
+        joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` turns it into metres.
+        ignore: per frame, pixels that show an occluder.
+
+    Attributes:
+        variables: the calibration.
+        stage: how many stages have descended so far, less one.
+        present: the one that descended last.
+
+    Raises:
+        SettingsError: an image is missing or of another size than its camera, or nothing of the calibration is free.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        frames: Sequence[Frame],
+        predictor: SurfacePredictor,
+        free: FreeParameters,
+        settings: SurfaceSolver,
+        joint_prior_deg: float,
+        ignore: Ignored | None = None,
+    ) -> None:
+        starts = [scene.state(frame.measured, predictor.device) for frame in frames]
+        self.variables = Variables(scene, starts[0], replace(free, joints=False), settings.length_scale)
+        self._parts: list[_FramePart] = []
+        for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):
+            unknowns = Variables(scene, start, free, settings.length_scale)
+            own = len(unknowns) - len(self.variables)
+            # The prior of the calibration counts once, so it is none of a frame's.
+            precision = torch.zeros_like(unknowns.lower)
+            precision[:own] = math.radians(joint_prior_deg) ** -2
+            problem = FrameProblem(
+                scene,
+                frame.images,
+                predictor,
+                unknowns,
+                settings,
+                ignore[index] if ignore else None,
+                prior=Prior.around_start(precision),
+                live=False,
+            )
+            self._parts.append(_FramePart(problem, own))
+        self.prior = self.variables.prior(settings)
+        self._weights = torch.ones(len(frames), dtype=torch.float64)
+        self._losses: Tensor | None = None
+        self.stage = -1
+        self.present: Descend | None = None
+        self._lowest, self._begun = math.inf, False
+
+    def epoch(self, blur: float) -> tuple[int, float]:
+        """Losses compare within an epoch: one observation, under one blur."""
+        return self._parts[0].problem.epoch(blur)
+
+    def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
+        """Observe all frames; those that fit badly count less from here on."""
+        if self._losses is not None:
+            self._weights = frame_weights(self._losses)
+        for part in self._parts:
+            part.observe(stage, offsets)
+        self._begun = False
+
+    def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> CalibrationEvaluation:
+        """Evaluate at a calibration; free joints follow it."""
+        if stage is not self.present or not self._begun:
+            self.present, self._lowest, self._begun = stage, math.inf, True
+            self.stage += 1
+        for part in self._parts:
+            part.follow(offsets)
+        evaluations = [part.evaluate(offsets, part.own, stage, gradient=gradient) for part in self._parts]
+        models = [
+            eliminate(evaluation.gradient, evaluation.hessian, len(part.own))
+            for evaluation, part in zip(evaluations, self._parts, strict=True)
+            if evaluation.hessian is not None
+        ]
+        combined = self._combined(offsets, evaluations, models)
+        self._losses = combined.frame_losses
+        # What is lowest so far is where the solver steps from, so there the frames' own unknowns step from too.
+        if models and combined.value < self._lowest:
+            self._lowest = combined.value
+            for part, model in zip(self._parts, models, strict=True):
+                part.anchor(offsets, model)
+        return combined
+
+    def frame_losses(self, offsets: Float[Tensor, " n"]) -> Float[np.ndarray, " frames"]:
+        """Loss of every frame at a calibration with joints as measured, as of the present stage."""
+        assert self.present is not None
+        at_measured = [
+            part.evaluate(offsets, torch.zeros_like(part.own), self.present, gradient=False) for part in self._parts
+        ]
+        return np.array([evaluation.loss for evaluation in at_measured])
+
+    def _combined(
+        self, offsets: Tensor, evaluations: list[Evaluation], models: list[Eliminated]
+    ) -> CalibrationEvaluation:
+        weights = self._weights
+        prior = self.prior.linearize(offsets)
+        values = torch.tensor([evaluation.value for evaluation in evaluations], dtype=torch.float64)
+        losses = torch.tensor([evaluation.loss for evaluation in evaluations], dtype=torch.float64)
+        slope, hessian, gradients = torch.zeros_like(offsets), None, None
+        if models:
+            gradients = weights[:, None] * torch.stack([model.gradient for model in models])
+            total = torch.einsum("f,fij->ij", weights, torch.stack([model.curvature for model in models]))
+            slope = prior.gradient + gradients.sum(0).to(offsets)
+            hessian = prior.hessian.double() + total.to(offsets.device)
+        maps = vars(evaluations[0])
+        return CalibrationEvaluation(
+            **maps
+            | {
+                "value": float(weights @ values) + prior.cost,
+                "loss": float(weights @ losses / weights.sum()),
+                "stage_loss": float(weights @ losses / weights.sum()),
+                "prior": prior.cost,
+                "gradient": slope,
+                "hessian": hessian,
+                "frame_losses": losses,
+                "frame_weights": weights,
+                "frame_gradients": gradients,
+            }
+        )
+
+
+def frame_weights(losses: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """How far each frame counts, in [0, 1]: in full up to a multiple of the median loss, and beyond it less, so
+    that a wrong frame (bad kinematics, smoke) does not decide what all share."""
+    shown = losses[losses > 0]
+    if not len(shown):
+        return torch.ones_like(losses)
+    return (_GOOD * shown.median() / losses.clamp(min=1e-12)).clamp(max=1.0).square()

@@ -1,0 +1,195 @@
+"""The surface factor: surface maps of a state against predicted ones, under one blur.
+
+What the network predicts (parts and normals, see `carts_core.surface`) the renderer knows exactly for every state, so
+no background, no shading and no network enter a step, and residuals have a Jacobian. A robust weight per pixel keeps
+what cannot be explained (an occluder, a false detection) from pulling.
+"""
+
+import math
+from dataclasses import astuple, dataclass
+from itertools import combinations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from ...rendering import JacobianBlock, Renderer, SurfaceRendering
+from ...scene import Scene, SceneState
+from ...settings import SurfaceSolver
+from ...surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ...threads import one_thread, total
+from ..inputs import kernel_radius, smoothed
+from ..observation import Observation
+from ..variables import APART, Variables
+from ..window import Window
+from .base import Linearization
+
+_REDUCTIONS = (1, 2, 4, 8)
+"""How many times smaller than the observed images those of a factor can be."""
+
+_STATES_AT_ONCE, _PIXELS_AT_ONCE = 128, 1 << 20
+"""Most states, and most pixels of all of them, that are rendered at once."""
+
+_SMALLEST_BLUR = 1.2
+"""Images are reduced as far as the blur stays at least this [px of the reduced image]."""
+
+
+class SurfaceFactor:
+    """Half the sum of robust squared differences of surface maps, in units of the noise. Implements `Factor`.
+
+    Args:
+        scene: with the cameras that take part.
+        variables: the unknowns.
+        observation: the predicted surface maps.
+        settings: noise and weights of the channels.
+        blur: deviation of the blur [px of the working image].
+        robust: difference beyond which a pixel loses its weight [1].
+
+    Attributes:
+        area: of a pixel [px of the working image].
+        size: width and height of the compared images [px].
+        window: the part of them that is compared [px].
+        certainty: information of a pixel, as a share of what it would have in a clear image [1].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        variables: Variables,
+        observation: Observation,
+        settings: SurfaceSolver,
+        *,
+        blur: float,
+        robust: float,
+    ) -> None:
+        images = observation.images
+        blur *= images.scale
+        factor = max(f for f in _REDUCTIONS if f == 1 or blur / f >= _SMALLEST_BLUR)
+        self._variables, self._blur, self._robust = variables, blur / factor, robust
+        self.area = (factor / images.scale) ** 2
+        self._noise = settings.noise
+        self._precision = self.area / settings.noise**2
+        self.size = images.size[0] // factor, images.size[1] // factor
+        self.window = observation.window.reduced(factor)
+        device = observation.maps.device
+        self.renderer = Renderer(
+            scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=device
+        )
+        self._weight = functional.avg_pool2d(observation.weight, factor)
+        self.certainty = functional.avg_pool2d(observation.certainty, factor)
+        maps = functional.avg_pool2d(observation.maps * observation.weight, factor)
+        self._observed = with_total(smoothed(maps, self._blur))
+        self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=device)
+        self._channels[1 : COVERAGE.stop] = settings.parts_weight
+        self._channels[NORMALS] = settings.normals_weight
+
+    def costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
+        """Cost of each of a batch of points, as many at once as memory allows."""
+        states = self._variables.state(offsets)
+        pixels = self.window.area * states.intrinsics.shape[-2]
+        at_once = max(min(_STATES_AT_ONCE, _PIXELS_AT_ONCE // pixels), 1)
+        found = []
+        for first in range(0, len(states.intrinsics), at_once):
+            part = states.map(lambda values, first=first: values[first : first + at_once])
+            _, squared, ratio = self._difference(self.renderer.surface_maps(part))
+            with one_thread():
+                sums = (squared * ratio * self.certainty).flatten(1).sum(1)
+            found.append(0.5 * self.area * sums)
+        return torch.cat(found) / self._noise**2
+
+    def compare(self, offsets: Float[Tensor, " n"]) -> "Comparison":
+        """Compare the state at a point."""
+        rendering = self.renderer.surface(self._variables.state(offsets), None, 1)
+        _, squared, ratio = self._difference(rendering.maps)
+        return self._comparison(rendering, squared, ratio)
+
+    def linearize(self, offsets: Float[Tensor, " n"]) -> "SurfaceLinearization":
+        """The quadratic model around a point, and the comparison there."""
+        around: SceneState = self._variables.around(offsets)
+        rendering = self.renderer.surface(around, APART, 1 + kernel_radius(self._blur))
+        model, squared, ratio = self._difference(rendering.maps)
+        comparison = self._comparison(rendering, squared, ratio)
+        residual = self._observed - model
+        weight = ratio.square() * self._channels * self._precision * self.certainty
+        grown = torch.zeros_like(residual)
+        grown[:, COVERAGE.start] = _growth(model[:, COVERAGE.start]) / math.sqrt(self.area)
+        gradient, hessian, outline = self._normal_equations(
+            rendering.jacobian, residual, grown, weight, len(self._variables)
+        )
+        return SurfaceLinearization(comparison.pixels / self._noise**2, gradient, hessian, comparison, outline)
+
+    def _comparison(self, rendering: SurfaceRendering, squared: Tensor, ratio: Tensor) -> "Comparison":
+        return Comparison(
+            0.5 * self.area * total(squared * ratio * self.certainty),
+            rendering,
+            (1.0 - squared[:, 0]).clamp(min=-1.0),
+            (ratio.square() * self._weight * self.certainty)[:, 0],
+        )
+
+    def _difference(self, maps: Float[Tensor, "*batch cameras 6 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Maps under the blur, the squared residual of each pixel, and what is left of that for being large [1]."""
+        model = with_total(smoothed(maps * self._weight, self._blur))
+        squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
+        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
+        return model, squared, 1.0 / (1.0 + squared / self._robust**2)
+
+    def _normal_equations(
+        self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """-J^T W r, J^T W J and J^T W g, under the blur."""
+        gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
+        outline = torch.zeros_like(gradient)
+        windows, blocks = [], []
+        for block in jacobian:
+            rows, columns = block.values.shape[-2:]
+            window = Window(block.left, block.top, columns, rows)
+            values = with_total(smoothed(block.values * window.of(self._weight), self._blur))
+            weighted = (values * window.of(weight)).flatten(1)
+            gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
+            outline[block.unknowns] = weighted @ window.of(grown).flatten()
+            curvature[block.unknowns[:, None], block.unknowns] = weighted @ values.flatten(1).T
+            windows.append(window)
+            blocks.append((block.unknowns, values))
+        for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
+            common = a.common(b)
+            if common is None:
+                continue
+            ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
+            cross = ours @ common.inside(b).of(second).flatten(1).T
+            curvature[mine[:, None], others] = cross
+            curvature[others[:, None], mine] = cross.T
+        return gradient, curvature, outline
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a state compares with what is observed."""
+
+    pixels: float
+    """The cost in pixels of the working image: half the sum of robust squared residuals, each as far as it counts."""
+    rendering: SurfaceRendering
+    similarity: Float[Tensor, "cameras h w"]
+    trust: Float[Tensor, "cameras h w"]
+    """Weight of each pixel, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class SurfaceLinearization(Linearization):
+    """The quadratic model, and what it was made from."""
+
+    comparison: Comparison
+    outline: Float[Tensor, " n"]
+    """What the gradient loses when all observed outlines move outwards by a pixel of the working image [1/px]."""
+
+
+def _growth(coverage: Float[Tensor, "cameras h w"]) -> Float[Tensor, "cameras h w"]:
+    """What coverage gains when outlines move outwards by a pixel."""
+    down, right = torch.gradient(coverage, dim=(-2, -1))
+    return torch.hypot(down, right)
+
+
+def with_total(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
+    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
+    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
+    return maps

@@ -1,0 +1,107 @@
+"""A fit on its way: what the stages of a solver share, and pass on to each other."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..settings.stages import Descend, Evaluate, FirstOrder, Observe
+from .evaluation import Evaluation
+from .factors import Linearization
+from .solvers import FirstOrderDescent, LevenbergMarquardt
+from .variables import Variables
+
+
+class StopReason(StrEnum):
+    """Why an optimization ended."""
+
+    CONVERGED = "converged"
+    ITERATIONS = "iterations"
+    START_KEPT = "start kept"
+    NOT_OPTIMIZED = "not optimized"
+    CANCELLED = "cancelled"
+
+
+class Problem(Protocol):
+    """What stages work on: one frame, or many that share a calibration."""
+
+    @property
+    def variables(self) -> Variables:
+        """The unknowns."""
+        ...
+
+    def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
+        """Replace the observation."""
+        ...
+
+    def evaluate(self, offsets: Float[Tensor, " n"], stage: Any, *, gradient: bool = True) -> Evaluation:
+        """The objective at a point, as a stage compares it."""
+        ...
+
+    def epoch(self, blur: float) -> tuple[int, float]:
+        """Losses compare within an epoch."""
+        ...
+
+
+@dataclass(frozen=True)
+class Point:
+    """An evaluated point."""
+
+    offsets: Float[Tensor, " n"]
+    evaluation: Evaluation
+    epoch: tuple[Any, ...]
+    """Losses compare among points of the same epoch."""
+
+
+@dataclass
+class Fit:
+    """The state of a run, which every stage takes up and leaves behind.
+
+    Args:
+        problem: what is solved.
+        offsets: the present estimate, at first the start.
+        budget: largest number of evaluations.
+    """
+
+    problem: Problem
+    offsets: Float[Tensor, " n"]
+    budget: int
+    stop_reason: StopReason = StopReason.NOT_OPTIMIZED
+    reached: Point | None = None
+    """The best point of the last descent."""
+    edges: Linearization | None = None
+    """What edges say around the estimate, after `AlignEdges`."""
+    restarts: int = 0
+    used: int = 0
+    """Evaluations so far."""
+    solver: LevenbergMarquardt = field(init=False)
+    descent: FirstOrderDescent | None = None
+    """Its state goes on from one `FirstOrder` to the next."""
+    losses: list[float] = field(default_factory=list)
+    """Of all points of `FirstOrder` stages."""
+
+    def __post_init__(self) -> None:
+        self.solver = LevenbergMarquardt(self.problem.variables.lower, self.problem.variables.upper)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all evaluations are used up."""
+        return self.used >= self.budget
+
+    @property
+    def loss(self) -> float:
+        """Of the best point of the last descent [1]; infinite before any."""
+        return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
+
+    def evaluate(self, stage: Descend | Evaluate | FirstOrder, *, gradient: bool = True) -> Point:
+        """Evaluate the present estimate."""
+        self.used += 1
+        evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)
+        return Point(self.offsets, evaluation, (self.restarts, *self.problem.epoch(stage.blur)))
+
+    def restart(self, offsets: Float[Tensor, " n"]) -> None:
+        """Go on from elsewhere, with more care than before."""
+        self.offsets, self.restarts = offsets, self.restarts + 1
+        self.solver.reset()

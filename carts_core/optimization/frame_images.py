@@ -1,0 +1,85 @@
+"""The images of a frame in a size in which they are compared."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from ..rendering import Renderer
+from ..scene import Scene
+from .counterfactual import Backgrounds, without_background
+from .haze import certainty, dehazed, transmission
+from .inputs import pixel_weights, stacked_images, working_size
+from .predictor import SurfacePredictor
+
+
+@dataclass(frozen=True)
+class FrameImages:
+    """Images in one size, and what their pixels are worth. Made by `FrameImages.of`."""
+
+    scale: float
+    """How many times larger than the working image [1]."""
+    size: tuple[int, int]
+    """Width and height [px]."""
+    images: Float[Tensor, "cameras 3 h w"]
+    """RGB in [0, 1], without smoke and haze."""
+    weight: Float[Tensor, "cameras 1 h w"]
+    """0 where an occluder is known to be, 1 elsewhere."""
+    certainty: Float[Tensor, "cameras 1 h w"]
+    """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
+    explained: Float[Tensor, "cameras 1 h w"] | None
+    """Share of what is seen of arms that the empty background shows as well [1]; None where that is not known."""
+    renderer: Renderer
+    """Of the whole image."""
+
+    @staticmethod
+    def of(
+        scene: Scene,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        ignore: Mapping[str, Bool[np.ndarray, "h w"]],
+        *,
+        scale: float,
+        working_width: int,
+        dehaze: float,
+        predictor: SurfacePredictor,
+        backgrounds: Backgrounds | None = None,
+    ) -> "FrameImages":
+        """Images at `scale` times the working size, as far as the predictor's stride allows.
+
+        Args:
+            scene: with the cameras that take part.
+            images: camera name -> observed RGB image.
+            ignore: camera name -> pixels that show an occluder.
+            scale: times the working size [1].
+            working_width: width of the working image [px].
+            dehaze: share of smoke and haze that is taken off [1].
+            predictor: sizes are multiples of its stride; it also sees the backgrounds, once.
+            backgrounds: of the cameras, where they are known.
+
+        Raises:
+            SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+        """
+        unit, _ = working_size(scene, working_width, predictor.stride)
+        size = working_size(scene, round(working_width * scale), predictor.stride)
+        stacked = stacked_images(scene, images, size, "image").to(predictor.device)
+        through, explained = transmission(stacked, dehaze), None
+        if backgrounds is not None and backgrounds.covers(scene):
+            background = backgrounds.at(scene, size, dehaze, predictor)
+            changed = background.changed(stacked, size[0] / unit)
+            if background.deceptive:
+                stacked, through = without_background(stacked, changed), torch.ones_like(through)
+            else:
+                explained = background.seen * (1.0 - changed)
+        return FrameImages(
+            scale=size[0] / unit,
+            size=size,
+            images=dehazed(stacked, through),
+            weight=pixel_weights(scene, ignore, size).to(predictor.device),
+            # Smoke misleads the network by more than noise does: docs/experiments.
+            certainty=certainty(through).square(),
+            explained=explained,
+            renderer=Renderer(scene, width=size[0], height=size[1], device=predictor.device),
+        )

@@ -1,0 +1,219 @@
+"""One frame as an optimization problem: its images, the unknowns, a prior, and what was observed last."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from ..scene import Scene
+from ..settings import SurfaceSolver
+from ..settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, first_observe
+from ..surface import COVERAGE
+from ..threads import total
+from .counterfactual import Backgrounds
+from .edge_alignment import align_edges
+from .evaluation import Evaluation
+from .factors import Linearization, Prior
+from .factors.edges import EdgeFactor
+from .factors.surface import SurfaceFactor
+from .frame_images import FrameImages
+from .ignore import propose_ignore
+from .observability import uncertainty
+from .observation import Observation, observe
+from .predictor import SurfacePredictor
+from .variables import Variables
+
+_SHOWN_BLUR = 1.6
+"""Iterates that somebody watches are compared under a blur of at most this [px of the working image]."""
+
+
+class FrameProblem:
+    """The sum of the surface factor of the last observation and of the prior.
+
+    Args:
+        scene: with the cameras that take part.
+        images: camera name -> observed RGB image.
+        predictor: predicts surface maps.
+        variables: the unknowns.
+        settings: noise, weights, working size.
+        ignore: camera name -> pixels that show an occluder.
+        prior: of the unknowns; as the settings expect by default.
+        backgrounds: of the cameras; what the predictor also sees in them is no arm.
+        live: whether coarse stages are also compared under a fine blur, for somebody who watches. It takes a third
+            more time and changes no step.
+
+    Attributes:
+        observation: the last one; stages replace it.
+        observations: how many there were.
+        proposed: camera name -> pixels that were left out on a proposal.
+
+    Raises:
+        SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        predictor: SurfacePredictor,
+        variables: Variables,
+        settings: SurfaceSolver,
+        ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+        *,
+        prior: Prior | None = None,
+        backgrounds: Backgrounds | None = None,
+        live: bool = True,
+    ) -> None:
+        self.scene, self.variables, self.settings = scene, variables, settings
+        self.prior = prior or variables.prior(settings)
+        self._predictor, self._backgrounds, self._live = predictor, backgrounds, live
+        self._given: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]] = images, ignore or {}
+        self._ignore = ignore or {}
+        self._images: dict[float, FrameImages] = {}
+        self._edges: EdgeFactor | None = None
+        self._factors: dict[tuple[float, float], SurfaceFactor] = {}
+        self._observation: Observation | None = None
+        self.observations = 0
+        self.proposed: dict[str, Bool[np.ndarray, "h w"]] = {}
+        self.images(first_observe(settings.stages).scale)
+
+    @property
+    def start(self) -> Float[Tensor, " n"]:
+        """Where all offsets are 0."""
+        return torch.zeros_like(self.variables.lower)
+
+    @property
+    def observation(self) -> Observation:
+        """The last one."""
+        assert self._observation is not None, "a solver begins with Observe"
+        return self._observation
+
+    @observation.setter
+    def observation(self, observation: Observation) -> None:
+        self._observation, self._factors = observation, {}
+        self.observations += 1
+
+    def images(self, scale: float) -> FrameImages:
+        """The images at a scale."""
+        if scale not in self._images:
+            self._images[scale] = FrameImages.of(
+                self.scene,
+                *self._given,
+                scale=scale,
+                working_width=self.settings.working_width,
+                dehaze=self.settings.dehaze,
+                predictor=self._predictor,
+                backgrounds=self._backgrounds,
+            )
+        return self._images[scale]
+
+    def reset(self) -> None:
+        """Forget what was observed and proposed."""
+        if self.proposed:
+            self._given, self._images, self._edges = (self._given[0], self._ignore), {}, None
+        self._observation, self._factors, self.observations, self.proposed = None, {}, 0, {}
+
+    def observe(self, stage: Observe, offsets: Float[Tensor, " n"], *, whole: bool = False) -> None:
+        """Have the predictor look at the images, conditioned on the start or on an estimate."""
+        given = self.start if stage.given is Given.START else offsets
+        state = self.variables.state(given)
+        self.observation = observe(self.images(stage.scale), self._predictor, state, stage, whole=whole)
+
+    def ignore_occluders(self, evaluation: Evaluation) -> bool:
+        """Leave out what probably lies over the arms, from a fit's evaluation; False if nothing does."""
+        silhouette, similarity = evaluation.silhouette.cpu().numpy(), evaluation.similarity.cpu().numpy()
+        self.proposed = propose_ignore(self.scene, silhouette, similarity)
+        if self.proposed:
+            images, given = self._given
+            masks = {name: mask | given.get(name, False) for name, mask in self.proposed.items()}
+            self._given, self._images, self._edges = (images, {**given, **masks}), {}, None
+        return bool(self.proposed)
+
+    def factor(self, blur: float, robust: float) -> SurfaceFactor:
+        """The surface factor of the last observation under a blur."""
+        if (blur, robust) not in self._factors:
+            self._factors[blur, robust] = SurfaceFactor(
+                self.scene, self.variables, self.observation, self.settings, blur=blur, robust=robust
+            )
+        return self._factors[blur, robust]
+
+    def epoch(self, blur: float) -> tuple[int, float]:
+        """Losses compare within an epoch: an observation, and where nobody watches one blur."""
+        return self.observations, 0.0 if self._live else blur
+
+    @torch.no_grad()
+    def costs(self, offsets: Float[Tensor, "batch n"], blur: float, robust: float) -> Float[Tensor, " batch"]:
+        """The objective at each of a batch of points."""
+        return self.factor(blur, robust).costs(offsets) + self.prior.costs(offsets)
+
+    @torch.no_grad()
+    def evaluate(
+        self, offsets: Float[Tensor, " n"], stage: "Descend | Evaluate", *, gradient: bool = True
+    ) -> Evaluation:
+        """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
+        factor = self.factor(stage.blur, stage.robust)
+        prior = self.prior.linearize(offsets)
+        slope, hessian, known = torch.zeros_like(offsets), None, None
+        if gradient:
+            surface = factor.linearize(offsets)
+            compared, total = surface.comparison, prior + surface
+            slope, hessian = total.gradient, total.hessian
+            if self.prior.informs_all:
+                known = uncertainty(
+                    self.variables.names,
+                    total.hessian,
+                    self.prior.marginal,
+                    self.variables.scales,
+                    self.settings.outline_error * surface.outline,
+                )
+        else:
+            compared = factor.compare(offsets)
+        shown, final = factor, compared
+        if self._live and stage.blur > _SHOWN_BLUR:
+            shown = self.factor(_SHOWN_BLUR, Descend.robust)
+            final = shown.compare(offsets)
+        coverage = final.rendering.maps[:, COVERAGE].sum(1)
+        empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
+        paste = shown.window.paste
+        return Evaluation(
+            value=compared.pixels / self.settings.noise**2 + prior.cost,
+            loss=self._loss(shown, final),
+            stage_loss=self._loss(factor, compared),
+            prior=prior.cost,
+            gradient=slope,
+            hessian=hessian,
+            uncertainty=known,
+            image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
+            silhouette=paste(coverage, empty.clone()),
+            similarity=paste(final.similarity, torch.ones_like(empty)),
+            attention=paste(final.trust, empty),
+        )
+
+    def _loss(self, factor: SurfaceFactor, compared) -> float:
+        """The cost per pixel of the arms, as rendered and as observed.
+
+        The area is weighted as the cost is, so that losses compare between clear and hazy images.
+        """
+        coverage = compared.rendering.maps[:, COVERAGE].sum(1)
+        rendered = total(coverage * factor.certainty[:, 0]) * factor.area
+        return 2.0 * compared.pixels / (0.5 * max(rendered + self.observation.area, 1.0))
+
+    def aligned(
+        self, stage: AlignEdges, offsets: Float[Tensor, " n"], known: Evaluation
+    ) -> tuple[Float[Tensor, " n"], Linearization]:
+        """Outlines drawn to edges from a point whose evaluation is known; see `align_edges`."""
+        assert known.hessian is not None
+        if self._edges is None:
+            self._edges = EdgeFactor(
+                self.scene,
+                self._given[0],
+                self.variables,
+                self._given[1],
+                working_width=self.settings.working_width,
+                dehaze=self.settings.dehaze,
+                device=self._predictor.device,
+            )
+        model = Linearization(known.value, known.gradient, known.hessian)
+        return align_edges(self._edges, stage, offsets, model, self.observation.whole_coverage())

@@ -1,0 +1,159 @@
+"""What the images of one frame measure of its correction, near a place where it is looked for."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..data import Frame
+from ..scene import Scene
+from ..settings import SequenceSettings, SurfaceSolver
+from ..settings.presets import COMPARE, reduced
+from ..settings.stages import Evaluate, Stage, first_observe
+from .counterfactual import Backgrounds
+from .error_model import Gaussian, Information
+from .evaluation import Evaluation
+from .factors import Linearization, Prior
+from .fit import Fit
+from .frame_problem import FrameProblem
+from .predictor import SurfacePredictor
+from .stages import run_stages
+from .variables import Variables
+
+Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
+
+_QUICK_SCALE = 1.0
+"""Largest `Observe.scale` of a quick cold start [1]."""
+
+_END = Evaluate()
+"""How a given correction is compared."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one frame says, at the end of a descent."""
+
+    correction: Float[np.ndarray, " n"]
+    """Best for image and prior together [rad]."""
+    information: Information
+    """Of the image alone, linearized there, and scaled for the correlation of neighbouring pixels."""
+    loss: float
+    iterations: int
+
+
+class FrameSolver:
+    """Solves single frames of a sequence.
+
+    Args:
+        scene: with the cameras that take part.
+        predictor: predicts surface maps.
+        settings: noise, weights, working size.
+        model: stages of cold and warm starts, and the noise of a measurement.
+        ignore: position of a frame -> camera name -> pixels that show an occluder.
+        backgrounds: of the cameras, where they are known.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        predictor: SurfacePredictor,
+        settings: SurfaceSolver,
+        model: SequenceSettings,
+        ignore: Ignore,
+        backgrounds: Backgrounds | None = None,
+    ) -> None:
+        self._scene, self._predictor, self._settings, self._ignore = scene, predictor, settings, ignore
+        self._backgrounds = backgrounds
+        self._share = (settings.noise / model.measurement_noise) ** 2
+        self._cold, self._warm = model.cold, model.warm
+
+    def warm(self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray) -> Measurement:
+        """Find the correction near `start` [n]."""
+        prior = _prior(expected, variables)
+        fit = self._run(frame, variables, prior, self._warm, start)
+        assert fit.reached is not None
+        seen = _information(fit.reached.offsets, fit.reached.evaluation, prior)
+        correction = fit.reached.offsets
+        if fit.edges is not None:
+            correction, seen = fit.offsets, seen + _of_edges(fit.offsets, fit.edges)
+        loss = fit.reached.evaluation.stage_loss
+        return Measurement(_double(correction), seen.scaled(self._share), loss, fit.used)
+
+    def cold(self, frame: Frame, variables: Variables, expected: Gaussian, *, quick: bool = False) -> Measurement:
+        """Find the correction from the measured values on; quick in smaller images but for the end."""
+        stages = reduced(self._cold, _QUICK_SCALE) if quick else self._cold
+        fit = self._run(frame, variables, _prior(expected, variables), stages, np.zeros(len(variables)))
+        assert fit.reached is not None
+        end = self.warm(frame, variables, expected, _double(fit.reached.offsets))
+        return replace(end, iterations=fit.used + end.iterations)
+
+    def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
+        """Evaluate a given correction [n], no more."""
+        problem = self._problem(frame, variables, _prior(expected, variables))
+        offsets = torch.from_numpy(correction).to(variables.lower)
+        problem.observe(first_observe(self._warm), offsets)
+        evaluation = problem.evaluate(offsets, _END)
+        information = _information(offsets, evaluation, problem.prior).scaled(self._share)
+        return Measurement(correction, information, evaluation.stage_loss, 0)
+
+    def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
+        """How badly given corrections [n] fit, in a smaller image that is observed conditioned on each."""
+        problem, found = self._problem(frame, variables, None), []
+        for correction in corrections:
+            offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+            problem.observe(first_observe(COMPARE), offsets)
+            found.append(problem.evaluate(offsets, _END, gradient=False).stage_loss)
+        return found
+
+    def _problem(self, frame: Frame, variables: Variables, prior: Prior | None) -> FrameProblem:
+        return FrameProblem(
+            self._scene,
+            frame.images,
+            self._predictor,
+            variables,
+            self._settings,
+            self._ignore(frame.index),
+            prior=prior,
+            backgrounds=self._backgrounds,
+            live=False,
+        )
+
+    def _run(
+        self, frame: Frame, variables: Variables, prior: Prior, stages: tuple[Stage, ...], start: np.ndarray
+    ) -> Fit:
+        problem = self._problem(frame, variables, prior)
+        offsets = variables.clamp(torch.from_numpy(start).to(variables.lower))
+        fit = Fit(problem, offsets, self._settings.iterations)
+        for _ in run_stages(stages, fit):
+            pass
+        return fit
+
+
+def _prior(expected: Gaussian, variables: Variables) -> Prior:
+    like = variables.lower
+    precision = np.linalg.inv(expected.covariance)
+    return Prior(torch.from_numpy(expected.mean).to(like), torch.from_numpy(precision).to(like))
+
+
+def _information(offsets: Tensor, evaluation: Evaluation, prior: Prior) -> Information:
+    """Of the image alone: the quadratic model without the prior."""
+    assert evaluation.hessian is not None
+    known = prior.linearize(offsets)
+    precision = _double(evaluation.hessian - known.hessian)
+    # Without what rounding took below 0: information is never negative.
+    values, vectors = np.linalg.eigh(0.5 * (precision + precision.T))
+    precision = vectors @ np.diag(values.clip(min=0.0)) @ vectors.T
+    slope = _double(evaluation.gradient - known.gradient)
+    return Information(precision, precision @ _double(offsets) - slope)
+
+
+def _of_edges(offsets: Tensor, edges: Linearization) -> Information:
+    precision = _double(edges.hessian)
+    return Information(precision, precision @ _double(offsets) - _double(edges.gradient))
+
+
+def _double(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()

@@ -1,0 +1,67 @@
+"""Frames that a stopped run has already solved are not solved again."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from ..checkpoint import Checkpoint
+from ..data import Frame
+from ..files import OutputPath
+from ..fingerprints import fingerprint
+from .error_model import Gaussian, Information
+from .measurement import FrameSolver, Measurement
+from .variables import Variables
+
+
+def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
+    """The checkpoint of a `SequenceOptimizer`.
+
+    Args:
+        path: the file.
+        made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
+    """
+    return Checkpoint(path, made_with, (Measurement, Information))
+
+
+class ResumableFrameSolver(FrameSolver):
+    """A `FrameSolver` that looks up in a checkpoint what it has solved before: the same to the last bit.
+
+    Args:
+        solver: that solves what is not there.
+        checkpoint: made by `sequence_checkpoint`.
+    """
+
+    def __init__(self, solver: FrameSolver, checkpoint: Checkpoint) -> None:
+        self._solver, self._checkpoint = solver, checkpoint
+
+    def warm(self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray) -> Measurement:
+        """As `FrameSolver.warm`."""
+        key = _key("warm", frame, expected, start)
+        return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start))
+
+    def cold(self, frame: Frame, variables: Variables, expected: Gaussian, *, quick: bool = False) -> Measurement:
+        """As `FrameSolver.cold`."""
+        key = _key("cold", frame, expected, quick)
+        return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, quick=quick))
+
+    def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
+        """As `FrameSolver.at`."""
+        key = _key("at", frame, expected, correction)
+        return self._checkpoint.value(key, lambda: self._solver.at(frame, variables, expected, correction))
+
+    def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
+        """As `FrameSolver.losses`."""
+        key = _key("losses", frame, *corrections)
+        return self._checkpoint.value(key, lambda: self._solver.losses(frame, variables, corrections))
+
+
+def _key(method: str, frame: Frame, *arguments: Any) -> str:
+    images = [(name, frame.images[name]) for name in sorted(frame.images)]
+    measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
+    return fingerprint(method, frame.index, images, measured, _plain(arguments))
+
+
+def _plain(arguments: Iterable[Any]) -> list[Any]:
+    return [astuple(value) if is_dataclass(value) and not isinstance(value, type) else value for value in arguments]

@@ -1,0 +1,105 @@
+"""Searches that a descent cannot do: random starts, along the shafts, and back at the start."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..settings.stages import Descend, Given, Observe, PreferStart, RandomRestart, ShaftSearch
+from ..threads import total
+from .frame_problem import FrameProblem
+
+_SUPPORT = 0.5
+"""Share of an arm's silhouette that has to be observed as an arm, or the arm is lost [1]."""
+
+_LEFT = 0.3
+"""Share of the silhouette at the start that an arm has to keep, or it is lost [1]."""
+
+
+def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
+    """Whether an arm that was in sight at the start has left the image, or stands where no arm was observed."""
+    seen, renderer = problem.observation, problem.observation.images.renderer
+    start = renderer.segment(problem.variables.state(problem.start))
+    found = seen.window.of(torch.from_numpy(renderer.segment(problem.variables.state(offsets))))
+    found = found.to(seen.maps.device)
+    coverage = seen.coverage
+    for arm in range(len(problem.scene.arms)):
+        here = found == arm
+        area, before = int(here.sum()), int((start == arm).sum())
+        if before and (area < _LEFT * before or total(coverage[here]) < _SUPPORT * area):
+            return True
+    return False
+
+
+@torch.no_grad()
+def best_random_start(
+    problem: FrameProblem, offsets: Float[Tensor, " n"], stage: RandomRestart, seed: int = 0
+) -> Float[Tensor, " n"]:
+    """The best of random points, arm by arm, compared with the whole image; that is observed once more for it.
+
+    Args:
+        problem: one frame; its observation is replaced by that of the whole image.
+        offsets: what has been found so far; it and the start are among the candidates.
+        stage: how many points, and how far apart.
+        seed: of the random numbers.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    deviation = stage.spread * problem.prior.marginal.rsqrt().cpu()
+    problem.observe(Observe(scale=stage.scale, given=Given.START, haze=False), offsets, whole=True)
+    best = offsets
+    for group in problem.variables.groups:
+        columns = list(group)
+        drawn = torch.stack([torch.randn(len(group), generator=generator) for _ in range(stage.candidates + 1)])
+        trials = best.repeat(len(drawn) + 1, 1)
+        trials[1:, columns] = (drawn * deviation[columns]).to(best)
+        trials[1, columns] = 0.0
+        trials = problem.variables.clamp(trials)
+        best = trials[problem.costs(trials, stage.blur, Descend.robust).argmin()]
+    return best
+
+
+@torch.no_grad()
+def best_along_shafts(
+    problem: FrameProblem, offsets: Float[Tensor, " n"], stage: ShaftSearch
+) -> Float[Tensor, " n"] | None:
+    """The best place of an arm moved along its shaft, each observed conditioned on itself; None if the present one is.
+
+    The observation at the best place becomes the problem's.
+    """
+
+    def cost(trial: Tensor) -> float:
+        problem.observe(Observe(), trial)
+        return float(problem.costs(trial[None], stage.blur, Descend.robust))
+
+    best, lowest = None, cost(offsets)
+    for index in problem.variables.prismatic:
+        for distance in (-stage.step, stage.step):
+            trial = offsets.clone()
+            trial[index] += distance / float(problem.variables.scales[index])
+            trial = problem.variables.clamp(trial)
+            if (found := cost(trial)) < lowest:
+                best, lowest = trial, found
+    problem.observe(Observe(), offsets if best is None else best)
+    return best
+
+
+@torch.no_grad()
+def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
+    """Whether the start explains an observation that is conditioned on it as well as the estimate does.
+
+    Where silhouettes differ much it does not, and nothing is observed. Where it does, that observation becomes the
+    problem's. A start is never preferred where a calibration is free: that is thought to be wrong.
+    """
+    if problem.variables.moves_calibration:
+        return False
+    start, before, state = problem.start, problem.observation, problem.variables.state
+    one, other = (before.images.renderer.segment(state(point)) >= 0 for point in (start, offsets))
+    if 2 * int((one & other).sum()) <= stage.overlap * (int(one.sum()) + int(other.sum())):
+        return False
+    problem.observe(Observe(given=Given.START), offsets)
+    points = torch.stack([start, offsets])
+    at_start, at_estimate = problem.factor(stage.blur, Descend.robust).costs(points).tolist()
+    gain = at_start - at_estimate + float(problem.prior.costs(start) - problem.prior.costs(offsets))
+    as_well = gain < stage.improvement and at_start < stage.ratio * at_estimate
+    if not as_well:
+        problem.observation = before
+    return as_well

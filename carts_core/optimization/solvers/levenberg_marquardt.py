@@ -1,0 +1,86 @@
+"""Levenberg-Marquardt with bounds."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
+_SOFTER, _HARDER = 0.25, 8.0
+_LONGEST_STEP = 0.15
+"""Largest change of an unknown in one step [rad]; beyond it the linear model means nothing."""
+
+REJECTIONS = 3
+"""After so many steps in a row that did not lower the objective, there is nothing to be gained [1]."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A proposed step."""
+
+    change: Float[Tensor, " n"]
+    reduction: float
+    """Of the objective, by its quadratic model [1]."""
+
+
+class LevenbergMarquardt:
+    """Solves for the step that minimizes the damped quadratic model; the damping follows how good the model proved.
+
+    Args:
+        lower, upper: bounds of the unknowns; one that is at a bound and would leave it stays there.
+    """
+
+    def __init__(self, lower: Float[Tensor, " n"], upper: Float[Tensor, " n"]) -> None:
+        self._lower, self._upper = lower, upper
+        self._damping = _FIRST_DAMPING
+
+    def reset(self) -> None:
+        """Begin with the first damping again."""
+        self._damping = _FIRST_DAMPING
+
+    def accepted(self) -> None:
+        """The last step lowered the objective."""
+        self._damping = max(self._damping * _SOFTER, _LEAST_DAMPING)
+
+    def rejected(self) -> None:
+        """The last step did not."""
+        self._damping *= _HARDER
+
+    def step(self, offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], hessian: Float[Tensor, "n n"]) -> Step:
+        """The step from a point with this quadratic model."""
+        slope, curvature = gradient.double(), hessian.double()
+        damped = curvature + self._damping * torch.diag(curvature.diagonal().clamp(min=1e-9))
+        change = bounded_step(offsets, slope, damped, self._lower, self._upper, _LONGEST_STEP)
+        reduction = -float(slope @ change + 0.5 * change @ (curvature @ change))
+        return Step(change.to(gradient), reduction)
+
+
+def bounded_step(
+    offsets: Float[Tensor, " n"],
+    gradient: Float[Tensor, " n"],
+    hessian: Float[Tensor, "n n"],
+    lower: Float[Tensor, " n"],
+    upper: Float[Tensor, " n"],
+    longest: float,
+) -> Float[Tensor, " n"]:
+    """Where the quadratic model is lowest among the unknowns that may move; no unknown changes by more than `longest`.
+
+    Args:
+        offsets: the present point [rad].
+        gradient, hessian: of the model there.
+        lower, upper: bounds; an unknown at a bound that would leave it stays.
+        longest: [rad]; infinity for no limit.
+    """
+    free = may_move(offsets, gradient, lower, upper)
+    step = torch.zeros_like(gradient, dtype=torch.float64)
+    step[free] = torch.linalg.solve(hessian.double()[free][:, free], -gradient.double()[free])
+    largest = float(step.abs().max()) if len(step) else 0.0
+    return step * min(1.0, longest / max(largest, 1e-12))
+
+
+def may_move(
+    offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], lower: Float[Tensor, " n"], upper: Float[Tensor, " n"]
+) -> Bool[Tensor, " n"]:
+    """Unknowns that are not at a bound which the descent would leave."""
+    return ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))

@@ -1,0 +1,159 @@
+"""What each stage of a solver does. The stages themselves are data: `carts_core.settings.stages`."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import singledispatch
+
+import torch
+
+from ..settings.stages import (
+    AlignEdges,
+    Descend,
+    Evaluate,
+    FirstOrder,
+    IgnoreOccluders,
+    Observe,
+    PreferStart,
+    RandomRestart,
+    ShaftSearch,
+    Stage,
+)
+from .feature_problem import FeatureProblem
+from .fit import Fit, Point, StopReason
+from .frame_problem import FrameProblem
+from .search import arm_is_lost, best_along_shafts, best_random_start, start_explains_as_well
+from .solvers import FirstOrderDescent
+from .solvers.levenberg_marquardt import REJECTIONS
+
+
+def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
+    """Run stages one after another; yields every point that is evaluated on the way."""
+    for stage in stages:
+        if fit.exhausted:
+            return
+        yield from run_stage(stage, fit)
+
+
+@singledispatch
+def run_stage(stage: object, fit: Fit) -> Iterator[Point]:
+    """Run one stage; yields every point that is evaluated on the way."""
+    raise TypeError(f"{stage!r} is no stage")
+
+
+@run_stage.register
+def _(stage: Observe, fit: Fit) -> Iterator[Point]:
+    fit.problem.observe(stage, fit.offsets)
+    yield from ()
+
+
+@run_stage.register
+def _(stage: Descend, fit: Fit) -> Iterator[Point]:
+    # After a restart nothing is left to later stages.
+    tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
+    best, rejections = None, 0
+    for taken in range(1, stage.steps + 1):
+        point = fit.evaluate(stage)
+        if best is None or point.evaluation.value < best.evaluation.value:
+            if best is not None:
+                fit.solver.accepted()
+            best, rejections = point, 0
+        else:
+            fit.solver.rejected()
+            rejections += 1
+        known = best.evaluation
+        assert known.hessian is not None
+        step = fit.solver.step(best.offsets, known.gradient, known.hessian)
+        stuck = rejections >= REJECTIONS
+        converged = stuck or step.reduction < tolerance * known.value
+        fit.reached = best
+        fit.offsets = best.offsets if stuck else fit.problem.variables.clamp(best.offsets + step.change)
+        fit.stop_reason = StopReason.CONVERGED if converged else StopReason.ITERATIONS
+        yield point
+        if converged or fit.exhausted or taken == stage.steps:
+            return
+
+
+@run_stage.register
+def _(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
+    problem = _one_frame(fit)
+    if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
+        fit.restart(best_random_start(problem, fit.offsets, stage))
+        yield from run_stages(stage.then, fit)
+
+
+@run_stage.register
+def _(stage: ShaftSearch, fit: Fit) -> Iterator[Point]:
+    if fit.loss < stage.if_loss:
+        return
+    found = best_along_shafts(_one_frame(fit), fit.offsets, stage)
+    if found is not None:
+        fit.restart(found)
+        yield from run_stages(stage.then, fit)
+
+
+@run_stage.register
+def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
+    assert fit.reached is not None, "AlignEdges follows a Descend"
+    fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
+    yield from ()
+
+
+@run_stage.register
+def _(stage: PreferStart, fit: Fit) -> Iterator[Point]:
+    if start_explains_as_well(_one_frame(fit), fit.offsets, stage):
+        fit.offsets, fit.stop_reason = torch.zeros_like(fit.offsets), StopReason.START_KEPT
+    yield from ()
+
+
+@run_stage.register
+def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
+    kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
+    point = fit.evaluate(stage, gradient=kept)
+    if known is not None and not kept:
+        # Edges have no deviation of their own: that of the descent before stands.
+        before = known.evaluation
+        evaluation = replace(point.evaluation, gradient=before.gradient, uncertainty=before.uncertainty)
+        point = replace(point, evaluation=evaluation)
+    # It is what counts in the end, whatever the loss says, which knows no edges.
+    yield replace(point, epoch=(*point.epoch, "end"))
+
+
+@run_stage.register
+def _(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
+    problem = _one_frame(fit)
+    if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
+        fit.offsets, fit.restarts, fit.used = problem.start, 0, 0
+        fit.solver.reset()
+        yield from run_stages(stage.then, fit)
+
+
+@run_stage.register
+def _(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
+    problem = fit.problem
+    assert isinstance(problem, FeatureProblem)
+    settings, planned = problem.settings, problem.settings.iterations
+    if fit.descent is None:
+        variables = problem.variables
+        fit.descent = FirstOrderDescent(settings, fit.offsets, variables.lower, variables.upper)
+    end = min(fit.used + math.ceil(stage.share * planned), planned)
+    # The point that the last step leads to is evaluated, too.
+    while fit.used < end or fit.used == end == planned:
+        point = fit.evaluate(stage)
+        fit.losses.append(point.evaluation.loss)
+        fit.offsets, fit.stop_reason = fit.descent.step(point.evaluation.gradient), StopReason.ITERATIONS
+        if _stalled(fit.losses, settings.tolerance, settings.patience):
+            fit.budget, fit.stop_reason = fit.used, StopReason.CONVERGED
+        yield point
+        if fit.exhausted:
+            return
+
+
+def _stalled(losses: list[float], tolerance: float, patience: int) -> bool:
+    """Whether the best loss has improved by less than the tolerance over so many steps."""
+    return tolerance > 0 and len(losses) > patience and min(losses[:-patience]) - min(losses) < tolerance
+
+
+def _one_frame(fit: Fit) -> FrameProblem:
+    assert isinstance(fit.problem, FrameProblem), "a stage for one frame"
+    return fit.problem

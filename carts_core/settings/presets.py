@@ -1,0 +1,87 @@
+"""The solvers that ship, each a tuple of stages to be read from top to bottom."""
+
+from dataclasses import replace
+
+from .stages import (
+    AlignEdges,
+    Descend,
+    Evaluate,
+    FirstOrder,
+    Given,
+    IgnoreOccluders,
+    Observe,
+    PreferStart,
+    RandomRestart,
+    ShaftSearch,
+    Stage,
+)
+
+_FAR = Observe(margin=27, attention=27, haze=False)
+"""An observation that has to find arms which are several degrees off."""
+
+_COARSE = Descend(blur=8.0, robust=2.0, tolerance=0.06)
+_MEDIUM = Descend(blur=3.0, tolerance=0.06)
+_FINE = Descend(blur=1.6, tolerance=0.06)
+_FINEST = Descend(blur=0.8)
+
+SEARCH: tuple[Stage, ...] = (
+    # A small image first: a good estimate is there soon.
+    Observe(scale=0.75, margin=27, attention=27, haze=False),
+    _COARSE,
+    # Conditioned on the start again, so that an error of the first pass is not confirmed by itself.
+    Observe(given=Given.START, margin=27, attention=27, haze=False),
+    _MEDIUM,
+    RandomRestart(then=(Descend(blur=8.0), _FAR, Descend(blur=3.0))),
+    Observe(),
+    _MEDIUM,
+    _FINE,
+    ShaftSearch(then=(Descend(blur=3.0), Descend(blur=1.6))),
+)
+"""From measured kinematics to a fine estimate."""
+
+FRAME: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), _FINEST, AlignEdges(), PreferStart(), Evaluate())
+"""One frame alone: the default."""
+
+OCCLUDED: tuple[Stage, ...] = (
+    *FRAME[:-3],
+    IgnoreOccluders(then=FRAME[:-3]),
+    *FRAME[-3:],
+)
+"""One frame alone, run again without what probably lies over the arms."""
+
+NONE: tuple[Stage, ...] = (Observe(), Evaluate())
+"""Nothing moves: the start is compared ("CaRTS without optimization")."""
+
+COLD: tuple[Stage, ...] = (*SEARCH, Observe(), _FINEST)
+"""A frame of a sequence that nothing is known of but its measured kinematics; `WARM` follows."""
+
+_NEAR_FINEST = Observe(margin=27, attention=27)
+
+WARM: tuple[Stage, ...] = (_NEAR_FINEST, Descend(blur=0.8, steps=2), AlignEdges())
+"""A frame of a sequence whose neighbours are known."""
+
+COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
+"""How well a given state fits a frame, in a smaller image."""
+
+CALIBRATION: tuple[Stage, ...] = (
+    _FAR,
+    Descend(blur=8.0),
+    Descend(blur=3.0),
+    Observe(),
+    Descend(blur=3.0),
+    Descend(blur=1.6),
+    Observe(),
+    _FINEST,
+)
+"""Many frames that share base frames and cameras."""
+
+FEATURES: tuple[Stage, ...] = (FirstOrder(attention=20, blur=1.6), FirstOrder())
+"""Losses of image features: a wide attention first, the final one for the second half of the iterations."""
+
+PAPER: tuple[Stage, ...] = (FirstOrder(share=1.0, blur=0.0),)
+"""The paper's: one attention, no blur."""
+
+
+def reduced(stages: tuple[Stage, ...], scale: float) -> tuple[Stage, ...]:
+    """The same stages with no observation at more than `scale` times the working image."""
+    return tuple(replace(s, scale=min(s.scale, scale)) if isinstance(s, Observe) else s for s in stages)

@@ -1,0 +1,100 @@
+"""Settings as plain data and back: what results keep, and what people write in a settings file."""
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from enum import StrEnum
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from ..errors import SettingsError
+from .stages import Stage
+
+_Settings = TypeVar("_Settings")
+_STAGES: dict[str, type] = {kind.__name__: kind for kind in get_args(Stage)}
+
+
+def to_plain(value: Any) -> Any:
+    """Settings as numbers, strings, lists and dictionaries; a stage names its kind under `stage`."""
+    if is_dataclass(value) and not isinstance(value, type):
+        kind = {"stage": type(value).__name__} if type(value).__name__ in _STAGES else {}
+        return {**kind, **{field.name: to_plain(getattr(value, field.name)) for field in fields(value)}}
+    if isinstance(value, StrEnum):
+        return value.value
+    if isinstance(value, tuple | list):
+        return [to_plain(one) for one in value]
+    return value
+
+
+def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
+    """Settings with some fields replaced by those of a table.
+
+    Args:
+        base: a settings dataclass.
+        table: field -> value, as `to_plain` writes them.
+        where: the table's name, for messages.
+
+    Raises:
+        SettingsError: a name is unknown, or a value has another type or is out of range.
+    """
+    types = get_type_hints(type(base))
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        if name not in types:
+            close = difflib.get_close_matches(name, types, 1)
+            hint = f" Did you mean {close[0]!r}?" if close else ""
+            raise SettingsError(f"{where} has no setting {name!r}.{hint} Its settings are: {', '.join(types)}.")
+        present = getattr(base, name)
+        of_stages = name == "stages" or (isinstance(present, tuple) and present and type(present[0]) in get_args(Stage))
+        values[name] = _stages(value, f"{where}.{name}") if of_stages else _like(value, present, f"{where}.{name}")
+    return replace(base, **values)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def _like(value: Any, present: Any, where: str) -> Any:
+    """A value of the type that the present one has."""
+    if isinstance(present, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(present, StrEnum) and isinstance(value, str):
+        kind = type(present)
+        if value not in set(kind):
+            raise SettingsError(f"{where} is {value!r}; allowed is {', '.join(kind)}.")
+        return kind(value)
+    if isinstance(present, tuple) and isinstance(value, list):
+        return tuple(value)
+    if type(value) is not type(present):
+        raise SettingsError(f"{where} is {value!r}; it must be a value such as {to_plain(present)!r}.")
+    return value
+
+
+def _stages(tables: Any, where: str) -> tuple[Stage, ...]:
+    if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
+        raise SettingsError(f"{where} must be a list of tables, each with a key `stage`, as `--print-settings` writes.")
+    return tuple(_stage(table, f"{where}[{index}]") for index, table in enumerate(tables))
+
+
+def _stage(table: Mapping[str, Any], where: str) -> Stage:
+    rest = dict(table)
+    name = rest.pop("stage", None)
+    if name not in _STAGES:
+        raise SettingsError(f"{where} has the stage {name!r}; allowed is {', '.join(_STAGES)}.")
+    kind = _STAGES[name]
+    known = {field.name for field in fields(kind)}
+    unknown = [key for key in rest if key not in known]
+    if unknown:
+        raise SettingsError(f"{where} ({name}) has no {unknown[0]!r}; it has {', '.join(sorted(known)) or 'nothing'}.")
+    if "then" in known:
+        rest["then"] = _stages(rest.get("then", []), f"{where}.then")
+    if name == "Descend" and "blur" not in rest:
+        raise SettingsError(f"{where} (Descend) needs a blur [px], for instance 1.6.")
+    example = _EXAMPLES.get(name) or kind()
+    values = {
+        key: _like(value, getattr(example, key), f"{where}.{key}") for key, value in rest.items() if key != "then"
+    }
+    return kind(**values, **({"then": rest["then"]} if "then" in rest else {}))
+
+
+_EXAMPLES: dict[str, Any] = {
+    "Descend": _STAGES["Descend"](blur=1.0),
+    "RandomRestart": _STAGES["RandomRestart"](then=()),
+    "ShaftSearch": _STAGES["ShaftSearch"](then=()),
+    "IgnoreOccluders": _STAGES["IgnoreOccluders"](then=()),
+}

@@ -1,0 +1,181 @@
+"""The stages that a solver is made of: plain data, in the order in which they run.
+
+A preset (`carts_core.settings.presets`) is a tuple of these; `carts_core.optimization.stages` says what each does.
+Lengths in pixels are those of the working image (`SurfaceSolver.working_width`).
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from .checks import require
+
+
+class Given(StrEnum):
+    """Which state the network is conditioned on: its rendering is an input of the network."""
+
+    START = "start"
+    """Where the run began."""
+    ESTIMATE = "estimate"
+    """The present estimate."""
+
+
+@dataclass(frozen=True)
+class Observe:
+    """Have the network predict the surface map of the images. Only this stage calls the network."""
+
+    scale: float = 1.5
+    """How many times larger than the working image the images are, up to the camera's own size [1]."""
+    given: Given = Given.ESTIMATE
+    """The state that the network is conditioned on."""
+    margin: int = 16
+    """What the network sees beyond the arms of that state [px]."""
+    attention: int = 8
+    """Distance from the arms of that state beyond which nothing counts [px]."""
+    haze: bool = True
+    """Whether what is seen through haze counts less. A search does better with all that there is."""
+
+    def __post_init__(self) -> None:
+        require(0.1 <= self.scale <= 8, "Observe.scale", self.scale, "0.1 to 8")
+        require(0 <= self.margin <= 1000, "Observe.margin", self.margin, "0 to 1000 px")
+        require(1 <= self.attention <= 1000, "Observe.attention", self.attention, "1 to 1000 px")
+
+
+@dataclass(frozen=True)
+class Descend:
+    """Levenberg-Marquardt on the surface factor under one blur."""
+
+    blur: float
+    """Deviation of the blur under which surface maps are compared [px]."""
+    robust: float = 0.5
+    """Difference of surface maps beyond which a pixel loses its weight [1]."""
+    steps: int = 6
+    """Largest number of steps [1]."""
+    tolerance: float = 1e-2
+    """The stage ends when no more than this share of the objective is to be gained [1]."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.blur <= 40, "Descend.blur", self.blur, "0 to 40 px")
+        require(1e-3 <= self.robust <= 100, "Descend.robust", self.robust, "0.001 to 100")
+        require(1 <= self.steps <= 1000, "Descend.steps", self.steps, "1 to 1000")
+        require(0 <= self.tolerance < 1, "Descend.tolerance", self.tolerance, "0 to 1")
+
+
+@dataclass(frozen=True)
+class RandomRestart:
+    """Where the fit is bad or an arm was lost: draw random states, compare them with the whole image, and descend
+    again from the best."""
+
+    then: tuple["Stage", ...]
+    """What runs from there."""
+    if_loss: float = 0.045
+    """Loss from which a fit is bad [1]."""
+    candidates: int = 64
+    """Random states per arm [1]."""
+    spread: float = 1.8
+    """Their deviation, in expected errors [1]."""
+    scale: float = 0.75
+    """Of the whole image that they are compared with, as `Observe.scale` [1]."""
+    blur: float = 8.0
+    """Under which they are compared, as `Descend.blur` [px]."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.if_loss <= 10, "RandomRestart.if_loss", self.if_loss, "0 to 10")
+        require(1 <= self.candidates <= 10_000, "RandomRestart.candidates", self.candidates, "1 to 10000")
+        require(0 < self.spread <= 10, "RandomRestart.spread", self.spread, "above 0, at most 10")
+
+
+@dataclass(frozen=True)
+class ShaftSearch:
+    """Where the fit is doubtful: move each arm along its shaft either way, observe again conditioned on that, and go
+    on from the best. A network that is conditioned on a shaft which ends too early may see it end there."""
+
+    then: tuple["Stage", ...]
+    """What runs where another place was better."""
+    if_loss: float = 0.03
+    """Loss from which a fit is doubtful [1]."""
+    step: float = 5e-3
+    """How far arms are moved [m]."""
+    blur: float = 3.0
+    """Under which places are compared, as `Descend.blur` [px]."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.if_loss <= 10, "ShaftSearch.if_loss", self.if_loss, "0 to 10")
+        require(0 < self.step <= 0.1, "ShaftSearch.step", self.step, "above 0, at most 0.1 m")
+
+
+@dataclass(frozen=True)
+class AlignEdges:
+    """Draw the outlines of the arms to edges of the image, weighed against what the network saw."""
+
+    steps: int = 24
+    """Largest number of steps [1]."""
+    weight: float = 0.3
+    """Of a squared distance from an edge, per pixel of the outline [1/px^2]."""
+
+    def __post_init__(self) -> None:
+        require(1 <= self.steps <= 1000, "AlignEdges.steps", self.steps, "1 to 1000")
+        require(0 < self.weight <= 100, "AlignEdges.weight", self.weight, "above 0, at most 100")
+
+
+@dataclass(frozen=True)
+class PreferStart:
+    """Go back to the start where it explains the image as well as the estimate. Not where a calibration is free."""
+
+    improvement: float = 5.0
+    """Least improvement of the objective that keeps the estimate [1]."""
+    ratio: float = 1.25
+    """Beyond this many times the estimate's cost, the start never explains the image as well [1]."""
+    overlap: float = 0.9
+    """Dice of both silhouettes below which the start is not tried [1]."""
+    blur: float = 0.8
+    """Under which both are compared, as `Descend.blur` [px]."""
+
+    def __post_init__(self) -> None:
+        require(0 < self.improvement <= 1e6, "PreferStart.improvement", self.improvement, "above 0, at most 1e6")
+        require(1 <= self.ratio <= 100, "PreferStart.ratio", self.ratio, "1 to 100")
+        require(0 <= self.overlap <= 1, "PreferStart.overlap", self.overlap, "0 to 1")
+
+
+@dataclass(frozen=True)
+class IgnoreOccluders:
+    """Propose what lies over the arms from what contradicts the fit, and run again without it."""
+
+    then: tuple["Stage", ...]
+    """What runs from the start again, if anything was proposed."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare the present estimate once more, for the record."""
+
+    blur: float = 0.8
+    """As `Descend.blur` [px]."""
+    robust: float = 0.5
+    """As `Descend.robust` [1]."""
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Gradient descent on a loss of image features, as in the paper."""
+
+    share: float = 0.5
+    """Of the planned iterations [1]."""
+    attention: int = 10
+    """Dilation of the silhouette [px]."""
+    blur: float = 0.6
+    """Deviation of the lens blur of the rendering before it is compared [px]."""
+
+    def __post_init__(self) -> None:
+        require(0 < self.share <= 1, "FirstOrder.share", self.share, "above 0, at most 1")
+        require(1 <= self.attention <= 400, "FirstOrder.attention", self.attention, "1 to 400 px")
+        require(0 <= self.blur <= 20, "FirstOrder.blur", self.blur, "0 to 20 px")
+
+
+Stage = (
+    Observe | Descend | RandomRestart | ShaftSearch | AlignEdges | PreferStart | IgnoreOccluders | Evaluate | FirstOrder
+)
+
+
+def first_observe(stages: tuple[Stage, ...]) -> Observe:
+    """The first observation of a solver, the default one if it has none."""
+    return next((stage for stage in stages if isinstance(stage, Observe)), Observe())

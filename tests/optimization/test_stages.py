@@ -1,0 +1,156 @@
+"""Stages of a solver, on objectives that are known in closed form and on a predictor that is always right."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from perfect_predictor import PerfectPredictor
+
+from carts_core.data import Sequence
+from carts_core.optimization import FreeParameters
+from carts_core.optimization.evaluation import Evaluation
+from carts_core.optimization.fit import Fit, StopReason
+from carts_core.optimization.frame_problem import FrameProblem
+from carts_core.optimization.stages import run_stage, run_stages
+from carts_core.optimization.variables import Variables
+from carts_core.optimization.window import Window
+from carts_core.settings import FreeParameters as Free
+from carts_core.settings import SurfaceSolver
+from carts_core.settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, PreferStart, RandomRestart, Stage
+
+
+class Bowl:
+    """Half the squared distance from a point, and a constant."""
+
+    def __init__(self, variables: Variables, minimum: torch.Tensor, floor: float = 1.0) -> None:
+        self.variables, self.minimum, self.floor = variables, minimum, floor
+        self.observed: list[Observe] = []
+
+    def observe(self, stage: Observe, offsets: torch.Tensor) -> None:
+        self.observed.append(stage)
+
+    def epoch(self, blur: float) -> tuple[int, float]:
+        return len(self.observed), blur
+
+    def evaluate(self, offsets: torch.Tensor, stage: object, *, gradient: bool = True) -> Evaluation:
+        slope = offsets - self.minimum
+        value = self.floor + 0.5 * float(slope @ slope)
+        empty = torch.zeros(1, 1, 1)
+        return Evaluation(value, value, value, 0.0, slope, torch.eye(len(offsets)), None, *(empty,) * 4)
+
+
+@pytest.fixture
+def variables(tiny_sequence: Callable[..., Path]) -> Variables:
+    sequence = Sequence.open(tiny_sequence(frames=1))
+    return Variables(sequence.scene, sequence.scene.state(sequence.frame(0).measured), FreeParameters(), 0.15)
+
+
+def run(stages: Iterable[Stage], problem: Bowl, budget: int = 60) -> tuple[Fit, int]:
+    fit = Fit(problem, torch.zeros_like(problem.variables.lower), budget)
+    return fit, len(list(run_stages(tuple(stages), fit)))
+
+
+def bowl(variables: Variables, promise: float) -> Bowl:
+    """The first step there promises about this share of the value."""
+    minimum = torch.zeros_like(variables.lower)
+    minimum[0] = (2.0 * promise) ** 0.5
+    return Bowl(variables, minimum)
+
+
+def test_a_descent_ends_when_no_more_than_its_tolerance_is_to_be_gained(variables: Variables) -> None:
+    assert run([Descend(1.0, tolerance=0.06)], bowl(variables, 0.03))[1] == 1
+    fit, steps = run([Descend(1.0, tolerance=0.01)], bowl(variables, 0.03))
+    assert steps > 1 and fit.stop_reason is StopReason.CONVERGED
+    assert float(fit.offsets[0]) == pytest.approx(0.06**0.5, abs=0.1)
+
+
+def test_after_a_restart_coarse_stages_end_as_late_as_fine_ones(variables: Variables) -> None:
+    fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
+    fit.restart(torch.zeros_like(variables.lower))
+    assert len(list(run_stage(Descend(1.0, tolerance=0.06), fit))) > 1
+
+
+def test_no_stage_runs_when_all_evaluations_are_used_up(variables: Variables) -> None:
+    problem = bowl(variables, 10.0)
+    fit, steps = run([Descend(1.0, steps=3), Observe(), Descend(1.0), Observe()], problem, budget=3)
+    assert steps == 3 and fit.exhausted and fit.stop_reason is StopReason.ITERATIONS
+    assert problem.observed == []
+
+
+def test_a_descent_never_passes_a_joint_limit(variables: Variables) -> None:
+    problem = Bowl(variables, variables.upper + 1.0)
+    fit, _ = run([Descend(1.0, steps=60, tolerance=0.0)], problem)
+    assert (fit.offsets <= variables.upper).all()
+    torch.testing.assert_close(fit.offsets, variables.upper)
+
+
+def test_the_end_has_the_deviation_of_the_descent_before_it(variables: Variables) -> None:
+    fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
+    *_, descended, end = run_stages((Descend(1.0), Evaluate()), fit)
+    assert end.epoch[-1] == "end"
+    assert fit.reached is not None and end.evaluation.gradient is fit.reached.evaluation.gradient
+    assert descended.epoch != end.epoch, "the end replaces the best point, whatever its loss"
+
+
+def test_what_is_no_stage_is_refused(variables: Variables) -> None:
+    with pytest.raises(TypeError, match="is no stage"):
+        run_stage("dance", Fit(bowl(variables, 1.0), torch.zeros_like(variables.lower), 60))
+
+
+def frame_fit(tiny_sequence: Callable[..., Path], free: Free, off: np.ndarray) -> Fit:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
+    frame, scene = sequence.frame(0), sequence.scene
+    truth = (frame.truth or {})["PSM1"]
+    predictor = PerfectPredictor(sequence, scene.state({"PSM1": truth}))
+    settings = SurfaceSolver(dehaze=0.0)
+    state = scene.state({"PSM1": truth + off})
+    variables = Variables(scene, state, free, settings.length_scale)
+    problem = FrameProblem(scene, frame.images, predictor, variables, settings, live=False)
+    return Fit(problem, problem.start, settings.iterations)
+
+
+def test_only_observe_calls_the_predictor(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    predict = PerfectPredictor.predict
+    monkeypatch.setattr(PerfectPredictor, "predict", lambda *given: calls.append(1) or predict(*given))
+    fit = frame_fit(tiny_sequence, Free(), np.zeros(7))
+    list(run_stages((Observe(), Descend(3.0), Descend(1.6), AlignEdges(), Evaluate()), fit))
+    assert len(calls) == 1
+
+
+def test_a_network_can_be_conditioned_on_the_start_or_on_the_estimate(
+    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = []
+    predict = PerfectPredictor.predict
+
+    def watched(own: PerfectPredictor, images: torch.Tensor, maps: torch.Tensor, window: Window) -> torch.Tensor:
+        given.append(maps)
+        return predict(own, images, maps, window)
+
+    monkeypatch.setattr(PerfectPredictor, "predict", watched)
+    fit = frame_fit(tiny_sequence, Free(), np.deg2rad([2.0, -2.0, 0, 0, 0, 0, 0]))
+    list(run_stages((Observe(), Descend(8.0), Observe(given=Given.START), Observe()), fit))
+    assert torch.equal(given[0], given[1])
+    assert not torch.equal(given[0], given[2])
+
+
+def test_a_random_restart_happens_only_where_the_fit_is_bad(tiny_sequence: Callable[..., Path]) -> None:
+    restart = RandomRestart(then=(Descend(8.0),), candidates=4)
+    fit = frame_fit(tiny_sequence, Free(), np.zeros(7))
+    list(run_stages((Observe(), Descend(3.0), restart), fit))
+    assert fit.restarts == 0
+    again = frame_fit(tiny_sequence, Free(), np.zeros(7))
+    list(run_stages((Observe(), Descend(3.0), replace(restart, if_loss=0.0)), again))
+    assert again.restarts == 1
+
+
+def test_the_start_is_never_preferred_where_a_calibration_is_free(tiny_sequence: Callable[..., Path]) -> None:
+    stages = (Observe(), Descend(0.8), PreferStart(), Evaluate())
+    for free, reason in ((Free(), StopReason.START_KEPT), (Free(base_frames=True), StopReason.CONVERGED)):
+        fit = frame_fit(tiny_sequence, free, np.zeros(7))
+        list(run_stages(stages, fit))
+        assert fit.stop_reason is reason
