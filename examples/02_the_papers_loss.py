@@ -16,7 +16,7 @@ from carts_core.data import Sequence
 from carts_core.evaluation import dice
 from carts_core.export import image_and_mask, outlined
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FrameOptimizer, OptimizerSettings
+from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
 from carts_core.perturbation import perturb
 from carts_core.process import tune_process
 from carts_core.rendering import Renderer
@@ -35,7 +35,7 @@ def main(iterations: int = 20, picture: Path = Path("paper.png")) -> None:
     extractor, renderer = FeatureExtractor.load(), Renderer(sequence.scene)
 
     pictures = []
-    for name, settings in (("paper", OptimizerSettings.paper(iterations)), ("default", OptimizerSettings())):
+    for name, settings in (("paper", DescentSolver.paper(iterations)), ("default", SurfaceSolver())):
         optimizer = FrameOptimizer(sequence.scene, frame, background, extractor, start=start, settings=settings)
         iterates = list(optimizer)
         assert optimizer.best is not None

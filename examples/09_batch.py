@@ -15,7 +15,7 @@ from carts_core.data import Sequence, spread
 from carts_core.errors import CartsError
 from carts_core.evaluation import FrameScore, evaluate
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import FreeParameters, OptimizerSettings
+from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
 
@@ -39,7 +39,7 @@ def main(
                 frames=spread(len(sequence), frames),
                 cameras=[camera.name for camera in sequence.scene.cameras],
                 domains=[domain for domain in sequence.domains if domain in domains] or [sequence.domains[0]],
-                settings=OptimizerSettings(),
+                settings=SurfaceSolver(),
                 free=FreeParameters(),
                 perturb_deg=2.0,
             )

@@ -12,7 +12,7 @@ from carts_core.evaluation import start_positions
 from carts_core.features.extractor import FeatureExtractor
 from carts_core.optimization import FrameOptimizer
 from carts_core.resources import sample_sequence
-from carts_core.settings import OptimizerSettings
+from carts_core.settings import SurfaceSolver
 from carts_core.threads import one_thread, total
 
 
@@ -33,7 +33,7 @@ def corrected(sequence: Sequence, index: int, threads: int, iterations: int) -> 
         {},
         FeatureExtractor.load(),
         start=start_positions(sequence, frame, 5.0, 0),
-        settings=OptimizerSettings(iterations=iterations),
+        settings=SurfaceSolver(iterations=iterations),
         live=False,
     )
     for _ in optimizer:

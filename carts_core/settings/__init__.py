@@ -21,6 +21,17 @@ from .optimization import SurfaceSolver as SurfaceSolver
 from .optimization import solver as solver
 from .sequence import Direction as Direction
 from .sequence import SequenceSettings as SequenceSettings
+from .stages import AlignEdges as AlignEdges
+from .stages import Descend as Descend
+from .stages import Evaluate as Evaluate
+from .stages import FirstOrder as FirstOrder
+from .stages import Given as Given
+from .stages import IgnoreOccluders as IgnoreOccluders
+from .stages import Observe as Observe
+from .stages import PreferStart as PreferStart
+from .stages import RandomRestart as RandomRestart
+from .stages import ShaftSearch as ShaftSearch
+from .stages import Stage as Stage
 from .synthesis import DOMAINS as DOMAINS
 from .synthesis import DomainConfig as DomainConfig
 from .synthesis import EndoscopeConfig as EndoscopeConfig

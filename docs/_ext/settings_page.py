@@ -48,6 +48,8 @@ def _default(field: dataclasses.Field) -> str:
         return "required"
     if dataclasses.is_dataclass(value):
         return f"{type(value).__name__}(...)"
+    if isinstance(value, tuple) and value and all(dataclasses.is_dataclass(one) for one in value):
+        return f"({', '.join(type(one).__name__ for one in value)})"
     return value.name if hasattr(value, "parent") and hasattr(value, "name") else repr(value)
 
 
