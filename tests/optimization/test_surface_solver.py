@@ -378,7 +378,7 @@ def test_an_arm_that_is_seen_to_end_too_early_is_searched_along_its_shaft(index:
     # As a small image and long first steps do not have it end too early in these frames.
     far = Observe(margin=27, attention=27, haze=False)
     descents = (Descend(8.0), Descend(3.0))
-    restart = RandomRestart(then=(Descend(8.0), far, Descend(3.0)), scale=1.5)
+    restart = RandomRestart(then=descents, scale=1.5)
     stages = (far, *descents, restart, Observe(), Descend(3.0), Descend(1.6))
     end = (AlignEdges(), Observe(), Descend(0.8), AlignEdges(), PreferStart(), Evaluate())
     found = {}

@@ -101,16 +101,16 @@ class EdgeFactor:
             weight: of a squared distance, per pixel of the outline [1/px^2].
         """
         near = functional.interpolate(coverage[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)
-        return LocalEdgeFactor(self, offsets, weight * attention(near, _NEAR) * self._shown)
+        return LocalEdgeFactor(self, offsets, attention(near, _NEAR) * self._shown, weight)
 
-    def equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> Linearization:
+    def equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"], edge_weight: float) -> Linearization:
         """The quadratic model of outlines as they are, where pixels of the images count that much."""
         distance, weight = self._nearest(outline)
         column, row = outline.position.round().long()
         weight = weight * counts[outline.camera, 0, row, column] * self._share[outline.parts]
         weight = weight / (1.0 + (distance / _ROBUST).square()).square()
-        weighted = weight * outline.motion
-        cost = 0.5 * float((weight * distance.square()).sum())
+        weighted = edge_weight * weight * outline.motion
+        cost = 0.5 * edge_weight * float((weight * distance.square()).sum())
         return Linearization(cost, -weighted @ distance, weighted @ outline.motion.T)
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
@@ -143,8 +143,8 @@ class LocalEdgeFactor:
     Outlines that move little are moved as they say they do; rendering them anew is what costs time.
     """
 
-    def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor) -> None:
-        self._factor, self._counts = factor, counts
+    def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:
+        self._factor, self._counts, self._weight = factor, counts, weight
         self._tangents = factor.renderer.tangents(factor.variables.around(offsets), APART)
         self._render(offsets)
 
@@ -156,7 +156,7 @@ class LocalEdgeFactor:
         """The quadratic model around a point."""
         if self._outline.moved_by(offsets - self._rendered_at) > _RENDERED_ANEW:
             self._render(offsets)
-        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts)
+        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
 
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
         """How far outlines move with a step [px]."""
