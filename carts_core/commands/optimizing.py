@@ -142,7 +142,7 @@ class Optimizing:
             return replace(frame, measured=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed))
 
         backgrounds = Backgrounds.of(
-            sequence, part.cameras, part.domain, required=asked.optimizer.needs_background and asked.mode == "frame"
+            sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
         )
         load = starts.frame if asked.mode == "sequence" else load
         return Origins(sequence, part.cameras, self._extractor, load, backgrounds.images)

@@ -23,7 +23,7 @@ class Uncertainty:
     """How well each unknown is known after an optimization."""
 
     names: tuple[str, ...]
-    """As in `ParameterVector.names`, such as `PSM1/yaw`."""
+    """As in `Variables.names`, such as `PSM1/yaw`."""
     std: tuple[float, ...]
     """Standard deviation [rad], [m] for prismatic joints and translations."""
     expected: tuple[float, ...]

@@ -131,7 +131,16 @@ def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path)
 def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["optimize", str(sequence), "--output", str(tmp_path / "out"), "--mode", "sequence", "--iterations", "2"]
+    command = [
+        "optimize",
+        str(sequence),
+        "--output",
+        str(tmp_path / "out"),
+        "--mode",
+        "sequence",
+        "--settings",
+        "iterations=2",
+    ]
     main(command)
     image_changed(tmp_path)
     capsys.readouterr()

@@ -58,7 +58,7 @@ def check_results(folder: Path) -> int:
 def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_been_stopped(
     sequence: Path, tmp_path: Path, mode: str, number: signal.Signals, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["optimize", str(sequence), "--mode", mode, "--iterations", "8", "--output"]
+    command = ["optimize", str(sequence), "--mode", mode, "--settings", "iterations=8", "--output"]
     main([*command, str(tmp_path / "whole")])
     folder = tmp_path / "stopped" / "regular" / "left"
     sign = folder / ("results.json" if mode == "frame" else "checkpoint.txt")
@@ -123,7 +123,7 @@ def forked(log: Path) -> Iterator[Callable[[list[str], float, int], tuple[int, s
 
 
 def campaigns(sequence: Path, folder: Path) -> list[Campaign]:
-    optimize = ["optimize", str(sequence), "--iterations", "8", "--output"]
+    optimize = ["optimize", str(sequence), "--settings", "iterations=8", "--output"]
     few = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
     made = {
         "frame": [*optimize, str(folder / "frame")],
