@@ -159,8 +159,8 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
     assert [entry.stopped for entry in first] == ["cold", "warm"]
     starts = [entry.start for entry in first]
     assert all(start and start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) for start in starts)
-    lines = benchmark.results.path.read_bytes().splitlines(keepends=True)
-    benchmark.results.path.write_bytes(lines[0])
+    lines = benchmark.results.path.path.read_bytes().splitlines(keepends=True)
+    benchmark.results.path.path.write_bytes(lines[0])
     results = ResultsFile(benchmark.results.path)
     again = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, results, runs)
     again.run(QUIET)
@@ -170,7 +170,7 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
 
 def _one(benchmark: Benchmark) -> Measurement:
     run = next(iter(benchmark.runs))
-    bench = _Bench(benchmark.sources[run.source], runner.Progress(console=QUIET))
+    bench = _Bench(benchmark.sources[run.source], runner.Bar(console=QUIET))
     return bench.measure([run], benchmark.scope, benchmark.extractor)[0]
 
 
