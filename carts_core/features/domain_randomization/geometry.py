@@ -26,17 +26,34 @@ class Body(Protocol):
     """Triangles that can be rasterised and shaded; see `RobotGeometry` for the attributes."""
 
     @property
-    def vertices(self) -> Float[np.ndarray, "V 3"]: ...
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Of all parts, each in the frame of its link [m]."""
+        ...
+
     @property
-    def faces(self) -> Int[np.ndarray, "F 3"]: ...
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        """Triangles."""
+        ...
+
     @property
-    def face_part(self) -> Int[np.ndarray, " F"]: ...
+    def face_part(self) -> Int[np.ndarray, " F"]:
+        """Index of the part that a triangle belongs to."""
+        ...
+
     @property
-    def shaft(self) -> int: ...
+    def shaft(self) -> int:
+        """Index of the longest part."""
+        ...
+
     @property
-    def shaft_axis(self) -> Float[np.ndarray, "3"]: ...
+    def shaft_axis(self) -> Float[np.ndarray, "3"]:
+        """Unit vector along the shaft, pointing away from the tip."""
+        ...
+
     @property
-    def shaft_end(self) -> Float[np.ndarray, "3"]: ...
+    def shaft_end(self) -> Float[np.ndarray, "3"]:
+        """The shaft's end at the tip [m]."""
+        ...
 
 
 class RobotGeometry:
