@@ -17,6 +17,7 @@ from .extras import needs_extra
 from .files.reading import CALIBRATION, MESH, open_regular, read_text
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI, PsmGeometry
+from .recording.yaml_files import parse_yaml
 from .wording import counted
 
 PACKAGE = "dvrk_model"
@@ -52,9 +53,6 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
     Raises:
         RobotError: it is no such folder.
     """
-    needs_extra("yaml", "import")
-    import yaml  # noqa: PLC0415
-
     table = model / _TABLE
     if not table.is_file():
         raise RobotError(
@@ -62,7 +60,7 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
             "`urdf` and `meshes` (https://github.com/jhu-dvrk/dvrk_model)."
         )
     try:
-        entries = yaml.safe_load(read_text(table, CALIBRATION))["instruments"]
+        entries = parse_yaml(read_text(table, CALIBRATION))["instruments"]
         return {
             str(number): Instrument(
                 str(number),
@@ -73,7 +71,7 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
             )
             for number, entry in entries.items()
         }
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RobotError(f"{table} is not a table of instruments ({error!r}). Check out dvrk_model again.") from error
 
 

@@ -155,7 +155,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(model, tmp_path):
     assert output.read_text().startswith("<robot")
 
 
-@pytest.mark.parametrize("content", ["[1", "instruments: 3", "instruments: {'400006': {}}", "\xff"])
+@pytest.mark.parametrize("content", ["[1", "[" * 50_000, "instruments: 3", "instruments: {'400006': {}}", "\xff"])
 def test_a_tree_without_a_readable_table_is_refused(model, content):
     (model / "urdf/common/instruments/instruments.yaml").write_bytes(content.encode("latin-1"))
     with pytest.raises(RobotError, match="not a table of instruments"):

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import SequenceError
-from ..extras import needs_extra
 from ..files.reading import CALIBRATION, VALUES, is_regular, parse_json, read_text
 from ..settings.importing import ImportOptions
 from .found import FoundCamera, Note
+from .yaml_files import parse_yaml
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _KINDS = (
@@ -149,15 +149,9 @@ def with_calibration_file(camera: FoundCamera, path: Path) -> FoundCamera:
 
 
 def _yaml(path: Path) -> Any:
-    needs_extra("yaml", "import")
-    import yaml  # noqa: PLC0415
-
     # OpenCV's files begin with a directive that is not YAML, and tag their matrices.
     text = re.sub(r"^%YAML.*$", "", read_text(path, CALIBRATION), flags=re.MULTILINE).replace("!!opencv-matrix", "")
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from error
+    return parse_yaml(text)
 
 
 def _from_names(camera: FoundCamera, content: dict[str, Any], path: Path) -> FoundCamera:

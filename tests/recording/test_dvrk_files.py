@@ -64,6 +64,7 @@ def test_a_file_that_does_not_say_its_axes_is_asked_about(tmp_path):
     [
         ("[1, 2", "not readable JSON"),
         ("[]", "has no base frame"),
+        ("[" * 100_000, "not readable JSON"),
         ('{"arms": []}', "has no base frame"),
         ('{"arms": {"name": "PSM1"}}', "has no base frame"),
         ('{"arms": [{"name": "PSM1", "base_frame": 5}]}', "shape"),

@@ -13,13 +13,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
-from ...extras import needs_extra
 from ...files.reading import TABLE, VALUES, read_text
 from ...settings.importing import ImportOptions
 from ..assembling import by_rows, cameras_of
 from ..found import FoundArm, FoundCamera, FoundRecording, Note
 from ..logs import ArmLog, arm_from_log, track
 from ..media import common_ids, find_images, image_files
+from ..yaml_files import parse_yaml
 from .protocol import Source
 
 _JIGSAWS_COLUMNS = 76
@@ -79,13 +79,10 @@ def _read_surgpose(path: Path, options: ImportOptions) -> FoundRecording:
 
 
 def _yaml_rows(file: Path) -> dict[int, dict]:
-    needs_extra("yaml", "import")
-    import yaml  # noqa: PLC0415
-
     try:
-        content = yaml.load(read_text(file, VALUES), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        content = parse_yaml(read_text(file, VALUES))
         return {int(frame): dict(row) for frame, row in content.items()}
-    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, TypeError, ValueError) as error:
         text = " ".join(str(error).split())
         raise SequenceError(f"{file} is no YAML file of frames with joints by arm ({text}). Copy it again.") from error
 

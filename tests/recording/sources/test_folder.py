@@ -206,6 +206,8 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
     "fisheye": (rewrite("left.yaml", "plumb_bob", "equidistant"), {}, "distortion model 'equidistant'"),
     "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
+    "nested lists": (lambda f: (f / "left.yaml").write_text("camera_matrix: " + "[" * 50_000), {}, "levels deep"),
+    "nested dashes": (lambda f: (f / "left.yaml").write_text("camera_matrix:\n  " + "- " * 50_000), {}, "levels deep"),
     "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
     "other size": (rewrite("left.yaml", "image_height: 72", "image_height: 20"), {}, "another shape"),
     "missing folder": (lambda folder: None, {"images": {"left": "nothing"}}, "nothing has no images"),
