@@ -198,7 +198,7 @@ class Runner:
             best, reason = run.best(), run.stop_reason
             if best is not None:
                 self._accept(run, best)
-            self.end(_REASONS.get(reason or "", reason))
+            self.end(run.verdict() or _REASONS.get(reason or "", reason))
             self._set(base_frame_gain=run.base_frame_gain())
             return
         self._accept(run, iterate)

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from carts_core.data import Sequence as Recording
 from carts_core.features import FeatureExtractor
 from carts_core.optimization import (
+    Assessment,
     Backgrounds,
     FrameEstimate,
     FrameOptimizer,
@@ -20,6 +21,8 @@ from carts_core.optimization import (
     SequenceOptimizer,
     SequenceSettings,
     SolverSettings,
+    StopReason,
+    Verdict,
 )
 from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
@@ -39,6 +42,10 @@ class Optimizer(Protocol):
     @property
     def stop_reason(self) -> str | None:
         """Why there are no more iterates, None before."""
+
+    @property
+    def assessment(self) -> Assessment | None:
+        """At the end, how far the result is to be believed; None before, and where it is not assessed."""
 
     def step(self) -> Iterate | None:
         """The next iterate, the start itself at first; None when there are no more."""
@@ -236,6 +243,14 @@ class ActiveRun:
     def best(self) -> Iterate | None:
         """The best iterate so far: of the present look, the one of the lowest loss; at the end, the last."""
         return self._optimizer.best
+
+    def verdict(self) -> str | None:
+        """At the end, for people, why the result is not to be believed and what to try; None where it is."""
+        found = self._optimizer.assessment
+        if found is None or found.verdict is Verdict.GOOD:
+            return None
+        kept = " The start was kept." if self.stop_reason in (StopReason.FAILED, StopReason.START_KEPT) else ""
+        return f"{found.verdict.value.capitalize()}: {found.reason}{kept} {found.remedy}"
 
     def base_frame_gain(self) -> float | None:
         """At the end, what free base frames would explain of the difference that is left [1]; None if not known."""

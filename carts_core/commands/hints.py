@@ -1,12 +1,15 @@
 """What a command suggests after its results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
 
-from ..optimization import BASE_FRAME_GAIN
+from ..optimization import BASE_FRAME_GAIN, Assessment, Verdict
 from ..wording import counted
+
+_NAMED = 5
+"""Frames that a hint names."""
 
 
 def print_hints(console: Console, *hints: str | None) -> None:
@@ -30,6 +33,24 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
         f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}, as the image hardly speaks against "
         "it there."
     )
+
+
+def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
+    """A line for each reason why results are not to be believed, or only in part.
+
+    Args:
+        where: as below.
+        assessed: id of each frame -> how far its result is to be believed.
+    """
+    frames: dict[tuple[str, str, str], list[str]] = {}
+    for frame_id, found in assessed.items():
+        if found is not None and found.verdict is not Verdict.GOOD:
+            frames.setdefault((found.verdict.value, found.reason, found.remedy), []).append(frame_id)
+    return [
+        f"{where}: {verdict} in {len(ids)} of {counted(len(assessed), 'frame')} ({', '.join(ids[:_NAMED])}"
+        f"{', ...' if len(ids) > _NAMED else ''}). {reason} {remedy}"
+        for (verdict, reason, remedy), ids in frames.items()
+    ]
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:

@@ -17,13 +17,13 @@ from ..export import KinematicsRow, read_kinematics_csv
 from ..features.extractor import FeatureExtractor
 from ..files import remove_file
 from ..fingerprints import fingerprint
-from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, sequence_checkpoint
+from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
 from .frame_folder import FrameFolder, FrameResult
-from .hints import base_frame_hint, kept_start_hint, print_hints
+from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_hints
 from .optimize import Optimize
 from .origins import Origin, Origins
 from .selection import output_folder
@@ -160,7 +160,7 @@ class Optimizing:
         if not todo:
             return
         backgrounds = Backgrounds.of(sequence, cameras, domain, required=self._solver.needs_background)
-        stopped, gains = [], []
+        stopped, gains, assessed = [], [], {}
         for index in track(todo, part.name, console=self._console, disable=not todo):
             frame = sequence.frame(index, domain, cameras)
             optimizer = FrameOptimizer(
@@ -178,7 +178,9 @@ class Optimizing:
                 pass
             best = optimizer.best
             assert best is not None and optimizer.stop_reason is not None
-            row = KinematicsRow(frame.frame_id, "optimized", best.joint_positions(), best.joint_std())
+            assessed[frame.frame_id] = optimizer.assessment
+            source = "measured" if optimizer.stop_reason is StopReason.FAILED else "optimized"
+            row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std())
             part.output.write([FrameResult(row, best.state, origins[index])])
             stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
@@ -187,6 +189,7 @@ class Optimizing:
             kept_start_hint(part.name, stopped),
             base_frame_hint(part.name, gains),
             *backgrounds.problems,
+            *verdict_hints(part.name, assessed),
         )
 
     def _as_sequence(self, part: _Part, origins: Mapping[int, Origin], common: Origin) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import Backgrounds, FrameOptimizer, FreeParameters, SolverSettings
+from ..optimization import Assessment, Backgrounds, FrameOptimizer, FreeParameters, SolverSettings
 from ..perturbation import perturb
 from ..rendering import Renderer
 from ..scene import SceneState
@@ -34,6 +34,10 @@ class FrameScore:
     """Why the optimization ended, or in sequence mode where the frame's values come from."""
     joint_std_deg: float | None = None
     """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
+    verdict: str | None = None
+    """good, doubtful or failed, as far as the image tells; None where it is not assessed."""
+    reason: str | None = None
+    """Of the verdict, one sentence."""
     base_frame_gain: float | None = None
     """What free base frames would explain of the remaining difference [1]; None where it is not known."""
 
@@ -82,7 +86,7 @@ def evaluate(
                 seconds = (time.perf_counter() - began) / len(group)
                 best = optimizer.best
                 assert best is not None and optimizer.stop_reason is not None
-                gain = optimizer.base_frame_gain()
+                gain, assessed = optimizer.base_frame_gain(), optimizer.assessment
                 for camera, renderer in renderers.items():
                     yield frame_score(
                         sequence,
@@ -97,6 +101,7 @@ def evaluate(
                         seconds,
                         optimizer.stop_reason,
                         gain,
+                        assessed,
                     )
 
 
@@ -129,6 +134,7 @@ def frame_score(
     seconds: float,
     stopped: str,
     base_frame_gain: float | None = None,
+    assessment: Assessment | None = None,
 ) -> FrameScore:
     """Compare an estimate of a frame with the truth.
 
@@ -138,6 +144,7 @@ def frame_score(
         start: arm name -> joint positions before [rad, m].
         state, joint_positions, joint_std: after.
         iterations, seconds, stopped, base_frame_gain: as in the score.
+        assessment: how far the estimate is to be believed, where it is assessed.
     """
     mask = (frame.masks or {}).get(camera)
     truth = frame.truth or {}
@@ -161,6 +168,8 @@ def frame_score(
         stopped=stopped,
         joint_std_deg=joint_std_deg(sequence.scene, joint_std, sequence.measured_joints),
         base_frame_gain=base_frame_gain,
+        verdict=None if assessment is None else assessment.verdict.value,
+        reason=None if assessment is None else assessment.reason,
     )
 
 

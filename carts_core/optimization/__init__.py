@@ -24,16 +24,21 @@ from .resumable import sequence_checkpoint as sequence_checkpoint
 from .sequence import FrameEstimate as FrameEstimate
 from .sequence import Origin as Origin
 from .sequence import SequenceOptimizer as SequenceOptimizer
+from .verdict import Assessment as Assessment
+from .verdict import Evidence as Evidence
+from .verdict import Verdict as Verdict
 
 __all__ = [
     "BASE_FRAME_GAIN",
     "CALIBRATION",
     "CALIBRATION_SETTINGS",
+    "Assessment",
     "Backgrounds",
     "CalibrationIterate",
     "CalibrationOptimizer",
     "CalibrationResult",
     "DescentSolver",
+    "Evidence",
     "FrameEstimate",
     "FrameOptimizer",
     "FreeParameters",
@@ -48,5 +53,6 @@ __all__ = [
     "SurfacePredictor",
     "SurfaceSolver",
     "UnknownChange",
+    "Verdict",
     "propose_ignore",
 ]

@@ -20,6 +20,8 @@ class StopReason(StrEnum):
     CONVERGED = "converged"
     ITERATIONS = "iterations"
     START_KEPT = "start kept"
+    FAILED = "failed"
+    """The image contradicts the estimate, so the start is kept."""
     NOT_OPTIMIZED = "not optimized"
     CANCELLED = "cancelled"
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
+from ..settings.stages import Evaluate
 from .base_frame_gain import base_frame_gain
 from .counterfactual import Backgrounds
 from .evaluation import Evaluation
@@ -24,6 +25,7 @@ from .observability import Uncertainty
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
 from .variables import Variables
+from .verdict import Assessment, Verdict, assess, evidence
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,10 @@ class FrameOptimizer:
         # A descent evaluates where its last step leads.
         budget = self.settings.iterations + int(isinstance(self._problem, FeatureProblem))
         self._fit = Fit(self._problem, torch.zeros_like(self._variables.lower), budget)
-        self._points = run_stages(self.settings.stages, self._fit)
+        self._points = self._judged(run_stages(self.settings.stages, self._fit))
+        self.assessment: Assessment | None = None
+        """At the end, how far the result is to be believed; None before, and for solvers other than `SurfaceSolver`.
+        What failed keeps its start, unless the image speaks against that even more."""
 
     @property
     def proposed(self) -> dict[str, Bool[np.ndarray, "h w"]]:
@@ -167,6 +172,29 @@ class FrameOptimizer:
         if self.best is None or self._improves(point):
             self.best, self._best_point = iterate, point
         return iterate
+
+    def _judged(self, points: Iterator[Point]) -> Iterator[Point]:
+        """The points of the stages, and the start where the image contradicts what they end with."""
+        yield from points
+        last, problem, fit = self._best_point, self._problem, self._fit
+        stages = [stage for stage in self.settings.stages if isinstance(stage, Evaluate)]
+        if last is None or not stages or not isinstance(problem, FrameProblem):
+            return
+        self.assessment = self._assess(problem, last)
+        if self.assessment.verdict is not Verdict.FAILED or not bool(last.offsets.any()):
+            return
+        ended, fit.offsets = fit.offsets, torch.zeros_like(fit.offsets)
+        start = replace(fit.evaluate(stages[-1]), epoch=(*last.epoch, "start"))
+        if self.assessment.nothing_there or self._assess(problem, start).probability <= self.assessment.probability:
+            fit.stop_reason = StopReason.FAILED
+            yield start
+        else:
+            fit.offsets = ended
+
+    def _assess(self, problem: FrameProblem, point: Point) -> Assessment:
+        """The verdict on a point."""
+        start, end = (self._variables.state(at) for at in (torch.zeros_like(point.offsets), point.offsets))
+        return assess(evidence(problem.images(1.0), start, end, problem.predictor, point.evaluation.loss))
 
     def _improves(self, point: Point) -> bool:
         """Whether a point replaces the best one: it is better, or the two do not compare because it knows more."""

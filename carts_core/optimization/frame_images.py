@@ -32,6 +32,8 @@ class FrameImages:
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
     """Share of what is seen of arms that the empty background shows as well [1]; None where that is not known."""
+    changed: Float[Tensor, "cameras 1 h w"] | None
+    """How surely each pixel differs from the empty background [1]; None where that is not known."""
     renderer: Renderer
     """Of the whole image."""
 
@@ -65,7 +67,7 @@ class FrameImages:
         unit, _ = working_size(scene, working_width, predictor.stride)
         size = working_size(scene, round(working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
-        through, explained = transmission(stacked, dehaze), None
+        through, explained, changed = transmission(stacked, dehaze), None, None
         if backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, dehaze, predictor)
             changed = background.changed(stacked, size[0] / unit)
@@ -81,5 +83,6 @@ class FrameImages:
             # Smoke misleads the network by more than noise does: docs/experiments.
             certainty=certainty(through).square(),
             explained=explained,
+            changed=changed,
             renderer=Renderer(scene, width=size[0], height=size[1], device=predictor.device),
         )

@@ -68,7 +68,7 @@ class FrameProblem:
     ) -> None:
         self.scene, self.variables, self.settings = scene, variables, settings
         self.prior = prior or variables.prior(settings)
-        self._predictor, self._backgrounds, self._live = predictor, backgrounds, live
+        self.predictor, self._backgrounds, self._live = predictor, backgrounds, live
         self._given: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]] = images, ignore or {}
         self._ignore = ignore or {}
         self._images: dict[float, FrameImages] = {}
@@ -104,7 +104,7 @@ class FrameProblem:
                 scale=scale,
                 working_width=self.settings.working_width,
                 dehaze=self.settings.dehaze,
-                predictor=self._predictor,
+                predictor=self.predictor,
                 backgrounds=self._backgrounds,
             )
         return self._images[scale]
@@ -119,7 +119,7 @@ class FrameProblem:
         """Have the predictor look at the images, conditioned on the start or on an estimate."""
         given = self.start if stage.given is Given.START else offsets
         state = self.variables.state(given)
-        self.observation = observe(self.images(stage.scale), self._predictor, state, stage, whole=whole)
+        self.observation = observe(self.images(stage.scale), self.predictor, state, stage, whole=whole)
 
     def ignore_occluders(self, evaluation: Evaluation) -> bool:
         """Leave out what probably lies over the arms, from a fit's evaluation; False if nothing does."""
@@ -213,7 +213,7 @@ class FrameProblem:
                 self._given[1],
                 working_width=self.settings.working_width,
                 dehaze=self.settings.dehaze,
-                device=self._predictor.device,
+                device=self.predictor.device,
             )
         model = Linearization(known.value, known.gradient, known.hessian)
         return align_edges(self._edges, stage, offsets, model, self.observation.whole_coverage())

@@ -1,0 +1,128 @@
+"""What a fit is said to be worth, and what becomes of one that failed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.commands.hints import verdict_hints
+from carts_core.data import Sequence
+from carts_core.evaluation import evaluate
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, SurfaceSolver, Verdict
+from carts_core.optimization.verdict import assess
+
+CONVINCING = Evidence(
+    area=0.05,
+    start_area=0.05,
+    loss=0.01,
+    residual=0.05,
+    agreement=0.95,
+    unconditioned=0.93,
+    predicted=0.95,
+    changed=0.97,
+    overlap_with_change=0.85,
+)
+CONTRADICTED = replace(
+    CONVINCING,
+    loss=0.2,
+    residual=0.8,
+    agreement=0.4,
+    unconditioned=0.1,
+    predicted=0.1,
+    changed=0.2,
+    overlap_with_change=0.1,
+)
+
+
+@pytest.fixture(scope="module")
+def extractor() -> FeatureExtractor:
+    return FeatureExtractor.load()
+
+
+@pytest.fixture
+def shipped(sample_sequence_path: Path) -> Sequence:
+    return Sequence.open(sample_sequence_path)
+
+
+def _unknown_background(found: Evidence) -> Evidence:
+    return replace(found, changed=None, overlap_with_change=None)
+
+
+@pytest.mark.parametrize("of", [lambda found: found, _unknown_background])
+def test_what_all_evidence_supports_is_good_and_what_it_contradicts_has_failed(of: Callable[..., Evidence]) -> None:
+    good, bad = assess(of(CONVINCING)), assess(of(CONTRADICTED))
+    assert good.verdict is Verdict.GOOD and good.remedy == "" and good.probability < 0.1
+    assert bad.verdict is Verdict.FAILED and bad.remedy and bad.probability > 0.5
+
+
+def test_no_arm_in_view_is_said_whatever_else_speaks_for_the_fit() -> None:
+    found = assess(replace(CONVINCING, start_area=0.0))
+    assert found.verdict is Verdict.FAILED and found.nothing_there
+    assert found.reason.startswith("No arm is in view") and "T_camera_world" in found.remedy
+
+
+def test_an_image_like_the_empty_background_shows_no_arm() -> None:
+    found = assess(replace(CONVINCING, changed=0.0, overlap_with_change=0.0))
+    assert found.verdict is Verdict.FAILED and found.nothing_there and "empty background" in found.reason
+
+
+def test_a_verdict_grows_worse_with_the_evidence() -> None:
+    order = [Verdict.GOOD, Verdict.DOUBTFUL, Verdict.FAILED]
+    names = ("loss", "residual", "agreement", "unconditioned", "predicted", "changed", "overlap_with_change")
+    levels = []
+    for share in np.linspace(0.0, 1.0, 21):
+        mixed = {n: (1 - share) * getattr(CONVINCING, n) + share * getattr(CONTRADICTED, n) for n in names}
+        levels.append(order.index(assess(replace(CONVINCING, **mixed)).verdict))
+    assert levels == sorted(levels) and set(levels) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("shown", ["black", "background"])
+def test_where_no_arm_is_seen_the_measured_joints_are_kept_and_the_frame_is_marked(
+    shipped: Sequence, extractor: FeatureExtractor, shown: str
+) -> None:
+    frame, scene = shipped.frame(0, cameras=["left"]), shipped.scene.with_cameras(["left"])
+    empty = shipped.background("left")
+    image = np.zeros_like(empty) if shown == "black" else empty
+    optimizer = FrameOptimizer(scene, replace(frame, images={"left": image}), {"left": empty}, extractor, live=False)
+    list(optimizer)
+    found = optimizer.assessment
+    assert found is not None and found.verdict is Verdict.FAILED and found.reason and found.remedy
+    assert optimizer.best is not None
+    for arm, joints in optimizer.best.joint_positions().items():
+        assert np.allclose(joints, frame.measured[arm], atol=1e-6)
+
+
+def test_an_arm_behind_the_camera_is_said_to_be_out_of_view(shipped: Sequence, extractor: FeatureExtractor) -> None:
+    (camera,) = shipped.scene.with_cameras(["left"]).cameras
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.T_camera_world
+    scene = replace(shipped.scene, cameras=(replace(camera, T_camera_world=turned),))
+    frame = shipped.frame(0, cameras=["left"])
+    optimizer = FrameOptimizer(scene, frame, {}, extractor, live=False)
+    list(optimizer)
+    assert optimizer.assessment is not None and optimizer.assessment.reason.startswith("No arm is in view")
+    assert optimizer.best is not None
+    assert all(np.allclose(q, frame.measured[arm], atol=1e-6) for arm, q in optimizer.best.joint_positions().items())
+
+
+def test_a_clear_frame_is_good_and_the_evaluation_says_so(shipped: Sequence, extractor: FeatureExtractor) -> None:
+    (score,) = evaluate(
+        shipped,
+        extractor,
+        frames=[4],
+        cameras=["left"],
+        domains=["regular"],
+        settings=SurfaceSolver(),
+        free=FreeParameters(),
+        perturb_deg=1.0,
+    )
+    assert score.verdict == "good" and score.reason == "The image supports the fit."
+
+
+def test_hints_name_frames_reasons_and_what_to_try() -> None:
+    failed = assess(replace(CONVINCING, start_area=0.0))
+    (hint,) = verdict_hints("left", {"001": failed, "002": assess(CONVINCING), "003": failed, "004": None})
+    assert hint == f"left: failed in 2 of 4 frames (001, 003). {failed.reason} {failed.remedy}"
+    assert verdict_hints("left", {"002": assess(CONVINCING)}) == []
