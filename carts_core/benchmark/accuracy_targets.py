@@ -177,18 +177,18 @@ def _rooms(data: Measurements, camera: str) -> list[Target]:
 
 
 def _occlusion(data: Measurements) -> Target:
-    told = {"ours": "nothing said", "ours_told": "occluder given", "ours_proposed": "mask proposed"}
+    labels = {"ours": "nothing said", "ours_given": "occluder given", "ours_proposed": "mask proposed"}
     means = {
         source: {
             method: mean(m.final.dice for m in runs)
-            for method in told
+            for method in labels
             if (runs := data.of(source=source, domain=OCCLUSION, method=method, error_deg=None))
         }
         for source in (SYNTHETIC, REAL)
     }
     alone = [found["ours"] for found in means.values() if "ours" in found]
     texts = (
-        f"{source}: " + ", ".join(f"{told[method]} {value:.3f}" for method, value in found.items())
+        f"{source}: " + ", ".join(f"{labels[method]} {value:.3f}" for method, value in found.items())
         for source, found in means.items()
         if found
     )

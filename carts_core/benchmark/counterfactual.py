@@ -116,9 +116,11 @@ class Counterfactual:
                 return expose(linear(image) * self._config.domain.low_brightness, _NOISY, rng)
             case "bleeding":
                 links = self._surface.Ts_world_link(measured)
-                return lit(lambda at: self._bleeding.stain(linear(image), at, links, self._surface.eye, self._lamp))
+                return lit(lambda at: self._bleeding.stain(linear(image), at, links, self._surface.lens, self._lamp))
             case "smoke":
-                return lit(lambda at: self._smoke.veil(linear(image), at.position, self._surface.eye, self._lamp, time))
+                return lit(
+                    lambda at: self._smoke.haze(linear(image), at.position, self._surface.lens, self._lamp, time)
+                )
             case "background_change":
                 # A soft seam, as a lens makes it.
                 cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]

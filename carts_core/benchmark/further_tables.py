@@ -40,7 +40,7 @@ def occlusion_table(data: Measurements) -> Table | None:
         f"Gauze, tissue or cloth over {100 * SHARE:.0f} % of the visible instruments. Dice of the rest, in percent: "
         "the occluders' pixels do not count, neither in the given mask nor in the estimate.",
         OCCLUSION,
-        ("ours", "ours_told", "ours_proposed"),
+        ("ours", "ours_given", "ours_proposed"),
         (_DICE, _JOINTS),
     )
 

@@ -15,7 +15,7 @@ class Method:
     settings: Callable[[int], SolverSettings] | None
     """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
     and looks at no kinematics."""
-    told: bool = False
+    occluders_given: bool = False
     """It is given the occluders' pixels."""
     every_camera: bool = False
     """All cameras enter one objective."""
@@ -42,7 +42,7 @@ METHODS = {
     "paper": Method("CaRTS ACS (paper's setting)", DescentSolver.paper),
     "acs": Method("CaRTS ACS, our schedule", lambda _: DescentSolver()),
     "ours": Method("CaRTS, ours", _ours),
-    "ours_told": Method("ours, occluder given", _ours, told=True),
+    "ours_given": Method("ours, occluder given", _ours, occluders_given=True),
     "ours_proposed": Method("ours, ignore mask proposed", lambda _: solver(SolverName.OCCLUDED)),
     "stereo": Method("ours, all cameras", _ours, every_camera=True),
     "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),

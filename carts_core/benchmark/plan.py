@@ -8,7 +8,7 @@ from .occlusion import OCCLUSION
 from .scope import REAL, ROOMS, SYNTHETIC, Run, Scope
 from .sources import Source
 
-_UNDER_OCCLUDERS = ("ours", "ours_told", "ours_proposed")
+_UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
 
 def plan(scope: Scope, sources: Items[Source]) -> list[Run]:

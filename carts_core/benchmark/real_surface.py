@@ -39,7 +39,7 @@ class RealSurface:
         self._scale = DISTANCE / (max(*depths, 0.02) + _CLEARANCE)
         self._T_world_camera = np.diag([1.0, -1.0, -1.0, 1.0])
         self._T_world_camera[2, 3] = DISTANCE
-        self.eye: np.ndarray = self._T_world_camera[:3, 3]
+        self.lens: np.ndarray = self._T_world_camera[:3, 3]
         """The lens, in the world."""
         camera = scene.cameras[0]
         fx, fy, cx, cy = camera.intrinsics
@@ -71,7 +71,7 @@ class RealSurface:
                 nearest = distance_transform_edt(arm_link < 0, return_distances=False, return_indices=True)
                 place = tuple(axis[mask] for axis in np.asarray(nearest))
                 depth[mask], normal[mask], link[mask] = arm_depth[place], arm_normal[place], arm_link[place]
-        position = (self._rays * depth[..., None]) @ self._T_world_camera[:3, :3].T + self.eye
+        position = (self._rays * depth[..., None]) @ self._T_world_camera[:3, :3].T + self.lens
         return Surface(position, normal.astype(np.float32), link, depth)
 
     def _rendered(self, measured: Mapping[str, np.ndarray]):

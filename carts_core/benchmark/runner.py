@@ -131,7 +131,7 @@ class _Bench:
         settings = method.settings(scope.steps(run))
         domain = "regular" if covered else run.domain
         backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
-        ignore = {camera: truth.hidden} if method.told and truth.hidden is not None else None
+        ignore = {camera: truth.hidden} if method.occluders_given and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
         scene = known.with_cameras(cameras)
         free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))

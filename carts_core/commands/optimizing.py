@@ -62,7 +62,7 @@ class Optimizing:
         """Optimize what is not there yet.
 
         Raises:
-            CartsError: something cannot be done as asked for; whatever can be known of that before is told before
+            CartsError: something cannot be done as asked for; whatever can be known of that is reported before
                 anything is written.
         """
         scene, select = self._sequence.scene, self._asked.select
@@ -125,13 +125,13 @@ class Optimizing:
         """Of frames in the folder that were not chosen."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
-            told = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
-            self._console.print(f"{output.folder}: {told}")
+            note = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
+            self._console.print(f"{output.folder}: {note}")
         others = [row.frame_id for row in output.rows if row.frame_id not in chosen]
         reasons = Counter(fault for frame_id in others if (fault := output.fault(frame_id, common)))
         for reason, count in reasons.items():
-            told = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
-            self._console.print(f"{output.folder}: {told}")
+            note = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
+            self._console.print(f"{output.folder}: {note}")
 
     def _origins(self, part: _Part) -> Origins:
         asked, sequence = self._asked, self._sequence

@@ -27,7 +27,7 @@ class SolverOptions:
     `iterations=20` and `sequence.initial_frames=3`."""
 
     def __post_init__(self) -> None:
-        _ = self.chosen, self.sequence  # A file that cannot be used is told at once.
+        _ = self.chosen, self.sequence  # A file that cannot be used is reported at once.
 
     @property
     def chosen(self) -> SolverSettings:

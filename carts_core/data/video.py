@@ -28,8 +28,8 @@ _KEPT_BYTES = 32 * 2**20
 class Video:
     """Frames of one video file by number; safe to use from several threads.
 
-    Decoding begins at the last key frame that is shown no later than the frame asked for, and what comes out is told
-    apart by its presentation time. Where seeking does not arrive where it should, decoding begins at an earlier key
+    Decoding begins at the last key frame that is shown no later than the frame asked for, and frames that come out are
+    identified by their presentation time. Where seeking does not arrive where it should, decoding begins at an earlier key
     frame; where the container's times are not to be relied on, at the first frame, which is slow and right.
 
     Args:

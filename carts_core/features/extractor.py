@@ -82,10 +82,10 @@ class FeatureExtractor:
 
     @torch.no_grad()
     def surface(
-        self, images: Float[Tensor, "batch 3 h w"], believed: Float[Tensor, "batch 6 h w"]
+        self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
-        """Surface maps of what images show, given those of where the arms are believed to be.
+        """Surface maps of what images show, given those of where the arms are expected.
 
         Arguments and errors as `SurfaceNetwork.forward`.
         """
-        return self._surface(images.contiguous(memory_format=torch.channels_last), believed).map()
+        return self._surface(images.contiguous(memory_format=torch.channels_last), given).map()

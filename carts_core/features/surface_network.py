@@ -1,4 +1,4 @@
-"""The surface network: an image and where the arms are believed to be in, a surface map of where they are out."""
+"""The surface network: an image and where the arms are expected in, a surface map of where they are out."""
 
 from dataclasses import dataclass
 
@@ -47,17 +47,17 @@ class SurfaceNetwork(UNet):
         self.fine = nn.Conv2d(fine, _HIDDEN, 1)
         self.out = nn.Conv2d(_HIDDEN, len(PARTS) + 1 + 3, 1)
 
-    def forward(self, images: Float[Tensor, "batch 3 h w"], believed: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
+    def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
         """What the images show.
 
         Args:
             images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
-            believed: surface maps of the kinematics as they are known; zero throughout where nothing is known.
+            given: surface maps of the kinematics as they are known; zero throughout where nothing is known.
 
         Raises:
             SettingsError: another number of channels, or a size that is no such multiple.
         """
-        fine, coarse = self.decoded(torch.cat([self.standardized(images), believed], 1))
+        fine, coarse = self.decoded(torch.cat([self.standardized(images), given], 1))
         grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)
         hidden = (grown + self.fine(fine)).relu()
         with one_thread():

@@ -221,7 +221,7 @@ class SequenceOptimizer:
         return None
 
     def _solve_alone(self, index: int) -> FrameEstimate | None:
-        """What a frame alone measures; None if it is not usable, which is told when its turn comes."""
+        """What a frame alone measures; None if it is not usable, which is reported when its turn comes."""
         began = time.perf_counter()
         start = Origin.KEYFRAME if index in self._keyframes else Origin.COLD
         try:

@@ -1,4 +1,4 @@
-"""A copy of a project file in memory, checked before anything in it is believed. The file itself is only read."""
+"""A copy of a project file in memory, checked before anything in it is used. The file itself is only read."""
 
 import os
 import sqlite3

@@ -1,4 +1,4 @@
-"""What an export can be told."""
+"""Options of an export."""
 
 from typing import Literal
 

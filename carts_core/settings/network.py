@@ -20,7 +20,7 @@ class Architecture:
     decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
     """3x3 convolutions per level on the way up, from full resolution down."""
     local_mean: bool = True
-    """Take the local mean off an image first, and not that of the whole image: a smooth veil then changes less."""
+    """Take the local mean off an image first, and not that of the whole image: smooth haze then changes less."""
     local_contrast: float = 0.0
     """How much an image is divided by its local contrast instead of that of the whole image, from 0 (not at all) to 1
     (entirely); needs `local_mean`. What takes contrast from a part of an image then changes less."""

@@ -55,7 +55,7 @@ class Bleeding:
         light: Float[np.ndarray, "h w 3"],
         surface: Surface,
         Ts_world_link: Mapping[int, Float[np.ndarray, "4 4"]],
-        eye: Float[np.ndarray, "3"],
+        lens: Float[np.ndarray, "3"],
         lamp: float,
     ) -> Float[np.ndarray, "h w 3"]:
         """A picture with the blood in it: absorption twice through its depth, its own red, and its wet highlights.
@@ -64,7 +64,7 @@ class Bleeding:
             light: linear RGB without blood.
             surface: what each pixel sees.
             Ts_world_link: the place of each link that `surface.link` names.
-            eye: the lens, where the light is, too [m].
+            lens: the lens, where the light is, too [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
         """
         x, y = surface.position[..., 0], surface.position[..., 1]
@@ -81,7 +81,7 @@ class Bleeding:
         base = light + (dull - light) * (pooled * on_tissue)[..., None]
         through = np.exp(-2.0 * depth[..., None] * _ABSORPTION)
 
-        offset = eye - surface.position
+        offset = lens - surface.position
         distance = np.linalg.norm(offset, axis=-1)
         to_eye = offset / distance[..., None]
         facing = np.clip((surface.normal * to_eye).sum(axis=-1), 0.0, 1.0)

@@ -32,7 +32,7 @@ class View:
     surface: Surface
     motion: Float[np.ndarray, "h w 2"]
     """[px] while the shutter is open."""
-    eye: Float[np.ndarray, "3"]
+    lens: Float[np.ndarray, "3"]
     """The lens, in the world [m]."""
     Ts_world_link: Mapping[int, Float[np.ndarray, "4 4"]]
 
@@ -66,9 +66,9 @@ class Conditions:
             case "low_brightness":
                 return view.light * self._config.domain.low_brightness
             case "bleeding":
-                return self._bleeding.stain(view.light, view.surface, view.Ts_world_link, view.eye, lamp)
+                return self._bleeding.stain(view.light, view.surface, view.Ts_world_link, view.lens, lamp)
             case "smoke":
-                return self._smoke.veil(view.light, view.surface.position, view.eye, lamp, view.time)
+                return self._smoke.haze(view.light, view.surface.position, view.lens, lamp, view.time)
             case "background_change" if view.other_light is not None:
                 return view.other_light
         raise AssertionError(f"no light for domain {domain}")

@@ -41,11 +41,11 @@ class Smoke:
             total += map_coordinates(field, np.moveaxis(places, -1, 0), order=1, mode="grid-wrap")
         return config.smoke_density * np.exp(_CONTRAST * total / np.sqrt(2.0) - 0.5 * _CONTRAST**2)
 
-    def veil(
+    def haze(
         self,
         light: Float[np.ndarray, "h w 3"],
         positions: Float[np.ndarray, "h w 3"],
-        eye: Float[np.ndarray, "3"],
+        lens: Float[np.ndarray, "3"],
         lamp: float,
         time: float,
     ) -> Float[np.ndarray, "h w 3"]:
@@ -54,7 +54,7 @@ class Smoke:
         Args:
             light: linear RGB without smoke.
             positions: the point that each pixel sees [m].
-            eye: the lens, where the light is, too [m].
+            lens: the lens, where the light is, too [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
             time: [s].
         """
@@ -62,7 +62,7 @@ class Smoke:
         small = (max(width // 3, 1), max(height // 3, 1))
         # Smoke is smooth, so a third of the resolution will do, but depth must stay sharp at instruments: the march
         # goes along each coarse ray to the farthest point, and each pixel stops at its own distance.
-        offsets = positions - eye
+        offsets = positions - lens
         distance = np.linalg.norm(offsets, axis=-1).astype(np.float32)
         rays = cv2.resize((offsets / distance[..., None]).astype(np.float32), small, interpolation=cv2.INTER_AREA)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -73,7 +73,7 @@ class Smoke:
         glow = np.zeros((height, width), np.float32)
         for near in edges[:-1]:
             middle = near + 0.5 * step
-            slab = (self.density(eye + rays * middle, time) * step).astype(np.float32)
+            slab = (self.density(lens + rays * middle, time) * step).astype(np.float32)
             there_and_back = np.exp(-1.2 * (depth_so_far + 0.5 * slab))
             slab_glow = _BACKSCATTER * lamp / (middle**2 + _LAMP_SIZE**2) * slab * there_and_back
             share = np.clip((distance - near) / step, 0.0, 1.0)

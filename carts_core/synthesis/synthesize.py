@@ -127,7 +127,7 @@ class _Painter:
             other_light=light[1] if len(light) > 1 else None,
             surface=surface,
             motion=stage.motion_in_image(frame, surface, camera, self._config.sensor.shutter),
-            eye=np.linalg.inv(camera.T_camera_world)[:3, 3],
+            lens=np.linalg.inv(camera.T_camera_world)[:3, 3],
             Ts_world_link=stage.Ts_world_link(frame),
         )
         return view, mask

@@ -62,7 +62,7 @@ def test_several_cameras_and_calibration_are_planned_where_there_is_something_to
     runs = plan(QUICK, BOTH)
     assert {run.source for run in runs if run.method in ("stereo", "stereo_posed")} == {"real"}
     assert {run.source for run in runs if run.method.startswith("calibrated")} == {"real"}
-    for method in ("ours", "ours_told", "ours_proposed"):
+    for method in ("ours", "ours_given", "ours_proposed"):
         assert Run("synthetic", "occlusion", 0, method, 2.0) in runs and Run("real", "occlusion", 5, method) in runs
     assert [run.frame for run in runs if (run.source, run.method) == ("real", "sequence")] == [0, 1]
     assert Run("synthetic", "regular", 1, "sequence", 2.0) in runs

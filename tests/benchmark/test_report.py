@@ -141,7 +141,7 @@ def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_fram
         [
             *_measurements(),
             *(make_measurement((0.7, 0.9), domain="occlusion", frame=frame) for frame in range(2)),
-            *(make_measurement((0.7, 0.96), domain="occlusion", method=m) for m in ("ours_told", "ours_proposed")),
+            *(make_measurement((0.7, 0.96), domain="occlusion", method=m) for m in ("ours_given", "ours_proposed")),
             make_measurement((0.8, 0.97), source="real", method="stereo"),
             make_measurement((0.8, 0.98), source="real", method="stereo_posed"),
             make_measurement((0.95,), source="real", method="calibrated"),

@@ -103,8 +103,8 @@ def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_a
     assert _target("seconds per frame", covered).reached == "not measured"
     assert _target("frames made worse", covered).reached == "100.0 %"
     plain = [make_measurement((0.9, dice), domain="occlusion", frame=i) for i, dice in enumerate((0.95, 0.97))]
-    told = make_measurement((0.9, 0.99), domain="occlusion", method="ours_told")
-    reached = _target("30 % of the visible instrument", *plain, told)
+    given = make_measurement((0.9, 0.99), domain="occlusion", method="ours_given")
+    reached = _target("30 % of the visible instrument", *plain, given)
     assert reached.reached == "0.960" and reached.met is True and "occluder given 0.990" in reached.basis
     real = make_measurement((0.9, 0.94), domain="occlusion", source="real")
     assert _target("30 % of the visible instrument", *plain, real).met is False

@@ -31,7 +31,7 @@ def test_the_mean_density_is_the_one_asked_for_and_it_is_dense_in_places() -> No
 
 def test_no_smoke_changes_nothing() -> None:
     light = np.random.default_rng(0).uniform(0, 1, (H, W, 3)).astype(np.float32)
-    np.testing.assert_allclose(_smoke(smoke_density=0.0).veil(light, _positions(0.1), EYE, 10.0, 0.0), light, atol=1e-6)
+    np.testing.assert_allclose(_smoke(smoke_density=0.0).haze(light, _positions(0.1), EYE, 10.0, 0.0), light, atol=1e-6)
 
 
 def test_what_is_farther_away_loses_more_contrast() -> None:
@@ -39,7 +39,7 @@ def test_what_is_farther_away_loses_more_contrast() -> None:
     light = np.repeat(0.1 + 0.4 * board[..., None], 3, axis=-1).astype(np.float32)
     contrast = []
     for depth in (0.04, 0.09, 0.14):
-        seen = _smoke().veil(light, _positions(depth), EYE, 10.0, 0.0)[..., 0]
+        seen = _smoke().haze(light, _positions(depth), EYE, 10.0, 0.0)[..., 0]
         contrast.append((seen[board == 1].mean() - seen[board == 0].mean()) / seen.mean())
     assert contrast[0] > 1.2 * contrast[1] > 1.2 * 1.1 * contrast[2]
 
@@ -47,7 +47,7 @@ def test_what_is_farther_away_loses_more_contrast() -> None:
 def test_an_instrument_in_front_stays_sharp_against_the_hazy_background() -> None:
     depth = np.full((H, W), 0.15)
     depth[:, : W // 2] = 0.03
-    seen = _smoke().veil(np.zeros((H, W, 3), np.float32), _positions(depth), EYE, 10.0, 0.0)[..., 0]
+    seen = _smoke().haze(np.zeros((H, W, 3), np.float32), _positions(depth), EYE, 10.0, 0.0)[..., 0]
     steps = np.abs(np.diff(seen, axis=1)).mean(axis=0)
     assert np.argmax(steps) == W // 2 - 1
     assert steps.max() > 4.0 * np.median(steps)
@@ -55,7 +55,7 @@ def test_an_instrument_in_front_stays_sharp_against_the_hazy_background() -> Non
 
 def test_light_on_smoke_brightens_the_dark() -> None:
     black = np.zeros((H, W, 3), np.float32)
-    weak, strong = (_smoke().veil(black, _positions(0.1), EYE, lamp, 0.0) for lamp in (5.0, 10.0))
+    weak, strong = (_smoke().haze(black, _positions(0.1), EYE, lamp, 0.0) for lamp in (5.0, 10.0))
     assert weak.min() > 0.0
     np.testing.assert_allclose(strong, 2.0 * weak, rtol=1e-4)
 
