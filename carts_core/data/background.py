@@ -81,8 +81,8 @@ def background_of_recording(
     if always > _STAYS * usually:
         problem = (
             f"camera {camera!r}: what is behind the arms is not known, since they hardly move in {len(arms)} views; "
-            "what looks like an arm in the background cannot be distinguished from one. A `background` image in the sequence "
-            "file, taken without arms, helps."
+            "what looks like an arm in the background cannot be distinguished from one. A `background` image in the "
+            "sequence file, taken without arms, helps."
         )
     return MeanBackground(estimate, 2 * clear > used, problem)
 

@@ -29,8 +29,8 @@ class Video:
     """Frames of one video file by number; safe to use from several threads.
 
     Decoding begins at the last key frame that is shown no later than the frame asked for, and frames that come out are
-    identified by their presentation time. Where seeking does not arrive where it should, decoding begins at an earlier key
-    frame; where the container's times are not to be relied on, at the first frame, which is slow and right.
+    identified by their presentation time. Where seeking does not arrive where it should, decoding begins at an earlier
+    key frame; where the container's times are not to be relied on, at the first frame, which is slow and right.
 
     Args:
         path: the video file.
