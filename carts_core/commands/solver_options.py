@@ -101,8 +101,11 @@ def _of_solver(text: str) -> str:
     """A single setting as TOML; one without a table is the solver's, and a bare word is a text."""
     key, _, value = (part.strip() for part in text.partition("="))
     key = key if "." in key else f"solver.{key}"
-    bare = value.replace("_", "").isalpha() and value not in ("true", "false", "inf", "nan")
-    return f"{key} = {json.dumps(value) if bare else value}"
+    try:
+        tomllib.loads(f"value = {value}")
+    except tomllib.TOMLDecodeError:
+        value = json.dumps(value)
+    return f"{key} = {value}"
 
 
 def _read(path: Path) -> str:

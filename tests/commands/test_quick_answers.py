@@ -49,12 +49,12 @@ def test_help_is_given_without_heavy_imports(command: tuple[str, ...]) -> None:
             ["evaluate", "sequence.toml", "--mode", "sequence", "--solver", "acs"],
             "--mode sequence needs the solver surface; given is --solver acs",
         ),
-        (["calibrate", "sequence.toml", "--settings", "loss=l1"], "[solver] has no setting 'loss'"),
+        (["calibrate", "sequence.toml", "--settings", "loss=l1"], "has no setting 'loss'"),
         (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),
         (["train", "--images.width", "17"], "give positive multiples of 16"),
     ],
 )
-def test_a_wrong_argument_is_told_without_heavy_imports(arguments: list[str], message: str) -> None:
+def test_a_wrong_argument_is_reported_without_heavy_imports(arguments: list[str], message: str) -> None:
     status, text, modules = _answer(*arguments)
     assert status == BAD_INPUT and message in text and not HEAVY & modules
 
