@@ -38,9 +38,9 @@ format: setup-dev ## Format the code and fix what can be fixed
 bench: setup-dev ## Run the slow tests and print the measurements
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
 	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m slow $(ARGS)
-	$(BIN)/python -m carts_core.bench
-	$(BIN)/python -m carts_core.data.bench
-	$(BIN)/python -m carts_viewer.bench
+	$(BIN)/python -m tools.bench_core
+	$(BIN)/python -m tools.bench_recordings
+	$(BIN)/python -m tools.bench_viewer
 	$(BIN)/carts bench --quick
 
 pictures: setup-dev ## Take the pictures of the README, the tutorial and the examples again

@@ -1,35 +1,28 @@
 """The app: opens a sequence, builds page, panels and worker, and ties them together."""
 
 import logging
-import os
-import sys
-import time
 from collections.abc import Callable
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TextIO
 
-from carts_core.console import log_to_stderr, visible
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.optimization import FreeParameters, SurfaceSolver
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
-from carts_viewer.ending import EndRequest
-from carts_viewer.guard import check_address
+from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.layers import Layer
 from carts_viewer.layout import Layout
-from carts_viewer.mailbox import Mailbox
-from carts_viewer.opening import opened_in_browser
-from carts_viewer.page import Page
-from carts_viewer.picture import Painter
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import OptimizerFactory
+from carts_viewer.scene_view import SceneView
 from carts_viewer.session import Session
-from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage, open_storage
 from carts_viewer.strokes import read_stroke
+from carts_viewer.transport.guard import check_address
+from carts_viewer.transport.page import Page
 from carts_viewer.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -44,10 +37,10 @@ class ViewerApp:
     Attributes:
         url: Where the page is.
         page: The page, for tests and scripts.
-        mailbox: Where intents go.
+        queue: Where intents go.
         sequence: The recording.
         scene: The recording's arms and cameras.
-        stage: What is seen in 3D, frame and overlay included.
+        scene_view: What is seen in 3D, frame and overlay included.
         project: The sequence's corrections.
         display: What puts states on the page.
         joints: The panel with the joints' sliders.
@@ -72,26 +65,26 @@ class ViewerApp:
         self.project = storage.project
         self._storage = storage
         self._session = Session(sequence, storage.project)
-        self._painter = Painter(sequence, device)
+        self._renderer = OverlayRenderer(sequence, device)
         state = self._first_state()
-        self.mailbox = Mailbox()
+        self.queue = IntentQueue()
         self._optimizers = OptimizerFactory(weights=weights, device=device, report=self._say)
-        self._controller = Controller(state, self._session, self._painter, self._optimizers, self._deliver)
+        self._controller = Controller(state, self._session, self._renderer, self._optimizers, self._deliver)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")
-        self._painter.arm_ids(state.pose.scene, state.camera)
+        self._renderer.arm_ids(state.pose.scene, state.camera)
         self.page = Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
         self.url = self.page.url
-        layout = Layout(self.page, self._session, storage, state, self.mailbox)
+        layout = Layout(self.page, self._session, storage, state, self.queue)
         self.joints = layout.joints
-        self.stage = Stage(self.page.server, sequence.scene, state.pose.scene, state.camera)
-        self.display = PageDisplay(self.page, self._session, self._painter, self.stage, layout.panels)
+        self.scene_view = SceneView(self.page.server, sequence.scene, state.pose.scene, state.camera)
+        self.display = PageDisplay(self.page, self._session, self._renderer, self.scene_view, layout.panels)
         self.page.on_drawn(self._on_drawn)
-        self.page.on_released(lambda: self.mailbox.put(ask.Released()))
+        self.page.on_released(lambda: self.queue.put(intents.Released()))
         self.page.on_pointed(self._on_pointed)
         self.page.on_painted(self._on_painted)
-        self.page.on_picked(lambda share: self.mailbox.put(ask.ShowFrame(int(_unit(share) * len(sequence)))))
-        self._worker = Worker(self.mailbox, self._controller, self.display)
+        self.page.on_picked(lambda share: self.queue.put(intents.ShowFrame(int(_unit(share) * len(sequence)))))
+        self._worker = Worker(self.queue, self._controller, self.display)
         self._worker.start(self._prepare)
 
     @classmethod
@@ -208,11 +201,11 @@ class ViewerApp:
 
     def _on_drawn(self, tab: int) -> None:
         self.display.drawn(tab)
-        self.mailbox.put(ask.Drawn())
+        self.queue.put(intents.Drawn())
 
     def _on_pointed(self, u: float, v: float) -> None:
         camera = self.scene.camera(self.state.camera)
-        self.mailbox.put(ask.PointAt(u * camera.width, v * camera.height))
+        self.queue.put(intents.PointAt(u * camera.width, v * camera.height))
 
     def _on_painted(self, tab: int, text: str) -> None:
         try:
@@ -222,7 +215,7 @@ class ViewerApp:
             # Our page sends no such thing, and others that look on did nothing wrong.
             _log.info("Refused: %s", error)
         else:
-            self.mailbox.put(ask.Paint(tab, stroke))
+            self.queue.put(intents.Paint(tab, stroke))
 
     def _deliver(self, client_id: int, name: str, content: bytes) -> None:
         client = self.page.server.get_clients().get(client_id)
@@ -232,80 +225,3 @@ class ViewerApp:
 
 def _unit(share: float) -> float:
     return min(max(share, 0.0), 1.0)
-
-
-def serve(
-    sequence_path: Path,
-    *,
-    project: Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    device: str = "cpu",
-    weights: tuple[Path, ...] = (),
-    open_browser: bool = False,
-) -> None:
-    """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
-
-    Args:
-        sequence_path: The sequence file.
-        project: The project file, begun if it is not there; None for the default place.
-        host: The address to listen on; one that other computers can reach makes the url carry a token.
-        port: 0 picks a free port; a busy one moves up to the next free one.
-        device: Where to render and optimize, say `cpu` or `cuda`.
-        weights: Weights files; a network that none is given of is the shipped one.
-        open_browser: Open the page in the default browser.
-
-    Raises:
-        SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
-            when corrections could not be saved, or not in the project that was opened.
-    """
-    log_to_stderr()
-    began = time.monotonic()
-    with EndRequest() as end:
-        try:
-            app = ViewerApp.open(
-                sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_say_doing
-            )
-        except CartsError as error:
-            print(f"error: {visible(str(error))}", file=sys.stderr)
-            raise SystemExit(2) from error
-        end.ready()
-        browser = opened_in_browser(app.url) if open_browser else nullcontext()
-        try:
-            _say(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.")
-            with browser:
-                end.wait()
-            _say("\nClosing.")
-        finally:
-            _close(app)
-
-
-def _close(app: ViewerApp) -> None:
-    """Save and close.
-
-    Raises:
-        SystemExit: see `serve`.
-    """
-    try:
-        app.close()
-        problem = app.project.incident
-    except CartsError as error:
-        problem = f"error: {error}"
-    if problem is not None:
-        _say(visible(problem), sys.stderr)
-        raise SystemExit(1)
-
-
-def _say_doing(line: str) -> None:
-    _say(f"  {visible(line)} …")
-
-
-def _say(text: str, to: TextIO | None = None) -> None:
-    """Print; a terminal that is gone, as it is after SIGHUP, keeps nothing from being saved."""
-    stream: TextIO = to or sys.stdout
-    try:
-        print(text, file=stream, flush=True)
-    except OSError:
-        with suppress(OSError, ValueError):
-            # Python flushes once more at the end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -4,33 +4,35 @@ from collections.abc import Mapping, Sequence
 
 from carts_viewer.layers import Layer, Rgba, paint_over
 from carts_viewer.marks import draw_keypoints, labelled_keypoints
-from carts_viewer.pace import Pace
-from carts_viewer.page import Page
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.inputs import Panel
-from carts_viewer.picture import Painter
+from carts_viewer.rate_limit import RateLimit
+from carts_viewer.scene_view import SceneView
 from carts_viewer.session import Session
-from carts_viewer.stage import Stage
 from carts_viewer.state import ViewState
 from carts_viewer.strokes import Tool
+from carts_viewer.transport.page import Page
 
 
 class PageDisplay:
     """The page as the worker sees it; used on the worker's thread."""
 
-    def __init__(self, page: Page, session: Session, painter: Painter, stage: Stage, panels: Sequence[Panel]) -> None:
+    def __init__(
+        self, page: Page, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
+    ) -> None:
         self._page = page
         self._scene = session.scene
-        self._painter = painter
-        self._stage = stage
+        self._renderer = renderer
+        self._scene_view = scene_view
         self._panels = panels
         self._keypoints = tuple(labelled_keypoints(session.scene).values())
-        self._pace = Pace()
+        self._rate_limit = RateLimit()
         self._shown: ViewState | None = None
-        self.drawn = self._pace.drawn
+        self.drawn = self._rate_limit.drawn
 
     def ready_in(self) -> float:
         """How long until the page can take another picture [s]; 0 when it can now."""
-        return self._pace.ready_in()
+        return self._rate_limit.ready_in()
 
     def show_picture(self, state: ViewState) -> None:
         """Send frame, overlay and 3D scene, as far as they changed."""
@@ -39,7 +41,7 @@ class PageDisplay:
         new_frame = old is None or state.frame is not old.frame
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
-            overlay = self._painter.overlay(
+            overlay = self._renderer.overlay(
                 state.pose.scene,
                 state.frame,
                 state.camera,
@@ -56,14 +58,14 @@ class PageDisplay:
             # Together, or a new frame would be seen for a moment under the old frame's overlay.
             with self._page.server.atomic():
                 if new_frame:
-                    self._stage.show_frame(state.frame.images[state.camera], camera)
-                self._stage.show_overlay(overlay, camera)
+                    self._scene_view.show_frame(state.frame.images[state.camera], camera)
+                self._scene_view.show_overlay(overlay, camera)
             self._page.server.flush()
             self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
-            self._pace.sent()
+            self._rate_limit.sent()
             # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
             if new_pose:
-                self._stage.show_pose(state.pose.scene, state.camera)
+                self._scene_view.show_pose(state.pose.scene, state.camera)
         self._shown = state
 
     def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
@@ -71,7 +73,7 @@ class PageDisplay:
         clients = self._page.server.get_clients()
         for tab, number in new.items():
             if old.get(tab) != number and tab in clients:
-                self._page.tell(clients[tab], "painted", number)
+                self._page.call(clients[tab], "painted", number)
 
     def show_panels(self, state: ViewState) -> None:
         """Bring every widget up to date."""

@@ -13,7 +13,7 @@ from typing import Literal
 
 from carts_core.files import write_text
 from carts_core.project import ReviewState
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Tool
 
@@ -32,7 +32,7 @@ class Shortcut:
 
     hotkey: str
     label: str
-    action: ask.Intent | Special
+    action: intents.Intent | Special
     modifier: str | None = None
 
     @property
@@ -49,44 +49,44 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
     slider that has the focus.
     """
     return [
-        Shortcut("space", "Play or stop", ask.Play()),
-        Shortcut("N", "Next frame", ask.MoveFrame(1)),
-        Shortcut("B", "Previous frame (back)", ask.MoveFrame(-1)),
-        Shortcut("R", "Run or pause the optimizer", ask.RunOrPause()),
-        Shortcut("T", "One step of the optimizer", ask.Step()),
-        Shortcut("X", "Reset to the start of the run", ask.Reset()),
-        Shortcut("K", "Make the frame a keyframe, or none", ask.HoldKeyframe()),
-        Shortcut("K", "Solve between the keyframes", ask.Solve(), "shift"),
-        Shortcut("G", "Accept, and go to the next unreviewed frame", ask.AcceptAndNext()),
-        Shortcut("F", "Mark as needing work", ask.SetReview(ReviewState.NEEDS_WORK)),
-        Shortcut("J", "Reject", ask.SetReview(ReviewState.REJECTED)),
-        Shortcut("G", "Clear the review", ask.SetReview(ReviewState.UNTOUCHED), "shift"),
-        Shortcut("Y", "Next unreviewed frame", ask.ShowUnreviewed()),
-        Shortcut("Y", "Previous unreviewed frame", ask.ShowUnreviewed(-1), "shift"),
-        Shortcut("L", "Next worst frame that is not settled", ask.ShowWorse()),
-        Shortcut("L", "Previous worst frame", ask.ShowWorse(-1), "shift"),
-        Shortcut("O", f"Nudge the joint by {FINE:g}° or mm", ask.Nudge(FINE)),
-        Shortcut("I", f"Nudge the joint by -{FINE:g}° or mm", ask.Nudge(-FINE)),
-        Shortcut("O", f"Nudge the joint by {COARSE:g}° or mm", ask.Nudge(COARSE), "shift"),
-        Shortcut("I", f"Nudge the joint by -{COARSE:g}° or mm", ask.Nudge(-COARSE), "shift"),
-        Shortcut("U", "Choose the next joint to nudge", ask.ChooseJoint()),
-        Shortcut("C", "Copy the correction of the previous frame", ask.CopyCorrection(-1)),
-        Shortcut("C", "Copy the correction of the next frame", ask.CopyCorrection(1), "shift"),
-        Shortcut("H", "Show or hide the keypoints", ask.ShowKeypoints()),
+        Shortcut("space", "Play or stop", intents.Play()),
+        Shortcut("N", "Next frame", intents.MoveFrame(1)),
+        Shortcut("B", "Previous frame (back)", intents.MoveFrame(-1)),
+        Shortcut("R", "Run or pause the optimizer", intents.RunOrPause()),
+        Shortcut("T", "One step of the optimizer", intents.Step()),
+        Shortcut("X", "Reset to the start of the run", intents.Reset()),
+        Shortcut("K", "Make the frame a keyframe, or none", intents.HoldKeyframe()),
+        Shortcut("K", "Solve between the keyframes", intents.Solve(), "shift"),
+        Shortcut("G", "Accept, and go to the next unreviewed frame", intents.AcceptAndNext()),
+        Shortcut("F", "Mark as needing work", intents.SetReview(ReviewState.NEEDS_WORK)),
+        Shortcut("J", "Reject", intents.SetReview(ReviewState.REJECTED)),
+        Shortcut("G", "Clear the review", intents.SetReview(ReviewState.UNTOUCHED), "shift"),
+        Shortcut("Y", "Next unreviewed frame", intents.ShowUnreviewed()),
+        Shortcut("Y", "Previous unreviewed frame", intents.ShowUnreviewed(-1), "shift"),
+        Shortcut("L", "Next worst frame that is not settled", intents.ShowWorse()),
+        Shortcut("L", "Previous worst frame", intents.ShowWorse(-1), "shift"),
+        Shortcut("O", f"Nudge the joint by {FINE:g}° or mm", intents.Nudge(FINE)),
+        Shortcut("I", f"Nudge the joint by -{FINE:g}° or mm", intents.Nudge(-FINE)),
+        Shortcut("O", f"Nudge the joint by {COARSE:g}° or mm", intents.Nudge(COARSE), "shift"),
+        Shortcut("I", f"Nudge the joint by -{COARSE:g}° or mm", intents.Nudge(-COARSE), "shift"),
+        Shortcut("U", "Choose the next joint to nudge", intents.ChooseJoint()),
+        Shortcut("C", "Copy the correction of the previous frame", intents.CopyCorrection(-1)),
+        Shortcut("C", "Copy the correction of the next frame", intents.CopyCorrection(1), "shift"),
+        Shortcut("H", "Show or hide the keypoints", intents.ShowKeypoints()),
         Shortcut("P", "Perturb all joints", "perturb"),
-        Shortcut("M", "Back to measured joints", ask.BackToMeasured()),
-        Shortcut("Z", "Undo", ask.Undo(), "cmd/ctrl"),
-        Shortcut("Z", "Redo", ask.Redo(), "cmd/ctrl+shift"),
-        Shortcut("B", "Brush, or put it away", ask.ToggleTool(Tool.BRUSH), "shift"),
-        Shortcut("X", "Eraser, or put it away", ask.ToggleTool(Tool.ERASER), "shift"),
-        Shortcut("P", "Polygon, or put it away", ask.ToggleTool(Tool.POLYGON), "shift"),
-        Shortcut("M", "Paint on the mask or on the ignore region", ask.SetTarget(), "shift"),
-        Shortcut("[", "Smaller brush", ask.ScaleBrush(1 / _GROWTH)),
-        Shortcut("]", "Larger brush", ask.ScaleBrush(_GROWTH)),
-        Shortcut("escape", "Drop the polygon, or put the tool away", ask.SetTool(Tool.OFF)),
+        Shortcut("M", "Back to measured joints", intents.BackToMeasured()),
+        Shortcut("Z", "Undo", intents.Undo(), "cmd/ctrl"),
+        Shortcut("Z", "Redo", intents.Redo(), "cmd/ctrl+shift"),
+        Shortcut("B", "Brush, or put it away", intents.ToggleTool(Tool.BRUSH), "shift"),
+        Shortcut("X", "Eraser, or put it away", intents.ToggleTool(Tool.ERASER), "shift"),
+        Shortcut("P", "Polygon, or put it away", intents.ToggleTool(Tool.POLYGON), "shift"),
+        Shortcut("M", "Paint on the mask or on the ignore region", intents.SetTarget(), "shift"),
+        Shortcut("[", "Smaller brush", intents.ScaleBrush(1 / _GROWTH)),
+        Shortcut("]", "Larger brush", intents.ScaleBrush(_GROWTH)),
+        Shortcut("escape", "Drop the polygon, or put the tool away", intents.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
-            Shortcut(str(number), f"Overlay: {layer.lower()}", ask.ShowLayer(layer))
+            Shortcut(str(number), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
             for number, layer in enumerate(layers, start=1)
         ),
     ]

@@ -1,7 +1,6 @@
 """Where the panels are on the page: browsing, overlay and joints on the left, tabs on the right."""
 
-from carts_viewer.mailbox import Mailbox
-from carts_viewer.page import Page
+from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.curves import CurvesPanel
 from carts_viewer.panels.export import ExportPanel
@@ -22,6 +21,7 @@ from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
+from carts_viewer.transport.page import Page
 
 _WIDTH = 312.0
 """Of either side [px]."""
@@ -35,7 +35,7 @@ class Layout:
         joints: the one with the joints' sliders.
     """
 
-    def __init__(self, page: Page, session: Session, storage: Storage, state: ViewState, mailbox: Mailbox) -> None:
+    def __init__(self, page: Page, session: Session, storage: Storage, state: ViewState, queue: IntentQueue) -> None:
         """Build the panels.
 
         Args:
@@ -43,9 +43,9 @@ class Layout:
             session: the open sequence.
             storage: its project.
             state: what is shown first.
-            mailbox: takes the intents.
+            queue: takes the intents.
         """
-        emit, waits = mailbox.put, mailbox.waits
+        emit, waits = queue.put, queue.waits
         gui = page.server.gui
         gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
         gui.set_panel_label("CaRTS")

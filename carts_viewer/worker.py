@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Protocol
 
 from carts_core.errors import CartsError
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.controller import Controller
-from carts_viewer.mailbox import Mailbox
+from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.state import ViewState
 
 _log = logging.getLogger(__name__)
 
-_BEGINNING = (ask.Optimizing, ask.Propagating, ask.Exporting)
+_BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting)
 """Intents that may begin what takes long."""
 
 
@@ -33,10 +33,10 @@ class Display(Protocol):
 
 
 class Worker:
-    """Drains the mailbox, newest wins; pictures go out as fast as the page draws them and the last one always does."""
+    """Drains the queue, newest wins; pictures go out as fast as the page draws them and the last one always does."""
 
-    def __init__(self, mailbox: Mailbox, controller: Controller, display: Display) -> None:
-        self._mailbox = mailbox
+    def __init__(self, queue: IntentQueue, controller: Controller, display: Display) -> None:
+        self._queue = queue
         self._controller = controller
         self._display = display
         self._stop = threading.Event()
@@ -55,14 +55,14 @@ class Worker:
     def stop(self) -> None:
         """Finish what is being done and end the thread."""
         self._stop.set()
-        self._mailbox.wake()
+        self._queue.wake()
         self._thread.join(timeout=30.0)
 
     def settled(self, timeout: float) -> bool:
         """Wait until nothing is left to do or to show; False when that took longer than `timeout` [s]."""
         end = time.monotonic() + timeout
         with self._rest:
-            while not (self._resting and self._mailbox.empty()):
+            while not (self._resting and self._queue.empty()):
                 if not self._rest.wait(min(0.05, max(0.0, end - time.monotonic()))) and time.monotonic() > end:
                     return False
         return True
@@ -79,17 +79,17 @@ class Worker:
         while not self._stop.is_set():
             self._attempt(self._round)
         # What somebody did just before the end is saved, too; nothing long is begun.
-        for intent in self._mailbox.take(0.0):
+        for intent in self._queue.take(0.0):
             if not isinstance(intent, _BEGINNING):
                 self._attempt(lambda intent=intent: self._controller.handle(intent))
 
     def _round(self) -> None:
-        patience = self._patience()
-        self._set_resting(patience is None and self._mailbox.empty())
-        waits = [wait for wait in (patience, self._controller.overdue_in()) if wait is not None]
-        intents = self._mailbox.take(min(waits, default=None))
+        wait_time = self._wait_time()
+        self._set_resting(wait_time is None and self._queue.empty())
+        waits = [wait for wait in (wait_time, self._controller.overdue_in()) if wait is not None]
+        waiting = self._queue.take(min(waits, default=None))
         self._set_resting(False)
-        for intent in intents:
+        for intent in waiting:
             self._attempt(lambda intent=intent: self._controller.handle(intent))
         self._attempt(self._controller.advance, stop=True)
         self._publish()
@@ -99,13 +99,13 @@ class Worker:
             self._resting = resting
             self._rest.notify_all()
 
-    def _patience(self) -> float | None:
+    def _wait_time(self) -> float | None:
         """How long to wait for an intent: not while there is work, and no longer than a picture waits for the page."""
-        patience = self._controller.patience()
+        wait_time = self._controller.wait_time()
         if self._pictured is not self._controller.state:
             ready = self._display.ready_in()
-            return ready if patience is None else min(ready, patience)
-        return patience
+            return ready if wait_time is None else min(ready, wait_time)
+        return wait_time
 
     def _publish(self) -> None:
         if self._pictured is not self._controller.state and self._display.ready_in() <= 0.0:

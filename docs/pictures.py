@@ -19,7 +19,7 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 from carts_core.keypoints import project_keypoints
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.marks import labelled_keypoints
 from carts_viewer.state import Phase
@@ -43,9 +43,9 @@ class Photographer:
         # The warning that this browser has no graphics card.
         page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
 
-    def do(self, *intents: ask.Intent) -> None:
+    def do(self, *intents: intents.Intent) -> None:
         for intent in intents:
-            self.app.mailbox.put(intent)
+            self.app.queue.put(intent)
             self.app.wait_until_shown(PATIENCE)
 
     def wait(self, reached: Callable[[], bool]) -> None:
@@ -56,7 +56,7 @@ class Photographer:
             time.sleep(0.2)
 
     def run(self) -> None:
-        self.do(ask.Run())
+        self.do(intents.Run())
         self.wait(lambda: self.app.state.run.phase is Phase.IDLE)
 
     def tab(self, name: str) -> None:
@@ -81,41 +81,53 @@ class Photographer:
         truth = scene.state(state.frame.truth or {})
         pixels = project_keypoints(scene, truth, [points[name] for name in names], state.camera).tolist()
         for name, (u, v) in zip(names, pixels, strict=True):
-            self.do(ask.ChooseKeypoint(name), ask.PointAt(u, v), ask.Released())
-        self.do(ask.ChooseKeypoint(None))
+            self.do(intents.ChooseKeypoint(name), intents.PointAt(u, v), intents.Released())
+        self.do(intents.ChooseKeypoint(None))
 
     def paint(self, target: Target, *points: tuple[float, float], polygon: bool = False) -> None:
         """A stroke or polygon through these places of the image [px]."""
         state = self.app.state
         stroke = Stroke(0, state.index, state.camera, target, False, polygon, 24, np.array(points))
-        self.do(ask.Paint(-1, stroke))
+        self.do(intents.Paint(-1, stroke))
 
 
 def take(work: Photographer) -> None:
     """All pictures, in the tutorial's order."""
     app = work.app
     work.picture("start")
-    work.do(ask.Perturb(2.0, 0))
+    work.do(intents.Perturb(2.0, 0))
     work.run()
     work.picture("run")
-    work.do(ask.ShowFrame(1), ask.Perturb(5.0, 0))
+    work.do(intents.ShowFrame(1), intents.Perturb(5.0, 0))
     work.tab("Review")
     work.click_keypoints("psm1 jaw 1 tip", "psm1 wrist pitch joint")
     work.picture("keypoints")
     work.click_keypoints("psm2 jaw 1 tip", "psm2 wrist pitch joint")
     work.run()
-    work.do(ask.ShowKeypoints(False))
+    work.do(intents.ShowKeypoints(False))
     work.tab("Paint")
     work.paint(Target.MASK, (150, 90), (200, 100), (260, 96))
     work.paint(Target.IGNORE, (430, 330), (520, 320), (560, 400), (450, 430), polygon=True)
     work.picture("paint")
     work.tab("Paint")
-    work.do(ask.Undo(), ask.Undo(), ask.ShowFrame(0), ask.AcceptAndNext(), ask.AcceptAndNext(), ask.ShowFrame(8))
+    work.do(
+        intents.Undo(),
+        intents.Undo(),
+        intents.ShowFrame(0),
+        intents.AcceptAndNext(),
+        intents.AcceptAndNext(),
+        intents.ShowFrame(8),
+    )
     work.run()
-    work.do(ask.HoldKeyframe(True), ask.ShowFrame(5), ask.Solve())
+    work.do(intents.HoldKeyframe(True), intents.ShowFrame(5), intents.Solve())
     work.wait(lambda: not app.state.solving)
     work.picture("solve")
-    work.do(ask.ShowFrame(2), *[ask.AcceptAndNext()] * 5, ask.SetNote("check the jaw of psm2"), ask.Released())
+    work.do(
+        intents.ShowFrame(2),
+        *[intents.AcceptAndNext()] * 5,
+        intents.SetNote("check the jaw of psm2"),
+        intents.Released(),
+    )
     work.picture("review")
     work.tab("Export")
     work.choose("Format", "COCO")

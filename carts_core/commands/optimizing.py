@@ -24,7 +24,7 @@ from ..stopping import when_stopped
 from ..wording import counted
 from .frame_folder import FrameFolder, FrameResult
 from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_hints
-from .optimize import Optimize
+from .optimize_options import OptimizeOptions
 from .origins import Origin, Origins
 from .selection import output_folder
 
@@ -50,7 +50,7 @@ class Optimizing:
         asked: the command line.
     """
 
-    def __init__(self, asked: Optimize) -> None:
+    def __init__(self, asked: OptimizeOptions) -> None:
         self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
         self._frames = asked.select.frame_indices(self._sequence)

@@ -28,7 +28,7 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from carts_viewer.app import serve
+        from carts_viewer.serving import serve
 
         serve(
             self.sequence or sample_sequence(),

@@ -3,12 +3,12 @@
 import viser
 
 from carts_core.project import Source
-from carts_viewer import intents as ask
-from carts_viewer.browsing import SPEEDS
-from carts_viewer.page import Page
+from carts_viewer import intents
+from carts_viewer.handlers.browsing import SPEEDS
 from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Scores, ViewState
+from carts_viewer.transport.page import Page
 
 _SOURCES = {
     Source.MEASURED: "joints as measured",
@@ -51,26 +51,26 @@ class BrowsePanel:
             )
             self._error = gui.add_html("", visible=False)
             self._caption = gui.add_html("")
-        on_input(self._frame, lambda value: ask.ShowFrame(int(value) - 1), emit)
-        on_click(back, lambda _: ask.MoveFrame(-1), emit)
-        on_click(forward, lambda _: ask.MoveFrame(1), emit)
-        on_click(self._play, lambda _: ask.Play(), emit)
-        on_input(self._speed, ask.SetSpeed, emit)
-        on_input(self._offset, ask.SetTimeOffset, emit)
-        on_input(self._domain, lambda label: ask.ShowDomain(self._domains[label]), emit)
-        on_input(self._camera, ask.ShowCamera, emit)
+        on_input(self._frame, lambda value: intents.ShowFrame(int(value) - 1), emit)
+        on_click(back, lambda _: intents.MoveFrame(-1), emit)
+        on_click(forward, lambda _: intents.MoveFrame(1), emit)
+        on_click(self._play, lambda _: intents.Play(), emit)
+        on_input(self._speed, intents.SetSpeed, emit)
+        on_input(self._offset, intents.SetTimeOffset, emit)
+        on_input(self._domain, lambda label: intents.ShowDomain(self._domains[label]), emit)
+        on_input(self._camera, intents.ShowCamera, emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
-        if not self._waits(ask.ShowFrame):
+        if not self._waits(intents.ShowFrame):
             write(self._frame, state.index + 1)
-        if not self._waits(ask.SetSpeed):
+        if not self._waits(intents.SetSpeed):
             write(self._speed, state.fps)
         self._error.visible = state.time_error is not None
         self._error.content = f'<p class="carts-error">{escaped(state.time_error or "")}</p>'
         offset = self._session.time_offset
         # What could not be used stays in the field, where it is being typed.
-        if offset is not None and state.time_error is None and not self._waits(ask.SetTimeOffset):
+        if offset is not None and state.time_error is None and not self._waits(intents.SetTimeOffset):
             write(self._offset, offset)
         write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
         write(self._camera, state.camera)

@@ -4,13 +4,13 @@ import viser
 
 from carts_core.export import FORMATS
 from carts_core.project import ProjectState, ReviewState, frames_in
-from carts_viewer import intents as ask
-from carts_viewer.exporting import FRAME_CHOICES
-from carts_viewer.page import Page
+from carts_viewer import intents
+from carts_viewer.handlers.exporting import FRAME_CHOICES
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
+from carts_viewer.transport.page import Page
 
 _PARTS = {"Arm": "arms", "Link": "links"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
@@ -46,12 +46,12 @@ class ExportPanel:
         with gui.add_folder("This frame"):
             gui.add_html('<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background.</p>')
             mask = gui.add_button("Export mask", icon=viser.Icon.PHOTO_DOWN, color="gray")
-        on_click(mask, ask.ExportMask, emit)
+        on_click(mask, intents.ExportMask, emit)
         on_click(self._export, lambda _: self._intent(), emit)
-        on_click(self._cancel, lambda _: ask.CancelExport(), emit)
-        on_click(self._download, ask.Download, emit)
+        on_click(self._cancel, lambda _: intents.CancelExport(), emit)
+        on_click(self._download, intents.Download, emit)
         for widget in (self._format, self._frames):
-            on_input(widget, lambda _: ask.Refresh(), emit)
+            on_input(widget, lambda _: intents.Refresh(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
@@ -76,9 +76,9 @@ class ExportPanel:
             text += "" if self._kept else f"<br>{_NOT_KEPT}"
         self._result.content = f'<p class="carts-caption" role="status">{text}</p>'
 
-    def _intent(self) -> ask.Export:
+    def _intent(self) -> intents.Export:
         """What the widgets say; the controller refuses what they cannot say."""
-        return ask.Export(
+        return intents.Export(
             self._formats.get(self._format.value, self._format.value),  # type: ignore[arg-type]
             self._frames.value,
             _PARTS.get(self._parts.value, self._parts.value),  # type: ignore[arg-type]

@@ -5,24 +5,24 @@ from collections.abc import Callable
 import viser
 
 from carts_core.resources import static_dir
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.keys import Shortcut, key_table, shortcuts
 from carts_viewer.layers import Layer
-from carts_viewer.page import OWN_KEYS, Page
 from carts_viewer.panels.inputs import Emit
+from carts_viewer.transport.page import OWN_KEYS, Page
 
 
 class HelpPanel:
     """Registers the shortcuts and explains everything in a few words."""
 
-    def __init__(self, page: Page, layers: list[Layer], perturb: Callable[[], ask.Intent], emit: Emit) -> None:
+    def __init__(self, page: Page, layers: list[Layer], perturb: Callable[[], intents.Intent], emit: Emit) -> None:
         gui = page.server.gui
         own = {}
         for shortcut in shortcuts(layers):
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
             command = gui.add_command(shortcut.label, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             _listen(page, command, shortcut, perturb, emit)
-            if hotkey is None and isinstance(shortcut.action, ask.Intent):
+            if hotkey is None and isinstance(shortcut.action, intents.Intent):
                 own[shortcut.hotkey] = shortcut.action
         page.on_pressed(lambda key: emit(own[key]) if key in own else None)
         text = (static_dir() / "help.md").read_text(encoding="utf-8")
@@ -30,13 +30,13 @@ class HelpPanel:
 
 
 def _listen(
-    page: Page, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], ask.Intent], emit: Emit
+    page: Page, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], intents.Intent], emit: Emit
 ) -> None:
     @command.on_trigger
     async def _(event: viser.CommandEvent) -> None:
-        if isinstance(shortcut.action, ask.Intent):
+        if isinstance(shortcut.action, intents.Intent):
             emit(shortcut.action)
         elif shortcut.action == "perturb":
             emit(perturb())
         elif event.client is not None:
-            page.tell(event.client, "toggleView")
+            page.call(event.client, "toggleView")

@@ -9,8 +9,8 @@ import viser
 
 from carts_core.console import visible
 from carts_viewer.intents import Intent, Refresh
-from carts_viewer.page import on_sent
 from carts_viewer.state import ViewState
+from carts_viewer.transport.viser_private import on_sent
 
 Emit = Callable[[Intent], None]
 """Hands an intent to the worker; never blocks."""

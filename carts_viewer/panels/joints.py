@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import viser
 
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
+from carts_viewer.handlers.posing import LARGEST_PERTURBATION
 from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
-from carts_viewer.posing import LARGEST_PERTURBATION
 from carts_viewer.session import JointRange, Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 _WINDOWS = {"± 5": 5.0, "± 20": 20.0, "Full range": math.inf}
 _STEP = 0.05
@@ -57,22 +57,22 @@ class JointsPanel:
         }
         self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="The joint that the keys I and O move")
         on_click(perturb, lambda _: self.perturb(), emit)
-        on_click(measured, lambda _: ask.BackToMeasured(), emit)
-        on_click(before, lambda _: ask.CopyCorrection(-1), emit)
-        on_click(after, lambda _: ask.CopyCorrection(1), emit)
-        on_input(self._nudged, lambda name: ask.ChooseJoint(self._names[name]), emit)
+        on_click(measured, lambda _: intents.BackToMeasured(), emit)
+        on_click(before, lambda _: intents.CopyCorrection(-1), emit)
+        on_click(after, lambda _: intents.CopyCorrection(1), emit)
+        on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]), emit)
 
         @window.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None and window.value in _WINDOWS:
                 self._window = _WINDOWS[window.value]
                 self._centred_on = None
-                emit(ask.Refresh())
+                emit(intents.Refresh())
 
-    def perturb(self) -> ask.Perturb:
+    def perturb(self) -> intents.Perturb:
         """The perturbation that the fields describe."""
         seed = int(self._seed.value) if valid(self._seed, self._seed.value) else 0
-        return ask.Perturb(float(self._degrees.value), max(0, seed))
+        return intents.Perturb(float(self._degrees.value), max(0, seed))
 
     def slider(self, arm: str, joint: int) -> viser.GuiSliderHandle[float]:
         """The slider of one joint."""
@@ -89,7 +89,7 @@ class JointsPanel:
                 shown = to_shown(limits, float(joints[arm][joint]))
                 # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
                 near = math.isfinite(slider.value) and abs(slider.value - shown) < _STEP / 2
-                if not near and not self._waits((ask.SetJoint, arm, joint)):
+                if not near and not self._waits((intents.SetJoint, arm, joint)):
                     self._widen(slider, shown)
                     slider.value = round(shown, 2)
         if state.joint is not None:
@@ -110,10 +110,10 @@ class JointsPanel:
             on_input(slider, self._intent(arm, joint, limits), emit)
         if len(self._session.scene.arms) > 1:
             reset = gui.add_button(f"{arm} back to measured", icon=viser.Icon.HISTORY, color="gray")
-            on_click(reset, lambda _: ask.BackToMeasured(arm), emit)
+            on_click(reset, lambda _: intents.BackToMeasured(arm), emit)
 
-    def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], ask.Intent]:
-        return lambda shown: ask.SetJoint(arm, joint, from_shown(limits, shown))
+    def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], intents.Intent]:
+        return lambda shown: intents.SetJoint(arm, joint, from_shown(limits, shown))
 
     def _centre(self, state: ViewState) -> None:
         """Put the sliders' ends around the measured values, within the joints' limits."""

@@ -4,11 +4,11 @@ import viser
 
 from carts_core.project import ProjectState, between_kept
 from carts_core.settings import Direction
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
@@ -32,11 +32,11 @@ class KeyframesPanel:
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._stop = gui.add_button("Stop and keep", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        on_input(self._held, lambda on: ask.HoldKeyframe(bool(on)), emit)
-        on_click(self._between, lambda _: ask.Solve(), emit)
-        on_click(self._all, lambda _: ask.Solve(whole=True), emit)
-        on_click(self._stop, lambda _: ask.StopSolving(), emit)
-        on_input(self._direction, lambda label: ask.SetDirection(_DIRECTIONS[label]), emit)
+        on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)), emit)
+        on_click(self._between, lambda _: intents.Solve(), emit)
+        on_click(self._all, lambda _: intents.Solve(whole=True), emit)
+        on_click(self._stop, lambda _: intents.StopSolving(), emit)
+        on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""

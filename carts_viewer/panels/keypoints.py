@@ -2,12 +2,12 @@
 
 import viser
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.marks import labelled_keypoints
-from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 _NEAREST = "Nearest to the pointer"
 
@@ -28,9 +28,9 @@ class KeypointsPanel:
             self._shown = gui.add_checkbox("Show keypoints", False)
             self._residuals = gui.add_html("")
             self._forget = gui.add_button("Forget the clicks", icon=viser.Icon.X, color="gray", visible=False)
-        on_input(self._chosen, lambda label: ask.ChooseKeypoint(None if label == _NEAREST else label), emit)
-        on_input(self._shown, lambda on: ask.ShowKeypoints(bool(on)), emit)
-        on_click(self._forget, lambda _: ask.ForgetPins(), emit)
+        on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label), emit)
+        on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)), emit)
+        on_click(self._forget, lambda _: intents.ForgetPins(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""

@@ -2,10 +2,10 @@
 
 import viser
 
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 
 class MessagePanel:
@@ -17,7 +17,7 @@ class MessagePanel:
         self._notes: list[viser.NotificationHandle] = []
         self._text = page.server.gui.add_html("", visible=False)
         self._dismiss = page.server.gui.add_button("Dismiss", icon=viser.Icon.X, color="red", visible=False)
-        on_click(self._dismiss, lambda _: ask.DismissError(), emit)
+        on_click(self._dismiss, lambda _: intents.DismissError(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the message up to date."""

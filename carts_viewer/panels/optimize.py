@@ -4,11 +4,11 @@ import viser
 
 from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.settings import SolverName
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
+from carts_viewer.transport.page import Page
 
 SOLVER_LABELS = {
     SolverName.SURFACE: "Surface maps (default)",
@@ -38,12 +38,12 @@ class OptimizePanel:
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["Shown camera", "All cameras"], visible=len(cameras) > 1)
-        on_click(self._run, lambda _: ask.Run(), emit)
-        on_click(self._pause, lambda _: ask.Pause(), emit)
-        on_click(self._step, lambda _: ask.Step(), emit)
-        on_click(self._reset, lambda _: ask.Reset(), emit)
-        on_input(self._solver, lambda label: ask.SetSetting("solver", self._solvers[label]), emit)
-        on_input(self._cameras, lambda label: ask.SetCameras(label == "All cameras"), emit)
+        on_click(self._run, lambda _: intents.Run(), emit)
+        on_click(self._pause, lambda _: intents.Pause(), emit)
+        on_click(self._step, lambda _: intents.Step(), emit)
+        on_click(self._reset, lambda _: intents.Reset(), emit)
+        on_input(self._solver, lambda label: intents.SetSetting("solver", self._solvers[label]), emit)
+        on_input(self._cameras, lambda label: intents.SetCameras(label == "All cameras"), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""

@@ -1,11 +1,11 @@
 """What is drawn over the frame, and what its colours mean."""
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
-from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 
 class OverlayPanel:
@@ -21,13 +21,13 @@ class OverlayPanel:
             self._layer = gui.add_dropdown("Layer", [str(layer) for layer in options], initial_value=str(state.layer))
             self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
             self._legend = gui.add_html("")
-        on_input(self._layer, lambda value: ask.ShowLayer(Layer(value)), emit)
-        on_input(self._opacity, lambda value: ask.SetOpacity(value / 100), emit)
+        on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)), emit)
+        on_input(self._opacity, lambda value: intents.SetOpacity(value / 100), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
         write(self._layer, str(state.layer))
-        if not self._waits(ask.SetOpacity):
+        if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))
         self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
 

@@ -3,13 +3,13 @@
 import viser
 
 from carts_core.settings import DescentSolver
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR
-from carts_viewer.page import Page
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.strokes import DIAMETERS, Target, Tool
+from carts_viewer.transport.page import Page
 
 _ICONS = {
     Tool.OFF: viser.Icon.POINTER,
@@ -33,7 +33,7 @@ class PaintPanel:
     def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         self._page, self._scene, self._waits = page, session.scene, waits
-        self._told: dict[str, object] = self._message(state)
+        self._sent: dict[str, object] = self._message(state)
         with gui.add_folder("Paint", expand_by_default=False):
             self._tools = {tool: gui.add_button(str(tool), icon=icon) for tool, icon in _ICONS.items()}
             for first in range(0, len(Tool), 2):
@@ -44,15 +44,15 @@ class PaintPanel:
             self._text = gui.add_html("")
             self._clear = gui.add_button("Clear", icon=viser.Icon.TRASH, color="gray")
         for tool, button in self._tools.items():
-            on_click(button, lambda _, tool=tool: ask.SetTool(tool), emit)
+            on_click(button, lambda _, tool=tool: intents.SetTool(tool), emit)
         for target, button in self._targets.items():
-            on_click(button, lambda _, target=target: ask.SetTarget(target), emit)
-        on_input(self._size, ask.SetDiameter, emit)
-        on_click(self._clear, lambda _: ask.ClearLayer(), emit)
+            on_click(button, lambda _, target=target: intents.SetTarget(target), emit)
+        on_input(self._size, intents.SetDiameter, emit)
+        on_click(self._clear, lambda _: intents.ClearLayer(), emit)
 
         @page.server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
-            page.tell(client, "setBrush", self._told)
+            page.call(client, "setBrush", self._sent)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets, and the pages' scripts, up to date."""
@@ -61,7 +61,7 @@ class PaintPanel:
             _press(button, tool is brush.tool)
         for target, button in self._targets.items():
             _press(button, target is brush.target)
-        if not self._waits(ask.SetDiameter):
+        if not self._waits(intents.SetDiameter):
             write(self._size, brush.diameter)
         self._size.disabled = brush.tool is Tool.POLYGON
         layer = state.mask_correction if brush.target is Target.MASK else state.ignore_region
@@ -72,10 +72,10 @@ class PaintPanel:
             hint += " This solver does not use the ignore region; <b>Surface maps</b> does."
         self._text.content = f'<p class="carts-caption">{hint}<br>{_counts(state)}</p>'
         message = self._message(state)
-        if message != self._told:
-            self._told = message
+        if message != self._sent:
+            self._sent = message
             for client in self._page.server.get_clients().values():
-                self._page.tell(client, "setBrush", message)
+                self._page.call(client, "setBrush", message)
 
     def _message(self, state: ViewState) -> dict[str, object]:
         """What a page must know to draw strokes by itself."""

@@ -2,11 +2,11 @@
 
 import viser
 
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
+from carts_viewer.transport.page import Page
 
 _LISTED = 60
 """Steps in the list, around the present one."""
@@ -24,8 +24,8 @@ class SavedPanel:
         self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
         self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
         page.row(self._undo, self._redo)
-        on_click(self._undo, lambda _: ask.Undo(), emit)
-        on_click(self._redo, lambda _: ask.Redo(), emit)
+        on_click(self._undo, lambda _: intents.Undo(), emit)
+        on_click(self._redo, lambda _: intents.Redo(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the line and the buttons up to date."""
@@ -55,7 +55,7 @@ class HistoryPanel:
         with gui.add_folder("History"):
             self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")
             page.columns([self._steps], 1, narrow_labels=True)
-        on_input(self._steps, lambda label: ask.GoToStep(self._positions[label]), emit)
+        on_input(self._steps, lambda label: intents.GoToStep(self._positions[label]), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the list up to date."""

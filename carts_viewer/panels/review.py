@@ -5,10 +5,10 @@ from collections import Counter
 import viser
 
 from carts_core.project import Kind, ProjectState, ReviewState
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 STATE_COLORS = {
     ReviewState.UNTOUCHED: "#6b7280",
@@ -41,25 +41,25 @@ class ReviewPanel:
             page.row(previous, following, weights=(5, 4))
             unreviewed = gui.add_button("Next unreviewed", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
             self._counts = gui.add_html("")
-        on_click(accept, lambda _: ask.AcceptAndNext(), emit)
+        on_click(accept, lambda _: intents.AcceptAndNext(), emit)
         for button, state in (
             (keep, ReviewState.ACCEPTED),
             (work, ReviewState.NEEDS_WORK),
             (reject, ReviewState.REJECTED),
             (clear, ReviewState.UNTOUCHED),
         ):
-            on_click(button, lambda _, state=state: ask.SetReview(state), emit)
-        on_click(previous, lambda _: ask.ShowWorse(-1), emit)
-        on_click(following, lambda _: ask.ShowWorse(1), emit)
-        on_click(unreviewed, lambda _: ask.ShowUnreviewed(1), emit)
-        on_input(self._note, ask.SetNote, emit)
+            on_click(button, lambda _, state=state: intents.SetReview(state), emit)
+        on_click(previous, lambda _: intents.ShowWorse(-1), emit)
+        on_click(following, lambda _: intents.ShowWorse(1), emit)
+        on_click(unreviewed, lambda _: intents.ShowUnreviewed(1), emit)
+        on_input(self._note, intents.SetNote, emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
         review = state.review
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
         self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{review.state}</b>{keyframe}</p>'
-        if not self._waits(ask.SetNote):
+        if not self._waits(intents.SetNote):
             write(self._note, review.note)
         if self._counted is None or not (state.unsaved or state.project is self._counted):
             self._counted = state.project

@@ -8,11 +8,11 @@ from typing import Any, get_args, get_type_hints
 
 from carts_core.settings import DescentSolver, SurfaceSolver
 from carts_core.settings.docstrings import field_docstrings
-from carts_viewer import intents as ask
-from carts_viewer.page import Page
+from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
 
 _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsics": "Camera intrinsics"}
 
@@ -106,12 +106,12 @@ def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
 
 
 def _setter(name: str):
-    return lambda value: ask.SetSetting(name, value)
+    return lambda value: intents.SetSetting(name, value)
 
 
 def _free_joint(arm: str, joint: str):
-    return lambda on: ask.SetFreeJoint(arm, joint, bool(on))
+    return lambda on: intents.SetFreeJoint(arm, joint, bool(on))
 
 
 def _free_group(name: str):
-    return lambda on: ask.SetFreeGroup(name, bool(on))
+    return lambda on: intents.SetFreeGroup(name, bool(on))

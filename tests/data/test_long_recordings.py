@@ -5,7 +5,7 @@ import math
 import pytest
 
 from carts_core.data import Sequence
-from carts_core.data.bench import browse, make_recording, open_seconds
+from tools.bench_recordings import browse, make_recording, open_seconds
 
 FRAMES = 60
 IMAGE_BYTES = 640 * 480 * 3

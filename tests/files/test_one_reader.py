@@ -15,7 +15,6 @@ ALLOWED = {
     "project": "reads its own database, lock and log",
     "benchmark": "reads its own results, its source, and the machine's description",
     "synthesis": "reads what it wrote",
-    "data/bench.py": "reads the state of its own process",
     "commands/frame_folder.py": "reads what an earlier run of the same command wrote",
     "commands/result_records.py": "reads what an earlier run of the same command wrote",
     "checkpoint.py": "reads what an earlier run of the same command wrote",

@@ -19,7 +19,7 @@ from carts_core.features.network import FeatureNetwork
 from carts_core.features.weights import save_weights
 from carts_core.project import Project
 from carts_core.settings import Architecture
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.running import OptimizerFactory
 
@@ -101,7 +101,7 @@ def open_marked(open_viewer: Callable[..., ViewerApp]) -> Callable[..., ViewerAp
 
     def make() -> ViewerApp:
         app = open_viewer(width=320, height=240, edit=uneven, masks=False, prepare=mark_frames)
-        app.mailbox.put(ask.SetOpacity(1.0))
+        app.queue.put(intents.SetOpacity(1.0))
         app.wait_until_shown()
         return app
 

@@ -23,15 +23,15 @@ from carts_core.data import Sequence
 from carts_core.errors import ProjectError, SequenceError, SettingsError
 from carts_core.project import Project, ProjectState
 from carts_core.resources import sample_sequence
-from carts_viewer import editing
-from carts_viewer import intents as ask
-from carts_viewer.app import ViewerApp, serve
+from carts_viewer import editing, intents
+from carts_viewer.app import ViewerApp
 from carts_viewer.layers import Layer, mask
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.browse import BrowsePanel
-from carts_viewer.picture import Painter
-from carts_viewer.raw_tab import RawTab
-from carts_viewer.stage import FRAME, OVERLAY
+from carts_viewer.scene_view import FRAME, OVERLAY
+from carts_viewer.serving import serve
 from carts_viewer.storage import open_storage
+from tools.raw_tab import RawTab
 
 
 def _get(app: ViewerApp, path: str, **headers: str) -> http.client.HTTPResponse:
@@ -53,15 +53,15 @@ def _picture(png: bytes) -> np.ndarray:
 
 def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer(masks=False)
-    app.mailbox.put(ask.ShowLayer(Layer.MASK))
+    app.queue.put(intents.ShowLayer(Layer.MASK))
     slider = app.joints.slider("PSM1", 0)
     with RawTab(app.url) as tab:
         for value in np.linspace(-5.0, 5.0, 100):
             tab.set(app.page.element_id(slider), float(value))
         _wait_for(lambda: app.state.pose.scene.joint_positions[0][0] == pytest.approx(math.radians(5.0)))
         state = app.wait_until_shown()
-        _wait_for(lambda: tab.overlays[-1][1] == app.stage.sent(OVERLAY))
-        fresh = Painter(app.sequence).arm_ids(state.pose.scene, "left")
+        _wait_for(lambda: tab.overlays[-1][1] == app.scene_view.sent(OVERLAY))
+        fresh = OverlayRenderer(app.sequence).arm_ids(state.pose.scene, "left")
         assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
         assert 1 <= len(tab.overlays) < 100
 
@@ -123,11 +123,11 @@ def test_a_missing_image_is_an_error_in_the_page_and_the_server_stays_up(open_vi
     app = open_viewer(frames=12)
     image = app.sequence.path.parent / "regular" / "left" / "012.png"  # Too far away to be read in advance.
     image.rename(image.with_suffix(".gone"))
-    app.mailbox.put(ask.ShowFrame(11))
+    app.queue.put(intents.ShowFrame(11))
     state = app.wait_until_shown()
     assert state.error is not None and "012.png" in state.error and state.index == 0
     image.with_suffix(".gone").rename(image)
-    app.mailbox.put(ask.ShowFrame(11))
+    app.queue.put(intents.ShowFrame(11))
     state = app.wait_until_shown()
     assert state.index == 11 and state.error is None
     assert _get(app, "/").status == 200
@@ -148,13 +148,13 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
 
     monkeypatch.setattr(app.sequence, "frame", slow)
     before = app.state
-    sent = app.stage.sent(FRAME)
-    app.mailbox.put(ask.ShowFrame(5))
+    sent = app.scene_view.sent(FRAME)
+    app.queue.put(intents.ShowFrame(5))
     assert asked.wait(30)
-    assert app.state.frame is before.frame and app.stage.sent(FRAME) == sent
+    assert app.state.frame is before.frame and app.scene_view.sent(FRAME) == sent
     decoded.set()
     state = app.wait_until_shown()
-    assert state.index == state.frame.index == 5 and app.stage.sent(FRAME) != sent
+    assert state.index == state.frame.index == 5 and app.scene_view.sent(FRAME) != sent
 
 
 def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
@@ -168,13 +168,13 @@ def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
         (folder / "frames.csv").write_text("frame,timestamp\n1,0.1\n2,0.15\n3,0.2\n")
 
     app = open_viewer(edit=describe, prepare=add_times)
-    app.mailbox.put(ask.ShowFrame(1))
+    app.queue.put(intents.ShowFrame(1))
     app.wait_until_shown()
     captions = [panel._caption.content for panel in app.display._panels if isinstance(panel, BrowsePanel)]
     assert ["at 0.150 s" in caption for caption in captions] == [True]
     offset = app.page.find("Time offset [s]")
     assert offset.visible and offset.value == -0.035
-    app.mailbox.put(ask.SetTimeOffset(-0.02))
+    app.queue.put(intents.SetTimeOffset(-0.02))
     app.wait_until_shown()
     assert offset.value == -0.02
     assert not open_viewer().page.find("Time offset [s]").visible
@@ -182,7 +182,7 @@ def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
 
 def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer(frames=6)
-    app.mailbox.put(ask.ShowFrame(1))
+    app.queue.put(intents.ShowFrame(1))
     app.wait_until_shown()
     app.close()
     assert not [thread for thread in threading.enumerate() if thread.name == "carts-frames"]
@@ -190,10 +190,10 @@ def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[...
 
 def test_weights_that_are_missing_are_an_error_in_the_page(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     with ViewerApp.open(tiny_sequence(), port=0, weights=(tmp_path / "none.safetensors",)) as app:
-        app.mailbox.put(ask.Run())
+        app.queue.put(intents.Run())
         state = app.wait_until_shown(60)
         assert "none.safetensors" in (state.error or "") and state.busy is None
-        app.mailbox.put(ask.MoveFrame(1))
+        app.queue.put(intents.MoveFrame(1))
         assert app.wait_until_shown().index == 1
 
 
@@ -201,10 +201,10 @@ def test_a_layer_that_cannot_be_computed_is_an_error_once_and_not_for_ever(
     tiny_sequence: Callable[..., Path], tmp_path: Path
 ) -> None:
     with ViewerApp.open(tiny_sequence(), port=0, weights=(tmp_path / "none.safetensors",)) as app:
-        app.mailbox.put(ask.ShowLayer(Layer.ATTENTION))
+        app.queue.put(intents.ShowLayer(Layer.ATTENTION))
         state = app.wait_until_shown(60)
         assert "none.safetensors" in (state.error or "") and state.layer is Layer.MASK
-        app.mailbox.put(ask.DismissError())
+        app.queue.put(intents.DismissError())
         assert app.wait_until_shown().error is None
 
 
@@ -266,7 +266,7 @@ def test_serve_ends_with_code_2_and_a_message_when_the_sequence_is_missing(capsy
 def test_serve_prints_the_address_and_ends_cleanly_on_ctrl_c(tiny_sequence: Callable[..., Path]) -> None:
     # A shell that runs the tests in the background makes its children ignore Ctrl-C, hence the second line.
     program = """
-import signal, sys; from pathlib import Path; from carts_viewer.app import serve
+import signal, sys; from pathlib import Path; from carts_viewer.serving import serve
 signal.signal(signal.SIGINT, signal.default_int_handler)
 serve(Path(sys.argv[1]), port=0)
 """
@@ -287,7 +287,7 @@ serve(Path(sys.argv[1]), port=0)
 
 def test_closing_twice_and_closing_while_running_do_no_harm(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    app.mailbox.put(ask.Run())
+    app.queue.put(intents.Run())
     app.close()
     app.close()
 
@@ -301,16 +301,16 @@ def _reopened(app: ViewerApp) -> ProjectState:
 def test_what_is_done_in_the_page_is_in_the_project_beside_the_sequence(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
     assert app.project.path == app.sequence.path.with_suffix(".carts").resolve()
-    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     assert app.wait_until_shown().unsaved and not app.project.state.steps
-    app.mailbox.put(ask.Released())
+    app.queue.put(intents.Released())
     assert not app.wait_until_shown().unsaved
     assert _reopened(app).joints(0)["PSM1"].joint_positions[0] == pytest.approx(0.1)
 
 
 def test_closing_saves_the_gesture_under_way(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     app.wait_until_shown()
     assert [step.name for step in _reopened(app).steps] == ["Move PSM1 yaw, frame 001"]
 
@@ -320,7 +320,7 @@ def test_a_gesture_that_nobody_ends_is_saved_all_the_same(
 ) -> None:
     monkeypatch.setattr(editing, "LONGEST_DRAFT", 0.2)
     app = open_viewer()
-    app.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
+    app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     _wait_for(lambda: len(app.project.state.steps) == 1 and not app.state.unsaved)
 
 
@@ -328,12 +328,12 @@ def test_a_second_viewer_of_the_same_project_saves_nothing_and_says_so(open_view
     app = open_viewer()
     with ViewerApp.open(app.sequence.path, port=0) as second:
         assert "open for writing elsewhere" in (second.notice or "") and app.notice is None
-        second.mailbox.put(ask.SetJoint("PSM1", 0, 0.1))
-        second.mailbox.put(ask.Released())
+        second.queue.put(intents.SetJoint("PSM1", 0, 0.1))
+        second.queue.put(intents.Released())
         state = second.wait_until_shown()
         assert state.unsaved and state.pose.scene.joint_positions[0][0] == pytest.approx(0.1)
-        second.mailbox.put(ask.MoveFrame(1))
-        second.mailbox.put(ask.MoveFrame(-1))
+        second.queue.put(intents.MoveFrame(1))
+        second.queue.put(intents.MoveFrame(-1))
         state = second.wait_until_shown()
         assert not state.unsaved and not state.project.joints(0) and state.error is None
     assert not app.project.state.steps

@@ -15,7 +15,7 @@ from viewer_desk import Desk
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.project import Project, ReviewState, Source
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 
 FRAMES = 3
@@ -112,20 +112,20 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
         @rule(joint=st.integers(0, 1), count=st.integers(1, 3), release=st.booleans())
         def drag(self, joint: int, count: int, release: bool) -> None:
             self.model.release()
-            self.desk.do(ask.Released())
+            self.desk.do(intents.Released())
             for _ in range(count):
                 self.values += 1
-                self.desk.do(ask.SetJoint(ARM, joint, _STEP * self.values))
+                self.desk.do(intents.SetJoint(ARM, joint, _STEP * self.values))
             moved = self._joints()
             moved[joint] = _STEP * self.values
             self.model.drag = self.model.changed(joints=tuple(moved), copied=False)
             if release:
-                self.desk.do(ask.Released())
+                self.desk.do(intents.Released())
                 self.model.release()
 
         @rule(degrees=st.sampled_from((0.1, 1.0)))
         def nudge(self, degrees: float) -> None:
-            self.desk.do(ask.ChooseJoint((ARM, 1)), ask.Nudge(degrees))
+            self.desk.do(intents.ChooseJoint((ARM, 1)), intents.Nudge(degrees))
             moved = self._joints()
             moved[1] = min(moved[1] + np.deg2rad(degrees), high[1])
             self.model.release()
@@ -134,7 +134,7 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
 
         @rule()
         def back_to_measured(self) -> None:
-            self.desk.do(ask.BackToMeasured(ARM))
+            self.desk.do(intents.BackToMeasured(ARM))
             self.model.do(joints=None, copied=False)
 
         @rule(step=st.sampled_from((-1, 1)))
@@ -142,56 +142,56 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
             source = self.model.index + step
             if not 0 <= source < FRAMES or self.model.frames[source].joints is None:
                 with pytest.raises(CartsError):
-                    self.desk.do(ask.CopyCorrection(step))
+                    self.desk.do(intents.CopyCorrection(step))
                 return
             change = np.array(self.model.frames[source].joints) - measured[source]
             copied = np.clip(measured[self.model.index] + change, low, high)
             if np.abs(copied - self._joints()).max() > 1e-5:  # Else it is a matter of rounding whether that is a step.
-                self.desk.do(ask.CopyCorrection(step))
+                self.desk.do(intents.CopyCorrection(step))
                 self.model.do(joints=tuple(copied), copied=True)
 
         @rule(state=st.sampled_from(list(ReviewState)))
         def review(self, state: ReviewState) -> None:
-            self.desk.do(ask.SetReview(state))
+            self.desk.do(intents.SetReview(state))
             self.model.do(review=state)
 
         @rule(text=st.text(max_size=20), release=st.booleans())
         def note(self, text: str, release: bool) -> None:
             self.model.release()
-            self.desk.do(ask.Released(), ask.SetNote(text))
+            self.desk.do(intents.Released(), intents.SetNote(text))
             self.model.drag = self.model.changed(note=self.desk.state.review.note)
             if release:
-                self.desk.do(ask.Released())
+                self.desk.do(intents.Released())
                 self.model.release()
 
         @rule(on=st.booleans())
         def keyframe(self, on: bool) -> None:
-            self.desk.do(ask.HoldKeyframe(on))
+            self.desk.do(intents.HoldKeyframe(on))
             self.model.do(marked=on)
 
         @rule(index=st.integers(0, FRAMES - 1))
         def show(self, index: int) -> None:
-            self.desk.do(ask.Released(), ask.ShowFrame(index))
+            self.desk.do(intents.Released(), intents.ShowFrame(index))
             self.model.release()
             self.model.index = index
 
         @rule()
         def undo(self) -> None:
             self.model.release()
-            self.desk.do(ask.Undo())
+            self.desk.do(intents.Undo())
             self.model.go_to(self.model.position - 1)
 
         @rule()
         def redo(self) -> None:
             self.model.release()
-            self.desk.do(ask.Redo())
+            self.desk.do(intents.Redo())
             self.model.go_to(self.model.position + 1)
 
         @rule(share=st.floats(0, 1))
         def go_to(self, share: float) -> None:
             self.model.release()
             position = round(share * (len(self.model.snapshots) - 1))
-            self.desk.do(ask.GoToStep(position))
+            self.desk.do(intents.GoToStep(position))
             self.model.go_to(position)
 
         @rule()

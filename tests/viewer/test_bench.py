@@ -5,10 +5,10 @@ from math import isfinite
 
 import pytest
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.bench import frame_latency, memory_while_optimizing, slider_latency
-from carts_viewer.soak import Soaking
+from tools.bench_viewer import frame_latency, memory_while_optimizing, slider_latency
+from tools.soak import Soaking
 
 
 @pytest.mark.slow
@@ -35,16 +35,16 @@ def test_a_short_soak_sees_what_it_is_there_for(
     assert seen.rounds == seen.reloads == 1 and seen.frames == 40 and seen.iterations > 0
     assert not seen.stale and not seen.exceptions and seen.growth == seen.spread == 0.0
     # A server that no longer sends overlays, and one whose worker fails, are noticed.
-    monkeypatch.setattr(app.stage, "show_overlay", lambda *_: None)
+    monkeypatch.setattr(app.scene_view, "show_overlay", lambda *_: None)
     assert Soaking(app, run=0.5).soak(0.01).stale
-    monkeypatch.setattr(app.stage, "show_frame", lambda *_: 1 / 0)
+    monkeypatch.setattr(app.scene_view, "show_frame", lambda *_: 1 / 0)
     assert any("unexpected error" in line for line in Soaking(app, run=0.5).soak(0.01).exceptions)
 
 
 @pytest.mark.slow
 def test_memory_stays_flat_while_the_optimizer_runs(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    app.mailbox.put(ask.SetSetting("working_width", 96))
+    app.queue.put(intents.SetSetting("working_width", 96))
     samples = memory_while_optimizing(app, iterations=500)
     assert samples[-1][0] >= 500 and len(samples) > 5
     # The first runs allocate what the rest reuse.

@@ -13,9 +13,9 @@ from playwright.sync_api import Browser, expect
 from viewer_canvas import decoded, eventually
 from viewer_tab import Tab
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.picture import Painter
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser
@@ -139,7 +139,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     tab = open_tab(app)
     tab.button("Perturb all joints")
     eventually(lambda: app.state.undoable, lambda count: count == 1)
-    start = app.stage.sent("/overlay")
+    start = app.scene_view.sent("/overlay")
     tab.button("Run")
     eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
     curves = app.state.run.curves
@@ -148,7 +148,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
     expect(tab.page.get_by_text(f"kept {loss[curves.best]:.3g} of iteration {curves.best}").first).to_be_visible()
     app.wait_until_shown()
-    assert app.stage.sent("/overlay") != start
+    assert app.scene_view.sent("/overlay") != start
     charts = tab.page.evaluate(
         "Object.values(window.__viserTestpoints.uplots).map(entry => Array.from(entry.chart.data[1]))"
     )
@@ -166,7 +166,7 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
     with tab.page.expect_download() as started:
         tab.button("Export mask")
     mask = decoded(Path(started.value.path()).read_bytes())
-    shown = Painter(app.sequence).arm_ids(app.state.pose.scene, "left") >= 0
+    shown = OverlayRenderer(app.sequence).arm_ids(app.state.pose.scene, "left") >= 0
     assert started.value.suggested_filename == "tiny_001_left.png"
     assert np.array_equal(mask > 0, shown)
     tab.button("Export")
@@ -216,7 +216,7 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     tab.page.get_by_text("Review", exact=True).first.click()
     tab.page.keyboard.press("k")
     expect(tab.page.get_by_text("from 001 to 016")).to_be_visible()
-    app.mailbox.put(ask.MoveFrame(1))
+    app.queue.put(intents.MoveFrame(1))
     expect(tab.page.get_by_text("15 to solve, 1 kept")).to_be_visible()
     tab.button("Solve between")
     stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)

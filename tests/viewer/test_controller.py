@@ -8,19 +8,19 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError, SettingsError
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.project import Source
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.layers import Layer
 from carts_viewer.state import Phase
 
 
 def test_frames_beyond_the_ends_are_the_ends(desk: Desk) -> None:
-    assert desk.do(ask.ShowFrame(99)).index == 2
-    assert desk.do(ask.MoveFrame(1)).index == 2
-    assert desk.do(ask.ShowFrame(-5)).index == 0
+    assert desk.do(intents.ShowFrame(99)).index == 2
+    assert desk.do(intents.MoveFrame(1)).index == 2
+    assert desk.do(intents.ShowFrame(-5)).index == 0
 
 
-@pytest.mark.parametrize("intent", [ask.ShowCamera("top"), ask.ShowDomain("rain")])
-def test_an_unknown_camera_or_domain_is_refused_with_the_known_ones(desk: Desk, intent: ask.Intent) -> None:
+@pytest.mark.parametrize("intent", [intents.ShowCamera("top"), intents.ShowDomain("rain")])
+def test_an_unknown_camera_or_domain_is_refused_with_the_known_ones(desk: Desk, intent: intents.Intent) -> None:
     with pytest.raises(CartsError, match="this sequence has: "):
         desk.do(intent)
     assert (desk.state.camera, desk.state.domain) == ("left", "regular")
@@ -29,51 +29,56 @@ def test_an_unknown_camera_or_domain_is_refused_with_the_known_ones(desk: Desk, 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_value_that_is_no_number_is_refused(desk: Desk, value: float) -> None:
     before = desk.joint()
-    for intent in (ask.SetJoint("PSM1", 0, value), ask.SetOpacity(value), ask.SetSpeed(value), ask.Perturb(value, 0)):
+    for intent in (
+        intents.SetJoint("PSM1", 0, value),
+        intents.SetOpacity(value),
+        intents.SetSpeed(value),
+        intents.Perturb(value, 0),
+    ):
         with pytest.raises(CartsError, match="not a number"):
             desk.do(intent)
     assert desk.joint() == before
 
 
 def test_numbers_out_of_range_are_clamped(desk: Desk) -> None:
-    assert desk.do(ask.SetOpacity(7.0)).opacity == 1.0
-    assert desk.do(ask.SetSpeed(1e9)).fps <= 60.0
-    desk.do(ask.SetJoint("PSM1", 0, 1e9))
+    assert desk.do(intents.SetOpacity(7.0)).opacity == 1.0
+    assert desk.do(intents.SetSpeed(1e9)).fps <= 60.0
+    desk.do(intents.SetJoint("PSM1", 0, 1e9))
     assert desk.joint() == pytest.approx(desk.session.joint_range("PSM1", 0).upper, abs=1e-6)
 
 
 def test_a_correction_survives_a_visit_to_other_frames_cameras_and_domains(desk: Desk) -> None:
-    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.ShowCamera("right"), ask.ShowDomain("smoke"))
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.ShowCamera("right"), intents.ShowDomain("smoke"))
     assert desk.joint() == pytest.approx(0.2)
-    desk.do(ask.MoveFrame(1))
+    desk.do(intents.MoveFrame(1))
     assert desk.state.pose.source is Source.MEASURED
-    desk.do(ask.MoveFrame(-1))
+    desk.do(intents.MoveFrame(-1))
     assert desk.joint() == pytest.approx(0.2) and desk.state.pose.source is Source.HAND
 
 
 def test_back_to_measured_forgets_the_correction(desk: Desk) -> None:
     before = desk.joint()
-    desk.do(ask.Perturb(3.0, 1), ask.BackToMeasured())
+    desk.do(intents.Perturb(3.0, 1), intents.BackToMeasured())
     assert desk.joint() == pytest.approx(before) and not desk.state.project.joints(0)
 
 
 def test_moving_a_joint_until_it_is_let_go_of_is_one_step_of_undo(desk: Desk) -> None:
-    desk.do(ask.SetJoint("PSM1", 0, 0.1), ask.SetJoint("PSM1", 0, 0.2))
+    desk.do(intents.SetJoint("PSM1", 0, 0.1), intents.SetJoint("PSM1", 0, 0.2))
     assert desk.state.undoable == 1
-    desk.do(ask.SetJoint("PSM1", 1, 0.2))
+    desk.do(intents.SetJoint("PSM1", 1, 0.2))
     assert desk.state.undoable == 2
-    desk.do(ask.Released(), ask.SetJoint("PSM1", 1, 0.1))
+    desk.do(intents.Released(), intents.SetJoint("PSM1", 1, 0.1))
     assert desk.state.undoable == 3
 
 
 def test_undo_returns_to_the_frame_of_the_change(desk: Desk) -> None:
     before = desk.joint()
-    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.MoveFrame(2), ask.Undo())
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.MoveFrame(2), intents.Undo())
     assert desk.state.index == 0 and desk.joint() == pytest.approx(before) and desk.state.undoable == 0
 
 
 def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
-    desk.do(ask.Perturb(2.0, 0), ask.Run())
+    desk.do(intents.Perturb(2.0, 0), intents.Run())
     assert desk.state.run.phase is Phase.RUNNING
     desk.controller.advance()
     first = desk.state
@@ -91,19 +96,19 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
 @pytest.mark.parametrize(
     "intent",
     [
-        ask.SetJoint("PSM1", 0, 0.1),
-        ask.MoveFrame(1),
-        ask.SetSetting("iterations", 9),
-        ask.ShowDomain("smoke"),
-        ask.SetFreeGroup("base_frames", True),
-        ask.Run(),
+        intents.SetJoint("PSM1", 0, 0.1),
+        intents.MoveFrame(1),
+        intents.SetSetting("iterations", 9),
+        intents.ShowDomain("smoke"),
+        intents.SetFreeGroup("base_frames", True),
+        intents.Run(),
     ],
 )
 def test_a_suspicion_against_base_frames_lasts_until_something_changes(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: ask.Intent
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: intents.Intent
 ) -> None:
     monkeypatch.setattr(FrameOptimizer, "base_frame_gain", lambda self: 0.4)
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.controller.advance()
     assert desk.state.run.base_frame_gain is None
     assert desk.finish().run.base_frame_gain == 0.4
@@ -111,76 +116,82 @@ def test_a_suspicion_against_base_frames_lasts_until_something_changes(
 
 
 def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.controller.advance()
-    desk.do(ask.Pause())
-    assert desk.state.run.phase is Phase.PAUSED and desk.controller.patience() is None
-    desk.do(ask.Run())
+    desk.do(intents.Pause())
+    assert desk.state.run.phase is Phase.PAUSED and desk.controller.wait_time() is None
+    desk.do(intents.Run())
     assert len(desk.finish().run.curves.loss) == 5
 
 
 def test_step_does_one_iteration_and_pauses(desk: Desk) -> None:
-    desk.do(ask.Step())
+    desk.do(intents.Step())
     assert len(desk.state.run.curves.loss) == 2 and desk.state.run.phase is Phase.PAUSED
-    desk.do(ask.Step())
+    desk.do(intents.Step())
     assert len(desk.state.run.curves.loss) == 3
 
 
 @pytest.mark.parametrize("finished", [True, False])
 def test_reset_returns_to_the_start_of_the_run(desk: Desk, finished: bool) -> None:
-    desk.do(ask.Perturb(2.0, 0))
+    desk.do(intents.Perturb(2.0, 0))
     start = desk.joint()
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.controller.advance()
     desk.controller.advance()
     if finished:
         desk.finish()
-    state = desk.do(ask.Reset())
+    state = desk.do(intents.Reset())
     assert desk.joint() == pytest.approx(start)
     assert state.run.curves.loss == () and state.run.phase is Phase.IDLE
 
 
 def test_a_whole_run_is_one_step_of_undo(desk: Desk) -> None:
-    desk.do(ask.Perturb(2.0, 0))
+    desk.do(intents.Perturb(2.0, 0))
     start = desk.joint()
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.finish()
-    desk.do(ask.Undo())
+    desk.do(intents.Undo())
     assert desk.joint() == pytest.approx(start)
 
 
 @pytest.mark.parametrize(
-    "intent", [ask.SetJoint("PSM1", 0, 0.1), ask.MoveFrame(1), ask.SetSetting("iterations", 9), ask.ShowDomain("smoke")]
+    "intent",
+    [
+        intents.SetJoint("PSM1", 0, 0.1),
+        intents.MoveFrame(1),
+        intents.SetSetting("iterations", 9),
+        intents.ShowDomain("smoke"),
+    ],
 )
-def test_a_run_stops_when_what_it_works_on_changes(desk: Desk, intent: ask.Intent) -> None:
-    desk.do(ask.Run())
+def test_a_run_stops_when_what_it_works_on_changes(desk: Desk, intent: intents.Intent) -> None:
+    desk.do(intents.Run())
     desk.controller.advance()
     state = desk.do(intent)
     assert state.run.phase is Phase.IDLE
-    assert desk.controller.patience() is None
+    assert desk.controller.wait_time() is None
 
 
 def test_a_setting_out_of_range_is_kept_out_and_run_says_why(desk: Desk) -> None:
-    state = desk.do(ask.SetSetting("iterations", 0))
+    state = desk.do(intents.SetSetting("iterations", 0))
     assert state.settings.iterations == 4 and "iterations" in (state.settings_error or "")
     with pytest.raises(SettingsError, match="iterations is 0"):
-        desk.do(ask.Run())
-    assert desk.do(ask.SetSetting("iterations", 3)).settings_error is None
-    assert len(desk.do(ask.Run()) and desk.finish().run.curves.loss) == 4
+        desk.do(intents.Run())
+    assert desk.do(intents.SetSetting("iterations", 3)).settings_error is None
+    assert len(desk.do(intents.Run()) and desk.finish().run.curves.loss) == 4
 
 
 def test_a_locked_joint_does_not_move(desk: Desk) -> None:
     name = desk.session.scene.arms[0].robot.joint_names[0]
-    desk.do(ask.Perturb(2.0, 0), ask.SetFreeJoint("PSM1", name, False))
+    desk.do(intents.Perturb(2.0, 0), intents.SetFreeJoint("PSM1", name, False))
     before, other = desk.joint(0), desk.joint(1)
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.finish()
     assert desk.joint(0) == pytest.approx(before) and desk.joint(1) != pytest.approx(other)
-    assert desk.do(ask.SetFreeJoint("PSM1", name, True)).free == FreeParameters()
+    assert desk.do(intents.SetFreeJoint("PSM1", name, True)).free == FreeParameters()
 
 
 def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk) -> None:
-    desk.do(ask.SetFreeGroup("extrinsics", True), ask.Run())
+    desk.do(intents.SetFreeGroup("extrinsics", True), intents.Run())
     state = desk.finish()
     calibrated = [camera.T_camera_world for camera in desk.session.scene.cameras]
     left, right = state.pose.scene.T_camera_world.numpy()
@@ -189,7 +200,7 @@ def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk)
 
 
 def test_a_run_with_all_cameras_has_a_map_for_each(desk: Desk) -> None:
-    desk.do(ask.SetCameras(True), ask.Run())
+    desk.do(intents.SetCameras(True), intents.Run())
     desk.controller.advance()
     maps = desk.state.maps
     assert maps is not None and maps.cameras == ("left", "right") and len(maps.iterate.attention) == 2
@@ -197,40 +208,40 @@ def test_a_run_with_all_cameras_has_a_map_for_each(desk: Desk) -> None:
 
 @pytest.mark.parametrize("layer", [Layer.ATTENTION, Layer.SIMILARITY])
 def test_maps_are_there_without_a_run_when_they_are_looked_at(desk: Desk, layer: Layer) -> None:
-    desk.do(ask.ShowLayer(layer))
+    desk.do(intents.ShowLayer(layer))
     desk.controller.map()
     state = desk.state
     assert state.maps is not None
-    picture = desk.painter.overlay(state.pose.scene, state.frame, "left", layer, 1.0, state.maps)
+    picture = desk.renderer.overlay(state.pose.scene, state.frame, "left", layer, 1.0, state.maps)
     assert picture[..., 3].all() and np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 1
 
 
 def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
-    desk.do(ask.Perturb(4.0, 3), ask.ShowCamera("right"), ask.ExportMask(7))
+    desk.do(intents.Perturb(4.0, 3), intents.ShowCamera("right"), intents.ExportMask(7))
     client, name, content = desk.delivered[0]
     mask = decoded(content)
     assert (client, name) == (7, "tiny_001_right.png")
     assert set(np.unique(mask)) == {0, 255}
-    assert np.array_equal(mask > 0, desk.painter.arm_ids(desk.state.pose.scene, "right") >= 0)
+    assert np.array_equal(mask > 0, desk.renderer.arm_ids(desk.state.pose.scene, "right") >= 0)
 
 
 def test_playing_goes_round(desk: Desk) -> None:
-    desk.do(ask.ShowFrame(2), ask.SetSpeed(60.0), ask.Play(True))
+    desk.do(intents.ShowFrame(2), intents.SetSpeed(60.0), intents.Play(True))
     desk.controller.advance()
     assert desk.state.index == 0 and desk.state.playing
-    assert not desk.do(ask.Play()).playing
+    assert not desk.do(intents.Play()).playing
 
 
 def test_an_error_of_what_is_going_on_stops_it_and_is_part_of_the_state(desk: Desk) -> None:
-    desk.do(ask.Export("masks", "All"), ask.Run(), ask.Play(True))
+    desk.do(intents.Export("masks", "All"), intents.Run(), intents.Play(True))
     desk.controller.fail(CartsError("the disk is on fire"), stop=True)
     state = desk.state
     assert state.error == "the disk is on fire" and not state.playing and state.export is None
-    assert state.run.phase is Phase.IDLE and desk.controller.patience() is None
-    assert desk.do(ask.DismissError()).error is None
+    assert state.run.phase is Phase.IDLE and desk.controller.wait_time() is None
+    assert desk.do(intents.DismissError()).error is None
 
 
 def test_an_error_of_something_else_leaves_the_run_alone(desk: Desk) -> None:
-    desk.do(ask.Run())
+    desk.do(intents.Run())
     desk.controller.fail(CartsError("no such frame"), stop=False)
     assert desk.state.run.phase is Phase.RUNNING and desk.state.error == "no such frame"

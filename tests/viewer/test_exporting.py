@@ -15,11 +15,11 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, ExportFormat, FormatName, read_kinematics_csv
 from carts_core.export.formats import FORMATS as REGISTERED
 from carts_core.project import JointCorrection, Key, MaskCorrection, Provenance, ReviewState, Source
-from carts_viewer import archive, exporting
-from carts_viewer import intents as ask
+from carts_viewer import archive, intents
+from carts_viewer.handlers import exporting
 
 
-def exported(desk: Desk, intent: ask.Export) -> Path:
+def exported(desk: Desk, intent: intents.Export) -> Path:
     """What an export wrote."""
     desk.do(intent)
     assert desk.state.export is not None and desk.state.export.path is None
@@ -36,7 +36,7 @@ def read_mask(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_written_beside_the_project_and_logged(desk: Desk, name: FormatName) -> None:
-    path = exported(desk, ask.Export(name, "All"))
+    path = exported(desk, intents.Export(name, "All"))
     project = desk.session.editor.project
     assert path.parent == project.path.with_name("sequence_exports")
     assert path.suffix == FORMATS[name].suffix and (path.is_file() if path.suffix else any(path.iterdir()))
@@ -44,9 +44,9 @@ def test_every_format_is_written_beside_the_project_and_logged(desk: Desk, name:
 
 
 def test_an_earlier_export_is_never_replaced(desk: Desk) -> None:
-    first, second = (exported(desk, ask.Export("csv", "All")) for _ in range(2))
+    first, second = (exported(desk, intents.Export("csv", "All")) for _ in range(2))
     assert (first.name, second.name) == ("kinematics.csv", "kinematics-2.csv") and first.is_file()
-    folders = [exported(desk, ask.Export("masks", "All", shown_camera=True)) for _ in range(2)]
+    folders = [exported(desk, intents.Export("masks", "All", shown_camera=True)) for _ in range(2)]
     assert [folder.name for folder in folders] == ["masks", "masks-2"]
 
 
@@ -63,50 +63,50 @@ def test_links_that_came_with_a_recording_are_not_followed(
     if kind == "folder of exports":
         folder.symlink_to(precious.parent)
         with pytest.raises(CartsError, match="sequence_exports is a link, where a folder is needed"):
-            exported(desk, ask.Export(name, "All"))
+            exported(desk, intents.Export(name, "All"))
     else:
         folder.mkdir()
         place = folder / {"temporary folder": f".{stem}.part"}.get(kind, stem)
         place.symlink_to(precious.parent if kind != "dangling export" else tmp_path / "home" / "new")
-        path = exported(desk, ask.Export(name, "All"))
+        path = exported(desk, intents.Export(name, "All"))
         assert not path.is_symlink() and path.parent == folder and place.is_symlink()
     assert [path.name for path in precious.parent.iterdir()] == ["thesis.tex"]
     assert precious.read_text() == "years of work"
 
 
 def test_only_frames_of_the_chosen_review_state_and_camera_are_written(desk: Desk) -> None:
-    desk.do(ask.ShowFrame(1), ask.SetReview(ReviewState.ACCEPTED), ask.ShowCamera("right"))
-    path = exported(desk, ask.Export("masks", "Accepted", shown_camera=True))
+    desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.ACCEPTED), intents.ShowCamera("right"))
+    path = exported(desk, intents.Export("masks", "Accepted", shown_camera=True))
     assert [file.name for file in (path / "binary").iterdir()] == ["right_002.png"]
     with pytest.raises(SettingsError, match="No frame is in this choice"):
-        desk.do(ask.Export("masks", "Needs work"))
+        desk.do(intents.Export("masks", "Needs work"))
 
 
 def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: Desk) -> None:
-    rendered = desk.painter.arm_ids(desk.state.pose.scene, "left") >= 0
+    rendered = desk.renderer.arm_ids(desk.state.pose.scene, "left") >= 0
     added, removed = np.zeros_like(rendered), rendered.copy()
     added[2:6, 3:9] = ~rendered[2:6, 3:9]
     removed[:, : removed.shape[1] // 2] = False
     edit = {Key.mask_correction(0, "left"): MaskCorrection.of(added, removed)}
     desk.session.editor.project.apply("Paint", edit)
-    folder = exported(desk, ask.Export("masks", "All")) / "binary"
+    folder = exported(desk, intents.Export("masks", "All")) / "binary"
     expected = (rendered | added) & ~removed
     assert removed.any() and np.array_equal(read_mask(folder / "left_001.png"), expected)
     for name, index, camera in (("right_001", 0, "right"), ("left_002", 1, "left")):
         pose = desk.session.pose(desk.session.sequence.frame(index, cameras=[])).scene
-        assert np.array_equal(read_mask(folder / f"{name}.png"), desk.painter.arm_ids(pose, camera) >= 0)
-    desk.do(ask.Refresh(), ask.ShowCamera("left"), ask.ExportMask(7))
+        assert np.array_equal(read_mask(folder / f"{name}.png"), desk.renderer.arm_ids(pose, camera) >= 0)
+    desk.do(intents.Refresh(), intents.ShowCamera("left"), intents.ExportMask(7))
     _, name, content = desk.delivered[-1]
     shown = decoded(content)
     assert name == "tiny_001_left.png" and np.array_equal(shown > 0, expected)
 
 
 def test_kinematics_say_where_each_row_comes_from_and_how_sure_it_is(desk: Desk) -> None:
-    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.Released())
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.Released())
     joints = len(desk.session.ranges)
     known = JointCorrection((0.1,) * joints, Provenance(Source.PROPAGATED), (0.01,) * (joints - 1) + (None,))
     desk.session.editor.project.apply("Solve", {Key.joints(1, "PSM1"): known})
-    rows = read_kinematics_csv(exported(desk, ask.Export("csv", "All")), desk.session.scene)
+    rows = read_kinematics_csv(exported(desk, intents.Export("csv", "All")), desk.session.scene)
     assert [row.source for row in rows] == ["edited", "propagated", "measured"]
     assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
     assert rows[1].joint_std is not None and rows[0].joint_std is not None
@@ -115,7 +115,7 @@ def test_kinematics_say_where_each_row_comes_from_and_how_sure_it_is(desk: Desk)
 
 
 def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None:
-    desk.do(ask.Export("csv", "All"), ask.SetJoint("PSM1", 0, 0.3), ask.Released())
+    desk.do(intents.Export("csv", "All"), intents.SetJoint("PSM1", 0, 0.3), intents.Released())
     export = desk.finish().export
     assert export is not None and export.path is not None
     assert read_kinematics_csv(export.path, desk.session.scene)[0].source == "measured"
@@ -124,37 +124,37 @@ def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None
 @pytest.mark.parametrize("written", [0, 1])
 def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
     monkeypatch.setattr(exporting, "_BIT", 0.0)  # So that it cannot be done already.
-    desk.do(ask.Export("coco", "All"))
+    desk.do(intents.Export("coco", "All"))
     desk.controller.advance()
     while desk.state.export is not None and desk.state.export.done < written:
         desk.controller.advance()
-    desk.do(ask.CancelExport())
+    desk.do(intents.CancelExport())
     folder = desk.session.editor.project.path.with_name("sequence_exports")
-    assert desk.state.export is None and desk.controller.patience() is None
+    assert desk.state.export is None and desk.controller.wait_time() is None
     assert list(folder.glob("*")) == [] and not desk.saved.exports
-    exported(desk, ask.Export("coco", "All"))
+    exported(desk, intents.Export("coco", "All"))
 
 
 def test_a_second_export_waits(desk: Desk) -> None:
-    desk.do(ask.Export("coco", "All"))
+    desk.do(intents.Export("coco", "All"))
     with pytest.raises(CartsError, match="already"):
-        desk.do(ask.Export("masks", "All"))
+        desk.do(intents.Export("masks", "All"))
     desk.controller.close()
 
 
 @pytest.mark.parametrize(
     "intent",
     [
-        ask.Export("../../etc", "All"),  # type: ignore[arg-type]
-        ask.Export("coco", "Everything"),
-        ask.Export("coco", "All", "pixels"),  # type: ignore[arg-type]
+        intents.Export("../../etc", "All"),  # type: ignore[arg-type]
+        intents.Export("coco", "Everything"),
+        intents.Export("coco", "All", "pixels"),  # type: ignore[arg-type]
     ],
 )
-def test_what_no_page_of_ours_offers_is_refused(desk: Desk, intent: ask.Export) -> None:
+def test_what_no_page_of_ours_offers_is_refused(desk: Desk, intent: intents.Export) -> None:
     with pytest.raises(SettingsError, match="There is no export"):
         desk.do(intent)
     with pytest.raises(CartsError, match="Nothing has been exported"):
-        desk.do(ask.Download(1))
+        desk.do(intents.Download(1))
 
 
 def test_a_package_that_is_missing_is_named(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,31 +162,31 @@ def test_a_package_that_is_missing_is_named(desk: Desk, monkeypatch: pytest.Monk
         raise ModuleNotFoundError("No module named 'pycocotools'", name="pycocotools")
 
     monkeypatch.setitem(REGISTERED, "coco", ExportFormat("COCO", write))
-    desk.do(ask.Export("coco", "All"))
+    desk.do(intents.Export("coco", "All"))
     with pytest.raises(CartsError, match="COCO needs the package pycocotools"):
         desk.finish()
-    assert desk.state.export is None and desk.controller.patience() is None
+    assert desk.state.export is None and desk.controller.wait_time() is None
 
 
 def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = exported(desk, ask.Export("coco", "All"))
-    desk.do(ask.Download(4))
+    path = exported(desk, intents.Export("coco", "All"))
+    desk.do(intents.Download(4))
     client, name, content = desk.delivered[-1]
     with zipfile.ZipFile(BytesIO(content)) as archived:
         assert (client, name) == (4, "coco.zip")
         assert json.loads(archived.read("coco/export.json"))["format"] == "coco"
         assert len(archived.namelist()) == sum(file.is_file() for file in path.rglob("*"))
-    table = exported(desk, ask.Export("csv", "All"))
-    desk.do(ask.Download(4))
+    table = exported(desk, intents.Export("csv", "All"))
+    desk.do(intents.Download(4))
     assert desk.delivered[-1] == (4, "kinematics.csv", table.read_bytes())
     monkeypatch.setattr(archive, "LARGEST", 10)
     with pytest.raises(CartsError, match="Copy it from there"):
-        desk.do(ask.Download(4))
+        desk.do(intents.Download(4))
     table.unlink()
     with pytest.raises(CartsError, match="not there any more"):
-        desk.do(ask.Download(4))
+        desk.do(intents.Download(4))
 
 
 def test_who_looks_on_read_only_can_export(desk: Desk) -> None:
     reader = desk.reopened(read_only=True)
-    assert exported(reader, ask.Export("csv", "All")).is_file() and not reader.saved.exports
+    assert exported(reader, intents.Export("csv", "All")).is_file() and not reader.saved.exports

@@ -7,7 +7,7 @@ import pytest
 from websockets.datastructures import Headers
 
 from carts_core.errors import SettingsError
-from carts_viewer.guard import Guard, check_address
+from carts_viewer.transport.guard import Guard, check_address
 
 EVERYWHERE = ".".join("0000")
 

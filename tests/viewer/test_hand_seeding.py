@@ -9,7 +9,7 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_core.keypoints import project_keypoints
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.marks import labelled_keypoints
 
@@ -30,7 +30,7 @@ def test_two_clicks_bring_a_frame_back_that_is_5_degrees_off(
 ) -> None:
     app = open_viewer(frames=1, width=640, height=480)
     tab = open_tab(app)
-    app.mailbox.put(ask.Perturb(5.0, seed))
+    app.queue.put(intents.Perturb(5.0, seed))
     perturbed = eventually(lambda: _dice(app) if app.state.undoable else -1.0, lambda dice: dice >= 0.0)
     assert perturbed < 0.8
     scene = app.scene

@@ -13,11 +13,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.page import Page
-from carts_viewer.raw_tab import RawTab
-from carts_viewer.stage import OVERLAY
+from carts_viewer.scene_view import OVERLAY
+from carts_viewer.transport.page import Page
+from tools.raw_tab import RawTab
 
 EVERYWHERE = ".".join("0000")
 
@@ -53,11 +53,11 @@ class Victims:
         self.tab.set(self.app.page.element_id(self.slider), value)
         _wait_for(lambda: abs(self.slider.value - value) < 1e-9)
         self.app.wait_until_shown()
-        _wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.stage.sent(OVERLAY))
+        _wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
         assert _get(self.app.url).status == 200
         # Whoever comes now gets all that the server has kept for newcomers.
         with RawTab(self.app.url) as late:
-            _wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.stage.sent(OVERLAY))
+            _wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_a_text_that_is_too_long_is_cut_off(victims: Victims) -> None:
     with RawTab(app.url) as rogue:
         rogue.set(app.page.element_id(app.page.find("Note")), "x" * 900_000)
         _wait_for(lambda: bool(app.state.review.note))
-        app.mailbox.put(ask.Released())
+        app.queue.put(intents.Released())
         app.wait_until_shown()
     assert 0 < len(app.state.review.note) < 20_000
     assert len(app.page.find("Note").value) == len(app.state.review.note)

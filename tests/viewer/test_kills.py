@@ -14,7 +14,7 @@ from viewer_victim import Widgets
 
 from carts_core.data import Sequence
 from carts_core.project import Project
-from carts_viewer.raw_tab import RawTab
+from tools.raw_tab import RawTab
 
 FRAMES = 24
 WIDTH, HEIGHT = 96, 72

@@ -13,13 +13,13 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_core.project import Key
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.layers import IGNORED_COLOR
-from carts_viewer.picture import Painter
-from carts_viewer.raw_tab import RawTab
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.strokes import Tool
+from tools.raw_tab import RawTab
 
 Open = Callable[..., ViewerApp]
 OpenTab = Callable[..., Tab]
@@ -133,7 +133,7 @@ def test_eraser_shift_and_polygon_change_the_mask_as_exported(open_marked: Open,
     app = open_marked()
     tab = open_tab(app)
     hand = Hand(tab)
-    rendered = Painter(app.sequence).mask(app.state.pose.scene, "left")
+    rendered = OverlayRenderer(app.sequence).mask(app.state.pose.scene, "left")
     hand.take("Shift+P", Tool.POLYGON)
     corners = [(20.0, 30.0), (140.0, 40.0), (120.0, 200.0), (30.0, 180.0)]
     hand.click((5.0, 5.0))
@@ -167,7 +167,7 @@ def test_eraser_shift_and_polygon_change_the_mask_as_exported(open_marked: Open,
 
 
 def _mask(app: ViewerApp) -> np.ndarray:
-    return Painter(app.sequence).mask(app.state.pose.scene, "left", app.project.state.get(_keys(app)[0]))
+    return OverlayRenderer(app.sequence).mask(app.state.pose.scene, "left", app.project.state.get(_keys(app)[0]))
 
 
 @pytest.mark.browser
@@ -271,6 +271,6 @@ def test_strokes_that_no_page_would_send_are_refused_and_disturb_nobody(open_vie
         # Far outside is at most one image size outside, and the frame is the one that the stroke names.
         tab.set(field, f"tab 11 {json.dumps(good | {'points': [[-1e9, 20], [1e9, 20]]})}")
         eventually(lambda: len(app.project.state.steps), lambda count: count == 1)
-    app.mailbox.put(ask.ShowFrame(0))
+    app.queue.put(intents.ShowFrame(0))
     region = app.wait_until_shown().ignore_region
     assert region is not None and region.region()[20].all() and not region.region()[30].any()

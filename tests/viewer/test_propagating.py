@@ -22,7 +22,7 @@ from carts_core.project import (
     ReviewState,
     Source,
 )
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 
 FRAMES = 5
@@ -42,7 +42,7 @@ def opened(recording: Path) -> Desk:
     """A desk with the settings that a user begins with."""
     sequence = Sequence.open(recording)
     desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
-    desk.controller.change(settings=SurfaceSolver())
+    assert desk.do(intents.SetSetting("solver", "surface")).settings == SurfaceSolver()
     return desk
 
 
@@ -51,7 +51,9 @@ def hand_made(desk: Desk, *frames: int) -> dict[int, float]:
     truth = desk.session.sequence.truth
     assert truth is not None
     for frame in frames:
-        desk.do(ask.ShowFrame(frame), ask.SetJoint("PSM1", 0, float(truth["PSM1"][frame][0])), ask.Released())
+        desk.do(
+            intents.ShowFrame(frame), intents.SetJoint("PSM1", 0, float(truth["PSM1"][frame][0])), intents.Released()
+        )
     return {frame: desk.saved.joints(frame)["PSM1"].joint_positions[0] for frame in frames}
 
 
@@ -71,7 +73,7 @@ def sources(desk: Desk) -> list[Source | None]:
 
 def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk: Desk) -> None:
     kept = hand_made(desk, 0, 3)
-    desk.do(ask.ShowFrame(1), ask.Solve())
+    desk.do(intents.ShowFrame(1), intents.Solve())
     assert desk.state.solving
     desk.finish()
     assert sources(desk) == [Source.HAND, Source.PROPAGATED, Source.PROPAGATED, Source.HAND, None]
@@ -84,13 +86,13 @@ def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk
     assert figures is not None and figures.loss is not None and figures.dice is not None
     assert desk.state.pose.source is Source.PROPAGATED
     assert desk.state.undoable == 3 and desk.state.project.steps[-1].name == "Solve 2 frames, 002 to 003"
-    desk.do(ask.Undo())
+    desk.do(intents.Undo())
     assert sources(desk) == [Source.HAND, None, None, Source.HAND, None]
 
 
 def test_solving_all_keeps_accepted_frames_and_needs_no_keyframe(desk: Desk) -> None:
     measured = desk.session.sequence.measured["PSM1"]
-    desk.do(ask.ShowFrame(2), ask.SetReview(ReviewState.ACCEPTED), ask.Solve(whole=True))
+    desk.do(intents.ShowFrame(2), intents.SetReview(ReviewState.ACCEPTED), intents.Solve(whole=True))
     desk.finish()
     assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, Source.PROPAGATED, Source.PROPAGATED]
     assert desk.joint() == pytest.approx(measured[2][0], abs=1e-6)
@@ -98,23 +100,23 @@ def test_solving_all_keeps_accepted_frames_and_needs_no_keyframe(desk: Desk) -> 
 
 def test_solving_backwards_begins_at_the_last_frame(desk: Desk) -> None:
     hand_made(desk, 0)
-    desk.do(ask.SetDirection("backward"), ask.ShowFrame(2), ask.Solve())
+    desk.do(intents.SetDirection("backward"), intents.ShowFrame(2), intents.Solve())
     solve_some(desk, 1)
-    desk.do(ask.StopSolving())
+    desk.do(intents.StopSolving())
     assert sources(desk) == [Source.HAND, None, None, None, Source.PROPAGATED]
 
 
 def test_stopping_keeps_what_is_solved_as_one_step(desk: Desk) -> None:
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     solve_some(desk, 2)
-    state = desk.do(ask.StopSolving())
+    state = desk.do(intents.StopSolving())
     assert not state.solving and state.solve is not None and state.solve.text.startswith("Stopped: 2 frames solved")
     assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, None, None] and state.undoable == 1
-    assert desk.controller.patience() is None
+    assert desk.controller.wait_time() is None
 
 
 def test_a_frame_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
     kept = hand_made(desk, 1)
     desk.finish()
@@ -124,9 +126,9 @@ def test_a_frame_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -
 
 def test_a_frame_that_a_person_freed_is_solved_although_it_was_made_by_hand(desk: Desk) -> None:
     hand_made(desk, 0, 1)
-    desk.do(ask.HoldKeyframe(False))
+    desk.do(intents.HoldKeyframe(False))
     assert desk.saved.get(Key.keyframe(1)) == Keyframe(False)
-    desk.do(ask.HoldKeyframe(), ask.HoldKeyframe(), ask.Solve())
+    desk.do(intents.HoldKeyframe(), intents.HoldKeyframe(), intents.Solve())
     desk.finish()
     assert sources(desk) == [Source.HAND, *[Source.PROPAGATED] * 4]
 
@@ -135,7 +137,7 @@ def test_ignored_pixels_are_not_looked_at(desk: Desk) -> None:
     project = desk.session.editor.project
     everything = np.ones((120, 160), bool)
     project.apply("Ignore", {Key.ignore_region(frame, "left"): IgnoreRegion.of(everything) for frame in range(FRAMES)})
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     desk.finish()
     measured = desk.session.sequence.measured["PSM1"]
     solved = [desk.saved.joints(frame)["PSM1"].joint_positions for frame in range(FRAMES)]
@@ -145,14 +147,14 @@ def test_ignored_pixels_are_not_looked_at(desk: Desk) -> None:
 def test_an_image_that_is_missing_does_not_cost_the_frames_before_it(recording: Path) -> None:
     (recording.parent / "regular" / "left" / "005.png").write_bytes(b"no picture")
     desk = opened(recording)
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     with pytest.raises(CartsError, match=r"005\.png"):
         desk.finish()
     assert sources(desk) == [*[Source.PROPAGATED] * 4, None] and not desk.state.solving
 
 
 def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> None:
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
     desk.controller.fail(CartsError("the export failed"), stop=True)
     assert not desk.state.solving and sources(desk) == [Source.PROPAGATED, *[None] * 4]
@@ -160,7 +162,7 @@ def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> 
 
 
 def test_closing_saves_what_is_solved(desk: Desk) -> None:
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
     desk.controller.close()
     assert sources(desk) == [Source.PROPAGATED, *[None] * 4]
@@ -170,27 +172,27 @@ def test_closing_saves_what_is_solved(desk: Desk) -> None:
     ("before", "message"),
     [
         ((), "no keyframe yet"),
-        ((ask.SetSetting("solver", "acs"), ask.HoldKeyframe(True)), "needs the solver"),
-        ((ask.Solve(whole=True),), "already"),
+        ((intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True)), "needs the solver"),
+        ((intents.Solve(whole=True),), "already"),
     ],
 )
 def test_what_cannot_be_solved_is_refused_with_the_reason(
-    desk: Desk, before: tuple[ask.Intent, ...], message: str
+    desk: Desk, before: tuple[intents.Intent, ...], message: str
 ) -> None:
     desk.do(*before)
     with pytest.raises(CartsError, match=message):
-        desk.do(ask.Solve())
+        desk.do(intents.Solve())
 
 
 def test_a_project_that_takes_no_edits_is_not_solved(desk: Desk) -> None:
     with pytest.raises(ProjectError, match="could not be saved"):
-        desk.reopened(read_only=True).do(ask.Solve(whole=True))
+        desk.reopened(read_only=True).do(intents.Solve(whole=True))
 
 
 def test_a_run_waits_for_solving_and_a_new_calibration_ends_it(desk: Desk) -> None:
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     with pytest.raises(CartsError, match="being solved"):
-        desk.do(ask.Run())
+        desk.do(intents.Run())
     project, camera = desk.session.editor.project, desk.session.scene.cameras[0]
     moved = CorrectedIntrinsics(tuple(value + 1 for value in camera.intrinsics), Provenance(Source.HAND))
     project.apply("Calibrate", {Key.intrinsics("left"): moved})
@@ -203,7 +205,7 @@ def test_dice_of_a_solved_frame_is_that_of_its_corrected_mask(desk: Desk) -> Non
     project = desk.session.editor.project
     everything, nothing = np.ones((120, 160), bool), np.zeros((120, 160), bool)
     project.apply("Add to the mask", {Key.mask_correction(1, "left"): MaskCorrection.of(everything, nothing)})
-    desk.do(ask.Solve(whole=True))
+    desk.do(intents.Solve(whole=True))
     desk.finish()
     masks = desk.session.sequence.frame(1, "regular", ["left"]).masks
     figures = [desk.saved.figures(frame) for frame in range(FRAMES)]

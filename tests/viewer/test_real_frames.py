@@ -14,7 +14,7 @@ from viewer_tab import Tab
 from carts_core.evaluation import dice
 from carts_core.project import ReviewState
 from carts_viewer.app import ViewerApp
-from carts_viewer.picture import Painter
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
 SEQUENCE = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
@@ -93,7 +93,7 @@ def _export_coco(tab: Tab) -> Path:
 def _read_back(folder: Path, app: ViewerApp, accepted: list[int]) -> list[float]:
     """Dice with the true masks of the reviewed camera; masks of all cameras are to the pixel what the project holds."""
     file = folder / "annotations" / "instances_default.json"
-    coco, painter = COCO(str(file)), Painter(app.sequence)
+    coco, renderer = COCO(str(file)), OverlayRenderer(app.sequence)
     images = json.loads(file.read_text(encoding="utf-8"))["images"]
     by_view = {(image["frame"], image["camera"]): image for image in images}
     cameras = [camera.name for camera in app.scene.cameras]
@@ -111,7 +111,7 @@ def _read_back(folder: Path, app: ViewerApp, accepted: list[int]) -> list[float]
             assert image["source"] == "optimized" and (folder / "images" / image["file_name"]).is_file()
             (annotation,) = coco.loadAnns(coco.getAnnIds(imgIds=image["id"]))
             mask = coco.annToMask(annotation).astype(bool)
-            assert np.array_equal(mask, painter.arm_ids(kept, camera) >= 0)
+            assert np.array_equal(mask, renderer.arm_ids(kept, camera) >= 0)
             if camera == CAMERA:
                 assert frame.masks is not None
                 found.append(dice(mask, frame.masks[camera]))

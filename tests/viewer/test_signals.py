@@ -15,9 +15,10 @@ from viewer_client import Client
 
 from carts_core.data import Sequence
 from carts_core.project import Project
-from carts_viewer import app as app_module
 from carts_viewer import opening
-from carts_viewer.raw_tab import RawTab
+from carts_viewer.app import ViewerApp
+from carts_viewer.serving import serve
+from tools.raw_tab import RawTab
 
 FRAMES = 6
 
@@ -26,14 +27,14 @@ def _serve_until_signal(sequence: Path, weights: Path, tell) -> None:
     """`carts view` as it is, but for a page that a test can find its way in."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    opened = app_module.ViewerApp.open
+    opened = ViewerApp.open
 
     def once(*arguments, **options):
-        app_module.ViewerApp.open = opened
+        ViewerApp.open = opened
         return viewer_victim.open_and_tell(sequence, weights, tell)
 
-    app_module.ViewerApp.open = once  # pyright: ignore[reportAttributeAccessIssue]
-    app_module.serve(sequence, port=0)
+    ViewerApp.open = once  # pyright: ignore[reportAttributeAccessIssue]
+    serve(sequence, port=0)
 
 
 def _live(sequence_path: Path, weights: Path, number: int, seed: int) -> int:

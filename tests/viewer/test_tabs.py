@@ -12,7 +12,7 @@ from viewer_canvas import Canvas, eventually
 from viewer_run import run_without_end
 from viewer_tab import Tab
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import Phase
 
@@ -61,8 +61,8 @@ def test_three_tabs_show_one_state_and_so_does_one_that_reloads_or_joins(
     eventually(lambda: _joint(app), lambda at: abs(at - value) < 1e-3)
     third.type_value(app.page.find("Opacity %"), 95)
     eventually(lambda: app.state.opacity, lambda opacity: opacity == 0.95)
-    app.mailbox.put(ask.SetNote("seen by all"))
-    app.mailbox.put(ask.Released())
+    app.queue.put(intents.SetNote("seen by all"))
+    app.queue.put(intents.Released())
     _agree(tabs)
     second.page.reload()
     second.wait_until_ready()
@@ -152,20 +152,20 @@ def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
             stranger.close()
 
 
-def _call_of_a_link(app: ViewerApp, browser: Browser, patience: float, *, policy: bool = True) -> float | None:
+def _call_of_a_link(app: ViewerApp, browser: Browser, wait_time: float, *, policy: bool = True) -> float | None:
     """Follow a link that names another server, and wait until the page calls it.
 
     Args:
         app: Whose page it is.
         browser: Which follows the link.
-        patience: How long to wait when the page is there [s].
+        wait_time: How long to wait when the page is there [s].
         policy: Whether the page comes with the header that says whom it may call.
 
     Returns:
         The time from the click to the call [s]; None when there is none.
     """
     with closing(browser.new_context()) as context, closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        listener.settimeout(patience)
+        listener.settimeout(wait_time)
         link = f"{app.url}/?websocket=ws://127.0.0.1:{listener.getsockname()[1]}"
         page = context.new_page()
         if not policy:

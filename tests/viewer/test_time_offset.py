@@ -10,7 +10,7 @@ from viewer_desk import Desk
 from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.project import Key, Project, TimeOffset
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 
 
@@ -36,7 +36,7 @@ def rows(desk: Desk) -> np.ndarray:
 def test_a_new_offset_moves_the_measured_joints_of_the_shown_frame_and_the_truth(desk: Desk) -> None:
     image, truth = desk.state.frame.images["left"], (desk.state.frame.truth or {})["PSM1"]
     desk.controller.score()
-    state = desk.do(ask.SetTimeOffset(0.05))
+    state = desk.do(intents.SetTimeOffset(0.05))
     assert state.pose.scene.joint_positions[0].numpy() == pytest.approx(rows(desk)[0], abs=1e-6)
     assert state.frame.measured["PSM1"] == pytest.approx(rows(desk)[0]) and state.scores is None
     assert not np.allclose((state.frame.truth or {})["PSM1"], truth)
@@ -45,36 +45,36 @@ def test_a_new_offset_moves_the_measured_joints_of_the_shown_frame_and_the_truth
 
 def test_typing_an_offset_is_one_step_that_undo_takes_back_and_a_restart_keeps(desk: Desk) -> None:
     before = desk.joint()
-    desk.do(ask.SetTimeOffset(0.0), ask.SetTimeOffset(0.03), ask.SetTimeOffset(0.035), ask.Released())
+    desk.do(intents.SetTimeOffset(0.0), intents.SetTimeOffset(0.03), intents.SetTimeOffset(0.035), intents.Released())
     assert [step.name for step in desk.saved.steps] == ["Time offset"] and desk.joint() != before
-    desk.do(ask.Undo())
+    desk.do(intents.Undo())
     assert desk.joint() == before and desk.session.time_offset == 0.0
-    desk.do(ask.Redo())
+    desk.do(intents.Redo())
     moved = desk.joint()
     again = desk.reopened()
     assert again.session.time_offset == 0.035 and again.joint() == moved
 
 
 def test_corrections_by_hand_stay_where_they_are(desk: Desk) -> None:
-    desk.do(ask.SetJoint("PSM1", 0, 0.2), ask.SetTimeOffset(0.05), ask.Released())
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.SetTimeOffset(0.05), intents.Released())
     assert desk.joint() == pytest.approx(0.2)
 
 
 def test_an_offset_without_joint_positions_is_told_without_an_alarm_and_changes_nothing(desk: Desk) -> None:
     before = desk.joint()
-    state = desk.do(ask.SetTimeOffset(17.0))
+    state = desk.do(intents.SetTimeOffset(17.0))
     assert "it stays at 0 s" in (state.time_error or "") and state.error is None and desk.joint() == before
-    assert not desk.saved.steps and desk.do(ask.SetTimeOffset(0.01)).time_error is None
-    state = desk.do(ask.SetTimeOffset(17.0), ask.Released())
+    assert not desk.saved.steps and desk.do(intents.SetTimeOffset(0.01)).time_error is None
+    state = desk.do(intents.SetTimeOffset(17.0), intents.Released())
     assert "it stays at 0.01 s" in (state.error or "") and state.time_error is None
     with pytest.raises(CartsError, match="not a number"):
-        desk.do(ask.SetTimeOffset(float("nan")))
+        desk.do(intents.SetTimeOffset(float("nan")))
 
 
 def test_figures_of_another_offset_do_not_count(desk: Desk) -> None:
     desk.controller.score()
     before = desk.saved.figures(0)
-    desk.do(ask.SetTimeOffset(0.05), ask.Released())
+    desk.do(intents.SetTimeOffset(0.05), intents.Released())
     after = desk.saved.figures(0)
     assert desk.saved.get(Key.time_offset()) == TimeOffset(0.05)
     assert before is not None and after is not None and after.dice != before.dice
@@ -85,4 +85,4 @@ def test_a_recording_without_times_has_no_offset(tiny_sequence: Callable[..., Pa
     desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
     assert desk.session.time_offset is None
     with pytest.raises(CartsError, match="no time to offset"):
-        desk.do(ask.SetTimeOffset(0.1))
+        desk.do(intents.SetTimeOffset(0.1))

@@ -11,7 +11,7 @@ from playwright.sync_api import Page
 
 from carts_viewer.app import ViewerApp
 from carts_viewer.layers import ARM_COLORS
-from carts_viewer.picture import Painter
+from carts_viewer.overlay import OverlayRenderer
 
 T = TypeVar("T")
 MARKERS = ((0.30, 0.30), (0.70, 0.30), (0.30, 0.70), (0.70, 0.70))
@@ -48,7 +48,7 @@ class Canvas:
     def __init__(self, app: ViewerApp, page: Page) -> None:
         self._app = app
         self._page = page
-        self._painter = Painter(app.sequence)
+        self._renderer = OverlayRenderer(app.sequence)
 
     def look(self) -> np.ndarray:
         """RGB [height, width, 3] of the canvas as a person sees it, the tool bar blanked."""
@@ -88,7 +88,7 @@ class Canvas:
         if map_ is None:
             return float("inf")
         shown = np.linalg.norm(look.astype(float) - ARM_COLORS[0], axis=-1) < 60
-        arm_ids = self._painter.arm_ids(self._app.state.pose.scene, self._app.state.camera)
+        arm_ids = self._renderer.arm_ids(self._app.state.pose.scene, self._app.state.camera)
         wanted = _warped(arm_ids >= 0, map_, look.shape[:2])
         wanted[: self._bar_height()] = False
         if not shown.any() or not wanted.any():

@@ -16,8 +16,8 @@ from viewer_victim import Widgets
 from websockets.exceptions import ConnectionClosed
 
 from carts_core.project import Key, ProjectState, ReviewState
-from carts_viewer.raw_tab import RawTab
 from carts_viewer.strokes import Target
+from tools.raw_tab import RawTab
 
 T = TypeVar("T")
 CORNER = (2, 2)

@@ -5,10 +5,10 @@ from carts_core.optimization import DescentSolver, FreeParameters
 from carts_core.project import Project, ProjectState
 from carts_core.settings import SolverName
 from carts_core.settings.stages import FirstOrder
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.controller import Controller
 from carts_viewer.layers import Layer
-from carts_viewer.picture import Painter
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -18,7 +18,7 @@ class Desk:
     """A controller and what it delivered."""
 
     def __init__(self, sequence: Sequence, project: Project, factory: OptimizerFactory) -> None:
-        self.session, self.painter = Session(sequence, project), Painter(sequence)
+        self.session, self.renderer = Session(sequence, project), OverlayRenderer(sequence)
         self.delivered: list[tuple[int, str, bytes]] = []
         self._factory = factory
         frame = self.session.frame(0, "regular", "left")
@@ -38,7 +38,7 @@ class Desk:
             project=self.session.editor.view,
         )
         self.controller = Controller(
-            state, self.session, self.painter, factory, lambda *file: self.delivered.append(file)
+            state, self.session, self.renderer, factory, lambda *file: self.delivered.append(file)
         )
 
     def reopened(self, *, read_only: bool = False) -> "Desk":
@@ -54,15 +54,15 @@ class Desk:
         """What the page would show."""
         return self.controller.state
 
-    def do(self, *intents: ask.Intent) -> ViewState:
+    def do(self, *asked: intents.Intent) -> ViewState:
         """Handle intents, one after the other."""
-        for intent in intents:
+        for intent in asked:
             self.controller.handle(intent)
         return self.state
 
     def finish(self) -> ViewState:
         """Advance until nothing is going on."""
-        while self.controller.patience() == 0.0:
+        while self.controller.wait_time() == 0.0:
             self.controller.advance()
         return self.state
 

@@ -1,6 +1,6 @@
 """A run that is still going on whenever a test looks."""
 
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 
 # The default solver converges on a tiny frame within seconds, whatever the other settings say.
@@ -10,6 +10,6 @@ _SETTINGS = {"solver": "acs", "iterations": 10_000, "working_width": 96}
 def run_without_end(app: ViewerApp) -> None:
     """Have the next runs go on until they are stopped, with short iterations."""
     for name, value in _SETTINGS.items():
-        app.mailbox.put(ask.SetSetting(name, value))
+        app.queue.put(intents.SetSetting(name, value))
     state = app.wait_until_shown()
     assert state.solver == "acs" and state.settings_error is None, state.settings_error

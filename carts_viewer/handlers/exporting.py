@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import singledispatchmethod
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
@@ -15,17 +14,15 @@ from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, ma
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
 from carts_core.scene import SceneState
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.archive import zipped
 from carts_viewer.checks import unknown
-from carts_viewer.picture import Painter
+from carts_viewer.context import Context, OpenRun
+from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import scene_at
 from carts_viewer.session import Session
 from carts_viewer.state import ExportState
 from carts_viewer.stepping import Stepped
-
-if TYPE_CHECKING:
-    from carts_viewer.controller import Controller
 
 FRAME_CHOICES = {
     "All": frozenset(ReviewState),
@@ -55,17 +52,23 @@ _BIT = 0.05
 """How long the page waits for an export at a time [s]; a step that takes longer is finished."""
 
 
-class Exporter:
-    """The part of the controller that makes files."""
+Deliver = Callable[[int, str, bytes], None]
+"""Sends a file to a tab: client id, file name, content."""
 
-    def __init__(self, controller: "Controller") -> None:
-        self._controller = controller
-        self._session = controller.session
+
+class ExportingHandler:
+    """The handler that makes files."""
+
+    def __init__(self, context: Context, run: OpenRun, deliver: Deliver) -> None:
+        self._context = context
+        self._open_run = run
+        self._deliver = deliver
+        self._session = context.session
         self._job: Stepped[Path] | None = None
-        self._intent: ask.Export | None = None
+        self._intent: intents.Export | None = None
 
     @singledispatchmethod
-    def handle(self, intent: ask.Exporting) -> None:
+    def handle(self, intent: intents.Exporting) -> None:
         """Do what an intent asks for.
 
         Raises:
@@ -73,7 +76,7 @@ class Exporter:
         """
         raise unknown(intent)
 
-    def patience(self) -> float | None:
+    def wait_time(self) -> float | None:
         """0 while there is something to write; None when there is not."""
         return None if self._job is None else 0.0
 
@@ -96,10 +99,10 @@ class Exporter:
                 f"{FORMATS[intent.format].label} needs the package {error.name}, which is not installed. "
                 f"Install it (pip install {error.name}), then export again."
             ) from error
-        self._tell(done=job.done, total=job.total)
+        self._report(done=job.done, total=job.total)
         if path is not None:
             self._job = None
-            self._tell(path=path)
+            self._report(path=path)
             self._log(intent, path)
 
     def cancel(self) -> None:
@@ -107,48 +110,48 @@ class Exporter:
         if self._job is not None:
             job, self._job = self._job, None
             job.cancel()
-            self._controller.change(export=None)
+            self._context.change(export=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.ExportMask) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.ExportMask) -> None:
+        state = self._context.state
         name = file_name(f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
         correction = state.project.get(Key.mask_correction(state.index, state.camera))
-        mask = self._controller.painter.mask(state.pose.scene, state.camera, correction)
-        self._controller.deliver(intent.client_id, name, mask_png(mask))
+        mask = self._context.renderer.mask(state.pose.scene, state.camera, correction)
+        self._deliver(intent.client_id, name, mask_png(mask))
 
     @handle.register
-    def _(self, intent: ask.Export) -> None:
+    def _(self, intent: intents.Export) -> None:
         if self._job is not None:
             raise CartsError("Something is being exported already. Wait, or cancel that first.")
         if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in ("arms", "links"):
             raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
-        self._controller.end_run("Stopped: frames are exported")
-        self._controller.save()
+        self._open_run.end("Stopped: frames are exported")
+        self._context.save()
         make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
         self._intent = intent
         self._job = Stepped(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
-        self._controller.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
+        self._context.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
 
     @handle.register
-    def _(self, intent: ask.CancelExport) -> None:
+    def _(self, intent: intents.CancelExport) -> None:
         self.cancel()
 
     @handle.register
-    def _(self, intent: ask.Download) -> None:
-        export_state = self._controller.state.export
+    def _(self, intent: intents.Download) -> None:
+        export_state = self._context.state.export
         if export_state is None or export_state.path is None:
             raise CartsError("Nothing has been exported yet.")
-        self._controller.deliver(intent.client_id, *zipped(export_state.path))
+        self._deliver(intent.client_id, *zipped(export_state.path))
 
     # ---- The export ------------------------------------------------------------------------------------------------
 
-    def _dataset(self, intent: ask.Export) -> tuple[Callable[[Monitor], Dataset], int]:
+    def _dataset(self, intent: intents.Export) -> tuple[Callable[[Monitor], Dataset], int]:
         """What makes the dataset as the project is now, frame by frame, and how many frames it will have."""
-        state, session = self._controller.state, self._session
+        state, session = self._context.state, self._session
         view = session.editor.view
         chosen = frames_in(view, FRAME_CHOICES[intent.frames])
         if not chosen:
@@ -157,35 +160,35 @@ class Exporter:
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = scene_at(session.scene, state.pose.scene).with_cameras(cameras)
-        painter, sequence, images = self._controller.painter, session.sequence, bool(intent.images)
+        renderer, sequence, images = self._context.renderer, session.sequence, bool(intent.images)
 
         def make(monitor: Monitor) -> Dataset:
             indices = Monitor(cancelled=monitor.cancelled).track(chosen)
-            frames = tuple(export_frame(session, painter, view, index, cameras) for index in indices)
+            frames = tuple(export_frame(session, renderer, view, index, cameras) for index in indices)
             return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
 
         return make, len(chosen)
 
-    def _log(self, intent: ask.Export, path: Path) -> None:
-        project, export_state = self._session.editor.project, self._controller.state.export
+    def _log(self, intent: intents.Export, path: Path) -> None:
+        project, export_state = self._session.editor.project, self._context.state.export
         if project.writable and export_state is not None:
             settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images}
             project.log_export(intent.format, path, export_state.frames, settings)
-            self._controller.change(project=self._session.editor.view)
+            self._context.change(project=self._session.editor.view)
 
-    def _tell(self, **changes: object) -> None:
-        if self._controller.state.export is not None:
-            self._controller.change(export=replace(self._controller.state.export, **changes))
+    def _report(self, **changes: object) -> None:
+        if self._context.state.export is not None:
+            self._context.change(export=replace(self._context.state.export, **changes))
 
 
 class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
     """Camera -> the corrected mask of a frame, for the cameras that have a correction; made when it is asked for."""
 
-    def __init__(self, painter: Painter, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
-        self._painter, self._pose, self._corrections = painter, pose, corrections
+    def __init__(self, renderer: OverlayRenderer, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
+        self._renderer, self._pose, self._corrections = renderer, pose, corrections
 
     def __getitem__(self, camera: str) -> Bool[np.ndarray, "height width"]:
-        return self._painter.mask(self._pose, camera, self._corrections[camera])
+        return self._renderer.mask(self._pose, camera, self._corrections[camera])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._corrections)
@@ -195,7 +198,7 @@ class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
 
 
 def export_frame(
-    session: Session, painter: Painter, project: ProjectState, index: int, cameras: list[str]
+    session: Session, renderer: OverlayRenderer, project: ProjectState, index: int, cameras: list[str]
 ) -> ExportFrame:
     """A frame as a project has it: joint positions, their deviations and source, and masks that were painted on."""
     frame = session.sequence.frame(index, cameras=[])
@@ -208,11 +211,11 @@ def export_frame(
         session.joints(pose.scene),
         {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
         index=index,
-        masks=CorrectedMasks(painter, pose.scene, {name: p for name, p in painted.items() if p is not None}),
+        masks=CorrectedMasks(renderer, pose.scene, {name: p for name, p in painted.items() if p is not None}),
     )
 
 
-def free_path(project: Path, stem: str, intent: ask.Export) -> OutputPath:
+def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:
     """Where an export goes: into a folder beside the project, under a name that nothing has yet."""
     folder, suffix = output_path(project.parent, f"{project.stem}_exports"), FORMATS[intent.format].suffix
     number, path = 1, folder / f"{stem}{suffix}"

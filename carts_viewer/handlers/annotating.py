@@ -1,22 +1,20 @@
 """What intents about the project do: history, review, corrections between frames, keypoints."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatchmethod
-from typing import TYPE_CHECKING
 
 from carts_core.errors import CartsError
 from carts_core.keypoints import project_keypoints
 from carts_core.optimization.keypoints import Pin, fit_keypoints
-from carts_core.project import Review, ReviewState, Source, next_unreviewed, worst_first
+from carts_core.project import Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import LONGEST_NOTE
 from carts_core.scene import SceneState
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.checks import unknown
+from carts_viewer.context import Context, OpenRun
 from carts_viewer.marks import labelled_keypoints
-
-if TYPE_CHECKING:
-    from carts_viewer.controller import Controller
 
 _SETTLED = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
 _REVIEW_STEPS = {
@@ -28,20 +26,28 @@ _REVIEW_STEPS = {
 }
 
 
-class Annotator:
-    """The part of the controller that the project is about."""
+class AnnotatingHandler:
+    """The handler that the project is about."""
 
-    def __init__(self, controller: "Controller") -> None:
-        self._controller = controller
-        self._session = controller.session
-        self._keypoints = labelled_keypoints(controller.session.scene)
+    def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
+        """
+        Args:
+            context: the state, and the way into the project.
+            run: ends when the frame is edited.
+            show: `BrowsingHandler.show`.
+        """
+        self._context = context
+        self._open_run = run
+        self._show = show
+        self._session = context.session
+        self._keypoints = labelled_keypoints(context.session.scene)
         self._held: str | None = None
         """The keypoint under somebody's pointer."""
         self._pinned_from: SceneState | None = None
         """The pose before the first of the present pins."""
 
     @singledispatchmethod
-    def handle(self, intent: ask.Annotation) -> None:
+    def handle(self, intent: intents.Annotation) -> None:
         """Do what an intent asks for.
 
         Raises:
@@ -56,62 +62,62 @@ class Annotator:
     # ---- History ---------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.Undo) -> None:
+    def _(self, intent: intents.Undo) -> None:
         self._finish("Stopped by undo")
         self._go_to(self._session.editor.view.position - 1)
 
     @handle.register
-    def _(self, intent: ask.Redo) -> None:
+    def _(self, intent: intents.Redo) -> None:
         self._finish("Stopped by redo")
         self._go_to(self._session.editor.view.position + 1)
 
     @handle.register
-    def _(self, intent: ask.GoToStep) -> None:
+    def _(self, intent: intents.GoToStep) -> None:
         self._finish("Stopped by undo")
         self._go_to(intent.position)
 
     def _finish(self, reason: str) -> None:
-        self._controller.end_run(reason)
-        self._controller.save()
+        self._open_run.end(reason)
+        self._context.save()
 
     def _go_to(self, position: int) -> None:
         change = self._session.editor.go_to(position)
-        self._controller.forget_pins()
+        self._context.forget_pins()
         frames = () if change is None else change.frames
-        index = self._controller.state.index
+        index = self._context.state.index
         # What changes should be seen, wherever it is.
-        self._controller.show(index=index if index in frames or not frames else frames[0], again=True)
+        self._show(index=index if index in frames or not frames else frames[0], again=True)
 
     # ---- Review ----------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.SetReview) -> None:
+    def _(self, intent: intents.SetReview) -> None:
         self._review(intent.state)
 
     @handle.register
-    def _(self, intent: ask.SetNote) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.SetNote) -> None:
+        state = self._context.state
         review = Review(state.review.state, str(intent.note)[:LONGEST_NOTE])
-        self._controller.mark("Note", review, gesture=(ask.SetNote, state.index))
+        self._mark("Note", review, gesture=(intents.SetNote, state.index))
 
     @handle.register
-    def _(self, intent: ask.AcceptAndNext) -> None:
+    def _(self, intent: intents.AcceptAndNext) -> None:
         self._review(ReviewState.ACCEPTED)
         # Whoever accepts the last frame is done, which is no error.
-        if next_unreviewed(self._controller.state.project, self._controller.state.index) is not None:
-            self.handle(ask.ShowUnreviewed())
+        if next_unreviewed(self._context.state.project, self._context.state.index) is not None:
+            self.handle(intents.ShowUnreviewed())
 
     @handle.register
-    def _(self, intent: ask.ShowUnreviewed) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.ShowUnreviewed) -> None:
+        state = self._context.state
         index = next_unreviewed(state.project, state.index, 1 if intent.step > 0 else -1)
         if index is None:
             raise CartsError("Every frame has been reviewed.")
         self._go(index)
 
     @handle.register
-    def _(self, intent: ask.ShowWorse) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.ShowWorse) -> None:
+        state = self._context.state
         project = state.project
         frames = range(len(project.identity.frame_ids))
         open_ones = [i for i in frames if i == state.index or project.review(i).state not in _SETTLED]
@@ -123,45 +129,53 @@ class Annotator:
         self._go(order[place % len(order)])
 
     def _review(self, state: ReviewState) -> None:
-        note = self._controller.state.review.note
-        self._controller.mark(_REVIEW_STEPS[state], Review(state, note))
+        note = self._context.state.review.note
+        self._mark(_REVIEW_STEPS[state], Review(state, note))
+
+    def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
+        """Say something about the shown frame, which ends a run."""
+        self._open_run.end("Stopped: the frame was reviewed")
+        # What says nothing is none, so that clearing what is clear is no step.
+        edits = {Key.review(self._context.state.index): None if review == Review() else review}
+        self._context.edit(name, edits, gesture=gesture)
 
     def _go(self, index: int) -> None:
-        self._controller.change(playing=False)
-        self._controller.show(index=index)
+        self._context.change(playing=False)
+        self._show(index=index)
 
     # ---- Corrections -----------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.CopyCorrection) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.CopyCorrection) -> None:
+        state = self._context.state
         index = state.index + (1 if intent.step > 0 else -1)
         if not 0 <= index < len(self._session.sequence):
             side = "after" if intent.step > 0 else "before"
             raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
         source = self._session.sequence.frame(index, cameras=[])
         scene = self._session.copied(state.frame, source)
-        self._controller.edit(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)
+        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.set_pose(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)
 
     @handle.register
-    def _(self, intent: ask.ShowKeypoints) -> None:
-        shown = self._controller.state.keypoints
-        self._controller.change(keypoints=replace(shown, shown=not shown.shown if intent.on is None else intent.on))
+    def _(self, intent: intents.ShowKeypoints) -> None:
+        shown = self._context.state.keypoints
+        self._context.change(keypoints=replace(shown, shown=not shown.shown if intent.on is None else intent.on))
 
     @handle.register
-    def _(self, intent: ask.ChooseKeypoint) -> None:
+    def _(self, intent: intents.ChooseKeypoint) -> None:
         if intent.label is not None and intent.label not in self._keypoints:
             raise CartsError(f"There is no keypoint {intent.label!r}; there are: {', '.join(self._keypoints)}.")
-        self._controller.change(keypoints=replace(self._controller.state.keypoints, chosen=intent.label))
+        self._context.change(keypoints=replace(self._context.state.keypoints, chosen=intent.label))
 
     @handle.register
-    def _(self, intent: ask.ForgetPins) -> None:
-        self._controller.forget_pins()
+    def _(self, intent: intents.ForgetPins) -> None:
+        self._context.forget_pins()
 
     @handle.register
-    def _(self, intent: ask.PointAt) -> None:
-        self._controller.end_run("Stopped: the pose was changed by hand")
-        state = self._controller.state
+    def _(self, intent: intents.PointAt) -> None:
+        self._open_run.end("Stopped: the pose was changed by hand")
+        state = self._context.state
         camera = self._session.scene.camera(state.camera)
         if not (math.isfinite(intent.u) and math.isfinite(intent.v)):
             raise CartsError(f"({intent.u}, {intent.v}) is no place in the image.")
@@ -174,12 +188,12 @@ class Annotator:
         pins = (*others, pin)
         fit = fit_keypoints(self._session.scene, self._pinned_from, pins)
         placed = replace(state.keypoints, shown=True, pins=pins, residuals=fit.residuals)
-        self._controller.change(keypoints=placed)
-        gesture = (ask.PointAt, pin.keypoint, pin.camera)
-        self._controller.edit(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
+        self._context.change(keypoints=placed)
+        gesture = (intents.PointAt, pin.keypoint, pin.camera)
+        self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
 
     def _nearest(self, pixel: tuple[float, float]) -> str:
-        state = self._controller.state
+        state = self._context.state
         points = list(self._keypoints.values())
         shown = project_keypoints(self._session.scene, state.pose.scene, points, state.camera)
         distances = (shown - shown.new_tensor(pixel)).norm(dim=-1).nan_to_num(math.inf)

@@ -1,11 +1,10 @@
-"""Everything the viewer needs from viser that viser does not offer publicly, in one place.
+"""The page: a viser server that is guarded, our script and style in it, and what the two say to one another.
 
 - The server is guarded (`guard.py`, `incoming.py`), and serves `static/` and our script and style.
-- Messages to one client's page (`tell`), and the page's word that it has drawn an overlay (`on_drawn`).
-- Values as a tab has sent them (`on_sent`).
+- Calls into one client's page (`call`), and the page's word that it has drawn an overlay (`on_drawn`).
 - Buttons side by side, which viser's panels do not know.
 
-viser is pinned to one minor version, and the browser tests drive all of this end to end.
+The browser tests drive all of this end to end.
 """
 
 import contextlib
@@ -21,15 +20,15 @@ from pathlib import Path
 from typing import Any
 
 import viser
-from viser._messages import RunJavascriptMessage
 from websockets.http11 import Request, Response
 
 from carts_core.errors import CartsError
 from carts_core.resources import static_dir
-from carts_viewer import incoming
-from carts_viewer.gate import gated, response
-from carts_viewer.guard import Guard, check_address
-from carts_viewer.outgoing import queue_safely
+from carts_viewer.transport import incoming
+from carts_viewer.transport.gate import gated, response
+from carts_viewer.transport.guard import Guard, check_address
+from carts_viewer.transport.outgoing import queue_safely
+from carts_viewer.transport.viser_private import command_id, element_id, run_script, value_of, widgets
 
 OWN_KEYS = ("[", "]", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -117,12 +116,11 @@ class Page:
         """Call `callback(share)` on the event loop whenever somebody clicks the timeline; any number, as above."""
         _on_numbers(self._picked, 1, callback)
 
-    def tell(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
+    def call(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
         """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
-        call = ", ".join(json.dumps(argument) for argument in arguments)
-        source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({call});"
-        # Never broadcast: viser replays a broadcast script to every tab that joins later.
-        client._websock_connection.queue_message(RunJavascriptMessage(source=source))
+        values = ", ".join(json.dumps(argument) for argument in arguments)
+        source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({values});"
+        run_script(client, source)
 
     def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
         """Lay out consecutive buttons of the current container side by side.
@@ -132,7 +130,7 @@ class Page:
             weights: Relative widths; equal when left out.
         """
         shares = [1.0] * len(handles) if weights is None else list(weights)
-        self._side_by_side([handle._impl.uuid for handle in handles], shares, "div:has(> [id='{}'])")
+        self._side_by_side([element_id(handle) for handle in handles], shares, "div:has(> [id='{}'])")
 
     def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:
         """Lay out consecutive checkboxes or number fields of the current container in columns, in reading order.
@@ -143,7 +141,7 @@ class Page:
             narrow_labels: Give labels no more room than they need, and the fields the rest.
         """
         for first in range(0, len(handles), count):
-            group = [handle._impl.uuid for handle in handles[first : first + count]]
+            group = [element_id(handle) for handle in handles[first : first + count]]
             # A short last line keeps the width of the others.
             box = "div:has(> .mantine-Flex-root > div [id='{}'])"
             self._side_by_side(group, [1.0] * len(group), box, total=float(count))
@@ -168,21 +166,19 @@ class Page:
     @property
     def drawn_id(self) -> str:
         """The `id` of the field in which a tab says that it has drawn an overlay."""
-        return self._drawn._impl.uuid
+        return element_id(self._drawn)
 
     def find(self, label: str) -> Any:
         """The widget with this label (for tests and scripts)."""
-        handles = self.server.gui._gui_input_handle_from_uuid.values()
-        return next(handle for handle in handles if getattr(handle, "label", None) == label)
+        return next(handle for handle in widgets(self.server) if getattr(handle, "label", None) == label)
 
     def command_id(self, label: str) -> str:
         """The id by which a tab triggers the command with this label (for tests and scripts)."""
-        commands = self.server.gui._command_handle_from_uuid
-        return next(element for element, command in commands.items() if command.label == label)
+        return command_id(self.server, label)
 
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
-        return handle._impl.uuid
+        return element_id(handle)
 
     def _respond(self, request: Request) -> Response | None:
         """Our own answer to a request, or None to let viser answer it."""
@@ -206,9 +202,7 @@ class Page:
 
     def _value_of(self, element: str) -> Any:
         # A tab may be there before the server's constructor has returned.
-        handles = self.server.gui._gui_input_handle_from_uuid if hasattr(self, "server") else {}
-        handle = handles.get(element)
-        return None if handle is None else handle._impl.value
+        return value_of(self.server, element) if hasattr(self, "server") else None
 
     def _static(self, name: str) -> Response:
         # Only names that a listing of the folder gave are looked up, so no path can leave it.
@@ -222,11 +216,11 @@ class Page:
         configuration = json.dumps(
             {
                 "drawn": self.drawn_id,
-                "released": self._released._impl.uuid,
-                "picked": self._picked._impl.uuid,
-                "pointed": self._pointed._impl.uuid,
-                "painted": self._painted._impl.uuid,
-                "pressed": self._pressed._impl.uuid,
+                "released": element_id(self._released),
+                "picked": element_id(self._picked),
+                "pointed": element_id(self._pointed),
+                "painted": element_id(self._painted),
+                "pressed": element_id(self._pressed),
                 "keys": OWN_KEYS,
             }
         )
@@ -244,22 +238,6 @@ class Page:
             )
             .encode()
         )
-
-
-def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
-    """Call `callback(value)` on the event loop whenever a tab sends a new value for a widget.
-
-    By the time that viser's own `on_update` reads the widget, the worker may have written an older value into it, and
-    what the tab has sent would be lost.
-    """
-    impl = handle._impl
-    tell_other_tabs = impl.sync_cb
-
-    def sent(client_id: int, updates: dict[str, Any]) -> None:
-        tell_other_tabs(client_id, updates)
-        callback(updates["value"])
-
-    impl.sync_cb = sent
 
 
 def _on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:

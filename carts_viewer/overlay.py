@@ -14,7 +14,7 @@ from carts_viewer.layers import Layer
 from carts_viewer.state import Maps, Scores
 
 
-class Painter:
+class OverlayRenderer:
     """Renders poses into the scene's cameras; keeps one renderer per camera."""
 
     def __init__(self, sequence: Sequence, device: str | torch.device = "cpu") -> None:

@@ -1,4 +1,4 @@
-"""`python -m carts_core.bench`: times and ratios of the core on the shipped sequence, measured on this machine.
+"""`python -m tools.bench_core`: times and ratios of the core on the shipped sequence, measured on this machine.
 
 Every figure is the median of repeated runs in one process; speed is a matter of the machine, the ratios less so.
 """
@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from rich.table import Table
 
-from .console import Terminal
-from .data import Sequence
-from .evaluation import start_positions
-from .features import FeatureExtractor
-from .optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
-from .process import tune_process
-from .rendering import Renderer, visibility_torch
-from .rendering.geometry import link_transforms, vertices_in_camera
-from .rendering.visibility_numba import rasterize
-from .resources import sample_sequence
-from .scene import SceneState
-from .wording import counted
+from carts_core.console import Terminal
+from carts_core.data import Sequence
+from carts_core.evaluation import start_positions
+from carts_core.features import FeatureExtractor
+from carts_core.optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
+from carts_core.process import tune_process
+from carts_core.rendering import Renderer, visibility_torch
+from carts_core.rendering.geometry import link_transforms, vertices_in_camera
+from carts_core.rendering.visibility_numba import rasterize
+from carts_core.resources import sample_sequence
+from carts_core.scene import SceneState
+from carts_core.wording import counted
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:

@@ -12,6 +12,7 @@ from viser import transforms
 from carts_core.camera import Camera
 from carts_core.scene import Scene, SceneState
 from carts_viewer.layers import ARM_COLORS, Rgba
+from carts_viewer.transport.viser_private import image_file
 
 LENS = "/lens"
 """Lines from the lens to the corners of the frame; hidden like `WORLD`."""
@@ -27,7 +28,7 @@ _LEAST_DEPTH = 0.005
 _OVERLAY_SHARE = 0.99
 
 
-class Stage:
+class SceneView:
     """What all tabs see; every tab chooses for itself from where."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene, state: SceneState, camera: str) -> None:
@@ -61,7 +62,7 @@ class Stage:
 
     def sent(self, name: str) -> bytes:
         """The image file that `FRAME` or `OVERLAY` was last sent as."""
-        return self._planes[name][1]._data
+        return image_file(self._planes[name][1])
 
     def show_pose(self, state: SceneState, camera: str) -> None:
         """Move arms and cameras to where they are, seen from this camera."""

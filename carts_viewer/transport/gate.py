@@ -13,7 +13,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.typing import Data
 
-from carts_viewer.incoming import LARGEST_MESSAGE
+from carts_viewer.transport.incoming import LARGEST_MESSAGE
 
 _log = logging.getLogger(__name__)
 _SERVER_CONSTRUCTION = threading.Lock()

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import singledispatchmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,30 +20,29 @@ from carts_core.project import (
     between_kept,
 )
 from carts_core.project.keys import WHOLE_PROJECT
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.checks import unknown
+from carts_viewer.context import Context, OpenRun
 from carts_viewer.running import OptimizerFactory, SequenceRun
 from carts_viewer.session import joint_correction
 from carts_viewer.state import SolveState
 
-if TYPE_CHECKING:
-    from carts_viewer.controller import Controller
 
+class PropagatingHandler:
+    """The handler that solves many frames, one at a time."""
 
-class Propagator:
-    """The part of the controller that solves many frames, one at a time."""
-
-    def __init__(self, controller: "Controller", optimizers: OptimizerFactory) -> None:
-        self._controller = controller
-        self._session = controller.session
+    def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory) -> None:
+        self._context = context
+        self._open_run = run
+        self._session = context.session
         self._optimizers = optimizers
         self._run: SequenceRun | None = None
         self._work: Iterator[None] = iter(())
-        self._before: ProjectState = controller.session.editor.view
+        self._before: ProjectState = context.session.editor.view
         """What the project said when the run began."""
 
     @singledispatchmethod
-    def handle(self, intent: ask.Propagating) -> None:
+    def handle(self, intent: intents.Propagating) -> None:
         """Do what an intent asks for.
 
         Raises:
@@ -51,7 +50,7 @@ class Propagator:
         """
         raise unknown(intent)
 
-    def patience(self) -> float | None:
+    def wait_time(self) -> float | None:
         """0 while frames are being solved; None when they are not."""
         return None if self._run is None else 0.0
 
@@ -68,7 +67,7 @@ class Propagator:
         """Forget what is being solved, if anything is."""
         if self._run is not None:
             self._run = None
-            self._tell(running=False, text=reason)
+            self._report(running=False, text=reason)
 
     def finish(self) -> None:
         """Stop, and save the frames that are solved. Errors as `advance`."""
@@ -80,29 +79,29 @@ class Propagator:
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.HoldKeyframe) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.HoldKeyframe) -> None:
+        state = self._context.state
         on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
-        self._controller.end_run("Stopped: the frame was marked")
+        self._open_run.end("Stopped: the frame was marked")
         name = "Make a keyframe" if on else "Make no keyframe"
-        self._controller.stage(name, {Key.keyframe(state.index): Keyframe(on)})
+        self._context.edit(name, {Key.keyframe(state.index): Keyframe(on)})
 
     @handle.register
-    def _(self, intent: ask.SetDirection) -> None:
+    def _(self, intent: intents.SetDirection) -> None:
         if intent.direction not in ("forward", "backward"):
             raise CartsError(f"There is no direction {intent.direction!r}.")
-        self._controller.change(direction=intent.direction)
+        self._context.change(direction=intent.direction)
 
     @handle.register
-    def _(self, intent: ask.Solve) -> None:
+    def _(self, intent: intents.Solve) -> None:
         if self._run is not None:
             raise CartsError("Frames are being solved already. Wait, or stop that first.")
         project = self._session.editor.project
         if not project.writable:
             raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
-        self._controller.end_run("Stopped: many frames are solved together")
-        self._controller.save()
-        view, index = self._session.editor.view, self._controller.state.index
+        self._open_run.end("Stopped: many frames are solved together")
+        self._context.save()
+        view, index = self._session.editor.view, self._context.state.index
         if not (intent.whole or view.kept_frames):
             raise CartsError(
                 "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
@@ -112,19 +111,19 @@ class Propagator:
         if len(kept) == len(frames):
             raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")
         self._before = view
-        self._controller.change(playing=False, error=None)
+        self._context.change(playing=False, error=None)
         self._run = self._make(frames, kept)
         self._work = self._bits(self._run)
-        self._controller.change(busy=None, solve=SolveState(frames, text="Looking at the first frame"))
+        self._context.change(busy=None, solve=SolveState(frames, text="Looking at the first frame"))
 
     @handle.register
-    def _(self, intent: ask.StopSolving) -> None:
+    def _(self, intent: intents.StopSolving) -> None:
         self.finish()
 
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
-        state, sequence, cameras = self._controller.state, self._session.sequence, self._controller.cameras
+        state, sequence, cameras = self._context.state, self._session.sequence, self._context.cameras
         poses = {index: self._session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
         return self._optimizers.make_sequence(
             sequence,
@@ -144,29 +143,29 @@ class Propagator:
         try:
             while run.step():
                 self._check_calibration()
-                self._tell(done=run.done, text=run.status())
+                self._report(done=run.done, text=run.status())
                 yield
             for index, estimate in run.estimates().items():
                 if run.cancelled:
                     break
                 dice[index] = self._dice(estimate)
-                self._tell(text=f"Comparing with the truth, frame {len(dice)} of {run.done}")
+                self._report(text=f"Comparing with the truth, frame {len(dice)} of {run.done}")
                 yield
         finally:
             # An image that is missing in the end does not cost what was solved before it.
             if self._run is run:
                 self._run = None
-                self._tell(running=False, text="")
-                self._tell(text=self._save(run, dice))
+                self._report(running=False, text="")
+                self._report(text=self._save(run, dice))
 
     def _dice(self, estimate: FrameEstimate) -> float | None:
-        state, sequence = self._controller.state, self._session.sequence
+        state, sequence = self._context.state, self._session.sequence
         if not sequence.has_masks(state.camera, state.domain):
             return None
         frame = sequence.frame(estimate.index, state.domain, [state.camera])
         scene = self._session.with_joints(state.pose.scene, estimate.joint_positions)
         correction = self._session.editor.view.get(Key.mask_correction(estimate.index, state.camera))
-        return self._controller.painter.scores(scene, frame, state.camera, correction).dice
+        return self._context.renderer.scores(scene, frame, state.camera, correction).dice
 
     def _check_calibration(self) -> None:
         now = self._session.editor.view
@@ -178,7 +177,7 @@ class Propagator:
 
     def _save(self, run: SequenceRun, dice: Mapping[int, float | None]) -> str:
         """Save all frames that were solved as one step, and say so."""
-        self._controller.save()
+        self._context.save()
         edits: dict[Key[Any], Any] = {}
         figures: dict[int, Figures] = {}
         now, kept = self._session.editor.view, set(self._session.editor.view.kept_frames)
@@ -191,12 +190,12 @@ class Propagator:
             return "Stopped before a frame was solved"
         first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
         self._session.editor.project.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
-        self._controller.refresh()
+        self._context.refresh()
         return f"{'Stopped: ' if run.cancelled else ''}{len(figures)} frames solved, one step of undo"
 
-    def _tell(self, **changes: Any) -> None:
-        if self._controller.state.solve is not None:
-            self._controller.change(solve=replace(self._controller.state.solve, **changes))
+    def _report(self, **changes: Any) -> None:
+        if self._context.state.solve is not None:
+            self._context.change(solve=replace(self._context.state.solve, **changes))
 
 
 def _edits(estimate: FrameEstimate, run: SequenceRun, review: Review) -> Edits:

@@ -2,21 +2,19 @@
 
 from dataclasses import replace
 from functools import singledispatchmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.project import Edits, Key, Review, ReviewState
 from carts_core.settings import SolverName
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.checks import unknown
+from carts_viewer.context import Context
 from carts_viewer.layers import Layer
 from carts_viewer.running import ActiveRun, OptimizerFactory
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
-
-if TYPE_CHECKING:
-    from carts_viewer.controller import Controller
 
 _REASONS = {
     "iterations": "Done, best iterate kept",
@@ -27,19 +25,19 @@ _REASONS = {
 }
 
 
-class Runner:
-    """The part of the controller that drives the optimizer, an iteration at a time."""
+class OptimizingHandler:
+    """The handler that drives the optimizer, an iteration at a time."""
 
-    def __init__(self, controller: "Controller", optimizers: OptimizerFactory) -> None:
-        self._controller = controller
-        self._session = controller.session
+    def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
+        self._context = context
+        self._session = context.session
         self._optimizers = optimizers
         self._run: ActiveRun | None = None
         self._before: Edits | None = None
         """What brings the frame back to where the last run began."""
 
     @singledispatchmethod
-    def handle(self, intent: ask.Optimizing) -> None:
+    def handle(self, intent: intents.Optimizing) -> None:
         """Do what an intent asks for.
 
         Raises:
@@ -52,13 +50,13 @@ class Runner:
         """Whether there is a run, paused or not."""
         return self._run is not None
 
-    def patience(self) -> float | None:
+    def wait_time(self) -> float | None:
         """0 while iterations are due; None when there are none."""
-        return 0.0 if self._controller.state.run.phase is Phase.RUNNING else None
+        return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
 
     def advance(self) -> None:
         """Do an iteration, if one is due."""
-        if self._controller.state.run.phase is Phase.RUNNING:
+        if self._context.state.run.phase is Phase.RUNNING:
             self._iterate()
 
     def end(self, reason: str | None, *, save: bool = True) -> None:
@@ -67,13 +65,13 @@ class Runner:
         Raises:
             ProjectError: it could not be saved.
         """
-        if self._controller.state.run.base_frame_gain is not None:
+        if self._context.state.run.base_frame_gain is not None:
             self._set(base_frame_gain=None)
         if self._run is not None:
             self._run = None
             self._set(phase=Phase.IDLE, reason=reason)
             if save:
-                self._controller.save()
+                self._context.save()
 
     def forget(self) -> None:
         """Another frame is shown, where there is no run to go back to the start of."""
@@ -85,7 +83,7 @@ class Runner:
         Raises:
             CartsError: it cannot be computed.
         """
-        state = self._controller.state
+        state = self._context.state
         if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
             return
         if state.maps is not None and state.camera in state.maps.cameras:
@@ -95,29 +93,29 @@ class Runner:
             iterate = run.step()
         except CartsError:
             # Without weights, say, there is nothing to show, and trying again with every picture would not help.
-            self._controller.change(layer=Layer.MASK)
+            self._context.change(layer=Layer.MASK)
             raise
-        self._controller.change(maps=None if iterate is None else Maps(iterate, run.cameras), busy=None)
+        self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras), busy=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: ask.Run) -> None:
+    def _(self, intent: intents.Run) -> None:
         if self._run is None:
             self._start()
         self._set(phase=Phase.RUNNING, reason=None)
 
     @handle.register
-    def _(self, intent: ask.Pause) -> None:
-        if self._controller.state.run.phase is Phase.RUNNING:
+    def _(self, intent: intents.Pause) -> None:
+        if self._context.state.run.phase is Phase.RUNNING:
             self._set(phase=Phase.PAUSED)
 
     @handle.register
-    def _(self, intent: ask.RunOrPause) -> None:
-        self.handle(ask.Pause() if self._controller.state.run.phase is Phase.RUNNING else ask.Run())
+    def _(self, intent: intents.RunOrPause) -> None:
+        self.handle(intents.Pause() if self._context.state.run.phase is Phase.RUNNING else intents.Run())
 
     @handle.register
-    def _(self, intent: ask.Step) -> None:
+    def _(self, intent: intents.Step) -> None:
         if self._run is None:
             self._start()
             self._iterate()
@@ -125,18 +123,18 @@ class Runner:
         self._iterate()
 
     @handle.register
-    def _(self, intent: ask.Reset) -> None:
+    def _(self, intent: intents.Reset) -> None:
         if self._run is not None:
             # Nothing of the run was saved yet, so there is nothing to take back.
             self._session.editor.drop()
         self.end(None)
-        self._controller.change(run=RunState())
+        self._context.change(run=RunState())
         if self._before is not None:
-            self._controller.stage("Reset to the start of the run", self._before)
+            self._context.edit("Reset to the start of the run", self._before)
 
     @handle.register
-    def _(self, intent: ask.SetSetting) -> None:
-        state = self._controller.state
+    def _(self, intent: intents.SetSetting) -> None:
+        state = self._context.state
         settings, solver = state.settings, state.solver
         try:
             if intent.name == "solver":
@@ -145,32 +143,32 @@ class Runner:
                 settings = changed(settings, {intent.name: intent.value}, "the solver")
         except SettingsError as error:
             # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
-            self._controller.change(settings_error=str(error))
+            self._context.change(settings_error=str(error))
             return
         self.end("Settings changed; Run starts anew from here")
-        self._controller.change(settings=settings, solver=solver, settings_error=None, maps=None)
+        self._context.change(settings=settings, solver=solver, settings_error=None, maps=None)
 
     @handle.register
-    def _(self, intent: ask.SetFreeJoint) -> None:
+    def _(self, intent: intents.SetFreeJoint) -> None:
         name = f"{intent.arm}/{intent.joint}"
-        locked = {*self._controller.state.free.locked_joints} - {name}
+        locked = {*self._context.state.free.locked_joints} - {name}
         self._set_free(locked_joints=tuple(sorted(locked if intent.on else {*locked, name})))
 
     @handle.register
-    def _(self, intent: ask.SetFreeGroup) -> None:
+    def _(self, intent: intents.SetFreeGroup) -> None:
         if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
             raise SettingsError(f"There is no group of parameters called {intent.group!r}.")
         self._set_free(**{intent.group: intent.on})
 
     @handle.register
-    def _(self, intent: ask.SetCameras) -> None:
+    def _(self, intent: intents.SetCameras) -> None:
         self.end("Cameras changed; Run starts anew from here")
-        self._controller.change(every_camera=intent.every)
+        self._context.change(every_camera=intent.every)
 
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
-        state = self._controller.state
+        state = self._context.state
         sequence, ignore = self._session.sequence, self._session.ignored(state.index, cameras)
         optimizer = self._optimizers.make(
             sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, ignore
@@ -179,15 +177,15 @@ class Runner:
         return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance)
 
     def _start(self) -> None:
-        if self._controller.state.settings_error is not None:
-            raise SettingsError(self._controller.state.settings_error)
-        if self._controller.state.solving:
+        if self._context.state.settings_error is not None:
+            raise SettingsError(self._context.state.settings_error)
+        if self._context.state.solving:
             raise CartsError("Many frames are being solved. Wait, or stop that first.")
-        self._run = self._make(self._controller.cameras)
-        self._controller.save()
-        self._controller.forget_pins()
-        self._before = self._session.saved(self._controller.state.index)
-        self._controller.change(run=RunState(Phase.RUNNING), playing=False, error=None, busy=None)
+        self._run = self._make(self._context.cameras)
+        self._context.save()
+        self._context.forget_pins()
+        self._before = self._session.saved(self._context.state.index)
+        self._context.change(run=RunState(Phase.RUNNING), playing=False, error=None, busy=None)
 
     def _iterate(self) -> None:
         run = self._run
@@ -202,12 +200,12 @@ class Runner:
             self._set(base_frame_gain=run.base_frame_gain())
             return
         self._accept(run, iterate)
-        self._controller.score()
-        curves, best = self._controller.state.run.curves, run.best()
+        self._context.score()
+        curves, best = self._context.state.run.curves, run.best()
         self._set(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
-                (*curves.scores, self._controller.state.scores or Scores()),
+                (*curves.scores, self._context.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
                 best.index if best else 0,
             )
@@ -215,17 +213,17 @@ class Runner:
 
     def _accept(self, run: ActiveRun, iterate: Any) -> None:
         """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
-        state = self._controller.state
+        state = self._context.state
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
         review = self._session.editor.project.state.review(state.index)
         if review.state is ReviewState.UNTOUCHED:
             edits[Key.review(state.index)] = Review(ReviewState.OPTIMIZED, review.note)
         maps = Maps(iterate, run.cameras)
-        self._controller.stage("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
+        self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
 
     def _set_free(self, **changes: Any) -> None:
         self.end("Free parameters changed; Run starts anew from here")
-        self._controller.change(free=replace(self._controller.state.free, **changes), maps=None)
+        self._context.change(free=replace(self._context.state.free, **changes), maps=None)
 
     def _set(self, **changes: Any) -> None:
-        self._controller.change(run=replace(self._controller.state.run, **changes))
+        self._context.change(run=replace(self._context.state.run, **changes))

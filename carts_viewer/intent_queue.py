@@ -6,7 +6,7 @@ from collections.abc import Hashable
 from carts_viewer.intents import Intent
 
 
-class Mailbox:
+class IntentQueue:
     """Where intents wait, in the order of their newest version. Any thread may put, the worker takes."""
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class Mailbox:
             self._changed.notify()
 
     def take(self, timeout: float | None = None) -> list[Intent]:
-        """Everything that waits, emptying the mailbox.
+        """Everything that waits, emptying the queue.
 
         Args:
             timeout: How long to wait for a first intent [s]; None waits for ever, 0 not at all.
@@ -32,9 +32,9 @@ class Mailbox:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._woken, timeout)
             self._woken = False
-            intents = list(self._waiting.values())
+            waiting = list(self._waiting.values())
             self._waiting.clear()
-            return intents
+            return waiting
 
     def wake(self) -> None:
         """End a `take` that waits, with nothing."""

@@ -9,11 +9,23 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
-from viser import _messages as messages
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from carts_viewer.stage import OVERLAY
+from carts_viewer.scene_view import OVERLAY
+
+_CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 0.0),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 600,
+    "image_width": 800,
+    "look_at": (0.0, 0.0, 0.1),
+    "up_direction": (0.0, -1.0, 0.0),
+}
 
 
 class RawTab:
@@ -66,11 +78,11 @@ class RawTab:
         Raises:
             ConnectionClosed: the server is gone, or has had enough.
         """
-        self.send(messages.GuiUpdateMessage(element, {"value": value}).as_serializable_dict())
+        self.send(_update(element, value))
 
     def press(self, command: str) -> None:
         """Trigger the command of a key; errors as `set`."""
-        self.send(messages.CommandTriggerMessage(command).as_serializable_dict())
+        self.send({"type": "CommandTriggerMessage", "uuid": command})
 
     def send(self, message: dict[str, Any] | bytes | str) -> None:
         """Send a message, or any bytes or text; errors as `set`."""
@@ -99,10 +111,7 @@ class RawTab:
             self._url, subprotocols=[protocol], max_size=None, compression=None, origin=self._origin
         )
         # viser counts a tab as connected once it has said where its camera is.
-        camera = messages.ViewerCameraMessage(
-            (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.1), (0.0, -1.0, 0.0)
-        )
-        await self._push(msgspec.msgpack.encode(camera.as_serializable_dict()))
+        await self._push(msgspec.msgpack.encode(_CAMERA))
         self._reader = asyncio.create_task(self._read(self._connection))
 
     async def _close(self) -> None:
@@ -139,5 +148,10 @@ class RawTab:
             self.overlays.append((arrived, (updates or props)["_data"]))
             self._drawings += 1
             if self._drawn is not None:
-                data = messages.GuiUpdateMessage(self._drawn, {"value": f"{id(self)} {self._drawings}"})
-                await self._push(msgspec.msgpack.encode(data.as_serializable_dict()))
+                drawn = _update(self._drawn, f"{id(self)} {self._drawings}")
+                await self._push(msgspec.msgpack.encode(drawn))
+
+
+def _update(element: str, value: Any) -> dict[str, Any]:
+    """The message that a widget has a new value."""
+    return {"type": "GuiUpdateMessage", "uuid": element, "updates": {"value": value}}

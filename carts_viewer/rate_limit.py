@@ -13,7 +13,7 @@ LONGEST_WAIT = 0.08
 _REMEMBERED = 3.0
 
 
-class Pace:
+class RateLimit:
     """Keeps count of what was sent and which tabs have drawn it. Safe to use from several threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

@@ -1,6 +1,6 @@
 """Uses the viewer for a long time from three tabs, and says whether memory stayed flat and every picture was fresh.
 
-    python -m carts_viewer.soak [SEQUENCE] --minutes 60
+    python -m tools.soak [SEQUENCE] --minutes 60
 
 In every round the optimizer runs while others look on, frames are scrubbed, a joint is dragged, and one tab is
 reloaded; then everything comes to rest and is checked. Server and tabs share one process, so its memory is theirs too.
@@ -18,13 +18,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from carts_core.data.bench import resident_megabytes
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
-from carts_viewer.picture import Painter
-from carts_viewer.raw_tab import RawTab
-from carts_viewer.stage import OVERLAY
+from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.scene_view import OVERLAY
+from tools.memory import resident_megabytes
+from tools.raw_tab import RawTab
 
 LARGEST_GROWTH = 0.05
 """Of memory after warm-up that is still flat, as a share."""
@@ -153,11 +153,11 @@ class Soaking:
         if state.error is not None:
             self.seen.exceptions.append(state.error)
         end = time.monotonic() + 10.0
-        sent = self._app.stage.sent(OVERLAY)
+        sent = self._app.scene_view.sent(OVERLAY)
         while time.monotonic() < end and any(_newest(tab) != sent for tab in self._tabs):
             time.sleep(0.05)
         # Drawn anew, by somebody who has never drawn anything.
-        right = Painter(self._app.sequence).overlay(
+        right = OverlayRenderer(self._app.sequence).overlay(
             state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
         )
         for number, tab in enumerate(self._tabs):

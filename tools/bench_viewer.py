@@ -1,6 +1,6 @@
 """Measures the viewer: from a moved slider to its overlay, from a key to the next frame, and whether memory stays flat.
 
-    python -m carts_viewer.bench [SEQUENCE]
+    python -m tools.bench_viewer [SEQUENCE]
 
 The sliders are moved over a real websocket, as a browser moves them (at most 20 times a second).
 """
@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from carts_core.data.bench import resident_megabytes
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_viewer import intents as ask
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.raw_tab import RawTab
-from carts_viewer.stage import OVERLAY
+from carts_viewer.scene_view import OVERLAY
+from tools.memory import resident_megabytes
+from tools.raw_tab import RawTab
 
 _MOVES_PER_SECOND = 20
 _SETTLE = 0.5
@@ -70,7 +70,7 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
             arrivals = [at for at, _ in tab.overlays if at >= moves[0][0]]
             stale |= not pictures or abs(pictures[-1][1] - moves[-1][1]) > 1e-3
             times += [_wait_for(at, value, pictures, arrivals) for at, value in moves]
-            app.mailbox.put(ask.BackToMeasured())
+            app.queue.put(intents.BackToMeasured())
             app.wait_until_shown()
             shown.clear()
     return _latency(times, stale)
@@ -90,7 +90,7 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
     forth, back = (app.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
     count = min(frames, len(app.sequence)) - 1
     lap = [forth] * count + [back] * count
-    app.mailbox.put(ask.ShowFrame(0))
+    app.queue.put(intents.ShowFrame(0))
     times: list[float] = []
     with RawTab(app.url, app.page.drawn_id) as tab:
         app.wait_until_shown()
@@ -104,7 +104,7 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
             times.append(tab.overlays[-1][0] - pressed)
             app.wait_until_shown()
             time.sleep(pause)
-        stale = tab.overlays[-1][1] != app.stage.sent(OVERLAY)
+        stale = tab.overlays[-1][1] != app.scene_view.sent(OVERLAY)
     # The first lap has read the frames.
     return _latency(times[len(lap) :], stale)
 
@@ -144,14 +144,14 @@ def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> li
     """
     done, samples = 0, list[tuple[int, float]]()
     while done < iterations:
-        app.mailbox.put(ask.Run())
+        app.queue.put(intents.Run())
         state = app.wait_until_shown(600.0)
         steps = len(state.run.curves.loss) - 1
         if state.error is not None or steps < 1:
             raise RuntimeError(state.error or "The run made no step.")
         done += steps
         samples.append((done, resident_megabytes()))
-        app.mailbox.put(ask.Reset())
+        app.queue.put(intents.Reset())
         app.wait_until_shown()
     return samples
 

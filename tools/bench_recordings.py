@@ -1,11 +1,10 @@
-"""`python -m carts_core.data.bench`: how a recording of 10,000 frames opens and browses, measured on this machine.
+"""`python -m tools.bench_recordings`: how a recording of 10,000 frames opens and browses, measured on this machine.
 
 It makes the recording itself, in a temporary folder: image files, an MP4 of the same images with B-frames, and a log of
 joint positions at 200 Hz that is matched with the video's presentation times.
 """
 
 import argparse
-import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -16,11 +15,11 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from ..console import Terminal
-from ..files import OutputPath, output_path, output_stream, write_bytes, write_text
-from ..process import tune_process
-from .frame_reader import FrameReader
-from .sequence import Sequence
+from carts_core.console import Terminal
+from carts_core.data import FrameReader, Sequence
+from carts_core.files import OutputPath, output_path, output_stream, write_bytes, write_text
+from carts_core.process import tune_process
+from tools.memory import resident_megabytes
 
 WIDTH, HEIGHT = 640, 480
 RATE = 25
@@ -29,12 +28,6 @@ LOG_RATE = 200
 """Of the log [rows/s]."""
 _PICTURES = 100
 _JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
-
-
-def resident_megabytes() -> float:
-    """Memory of this process [MB], as Linux reports it."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def make_recording(folder: Path, frames: int) -> dict[str, Path]:
@@ -84,7 +77,7 @@ def browse(sequence: Sequence, indices: Iterable[int]) -> tuple[list[float], lis
         began = time.perf_counter()
         reader.frame(index, sequence.domains[0], camera)
         times.append(1e3 * (time.perf_counter() - began))
-        # Somebody looks at it, or the page draws it; without a pause there would be nothing to read in advance.
+        # The page draws it; without a pause there would be nothing to read in advance.
         time.sleep(0.01)
         if number % max(len(order) // 5, 1) == 0:
             memory.append(resident_megabytes())

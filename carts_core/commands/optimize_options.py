@@ -1,0 +1,41 @@
+"""What a command line of `carts optimize` says."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..errors import SettingsError
+from ..settings import FreeParameters
+from .selection import Mode, Network, Perturbation, Selection, SequencePath
+from .solver_options import SolverOptions
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """The sequence, the chosen frames, and how they are corrected."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras if they look together."""
+    overwrite: bool = False
+    """Start over, although the folder holds results of other settings."""
+    mode: Mode = "frame"
+    """Correct each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+    together: bool = False
+    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
+    keyframes: Path | None = None
+    """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
+
+    def __post_init__(self) -> None:
+        if self.keyframes is not None and self.mode != "sequence":
+            raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
+        if self.mode == "sequence":
+            self.solving.check_surface("--mode sequence")

@@ -1,0 +1,158 @@
+"""What the handlers of intents work with: the state, the open recording, and the way into its project."""
+
+from dataclasses import replace
+from typing import Any, Protocol
+
+from carts_core.project import Edits, Figures, Provenance, Source
+from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.scene import SceneState
+from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.session import Session
+from carts_viewer.state import Maps, ViewState
+
+
+class OpenRun(Protocol):
+    """The run of the optimizer on the shown frame, as far as other handlers have to do with it."""
+
+    def end(self, reason: str | None) -> None:
+        """End the run, if there is one, and save where it is.
+
+        Args:
+            reason: for people; None if they need none.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+
+    def forget(self) -> None:
+        """Another frame is shown, where there is no run to go back to the start of."""
+
+
+class Context:
+    """The state, which handlers replace, and the edits that they make; used on the worker's thread alone.
+
+    Attributes:
+        state: what the page shows.
+        session: the recording and its project.
+        renderer: renders poses.
+    """
+
+    def __init__(self, state: ViewState, session: Session, renderer: OverlayRenderer) -> None:
+        self.state = state
+        self.session = session
+        self.renderer = renderer
+        self._editor = session.editor
+        self._loss: float | None = None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that a run uses."""
+        names = tuple(camera.name for camera in self.session.scene.cameras)
+        return names if self.state.every_camera else (self.state.camera,)
+
+    def change(self, **changes: Any) -> None:
+        """Replace fields of the state."""
+        self.state = replace(self.state, **changes)
+
+    def set_pose(
+        self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
+    ) -> None:
+        """Give the shown frame another pose; no run may be open.
+
+        Args:
+            name: of the step in the history.
+            scene: the pose.
+            gesture: edits of the same gesture are one step, saved when it ends; None: this is the whole gesture.
+            source: who made it.
+            pins: whether the pose is what pins say; otherwise they are forgotten.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if not pins:
+            self.forget_pins()
+        self.edit(name, self.session.edits(self.state.frame, scene, Provenance(source)), gesture=gesture)
+
+    def edit(
+        self,
+        name: str,
+        edits: Edits,
+        *,
+        gesture: object = None,
+        loss: float | None = None,
+        maps: Maps | None = None,
+    ) -> None:
+        """Change the project; arguments and errors as `set_pose`, for any edits.
+
+        Args:
+            name: of the step in the history.
+            edits: what changes.
+            gesture: see `set_pose`.
+            loss: the optimizer's, at the new pose.
+            maps: what the optimizer saw there.
+        """
+        if self._editor.gesture != gesture:
+            self.save()
+        self._loss = loss
+        frames = sorted({key.frame for key in edits} - {WHOLE_PROJECT})
+        where = "".join(f", frame {self.session.sequence.frame_ids[index]}" for index in frames)
+        self._editor.draft(f"{name}{where}", edits, gesture or object())
+        self.refresh(maps)
+        if gesture is None:
+            self.save()
+
+    def save(self) -> None:
+        """Save the gesture under way as one step, as far as there is one.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if not self._editor.unsaved:
+            return
+        index, figures = self.state.index, {}
+        if self._editor.view.figures(index) is None:
+            self.score()
+            found = Figures(self._loss, self.state.scores.dice if self.state.scores else None)
+            figures = {} if found == Figures() else {index: found}
+        self._editor.save(figures)
+        self.change(project=self._editor.view, unsaved=self._editor.unsaved)
+
+    def leave_frame(self) -> None:
+        """Save the shown frame before another one is shown. Errors as `save`."""
+        self.save()
+        # What a project that takes no edits could not save was for looking at only.
+        self._editor.drop()
+        self._loss = None
+
+    def refresh(self, maps: Maps | None = None) -> None:
+        """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
+        before = self.state
+        if not self.session.matched(self.state.frame):
+            frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
+            self.change(frame=frame, scores=None, maps=None)
+        pose = self.session.pose(self.state.frame)
+        if not pose.equals(self.state.pose):
+            self.change(pose=pose, scores=None, maps=None)
+        self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
+        if self.state.mask_correction != before.mask_correction:
+            self.change(scores=None)
+        if self.state.ignore_region != before.ignore_region:
+            self.change(maps=None)
+
+    def score(self) -> None:
+        """Compare the pose with the truth, if that was not done yet; the project keeps the first figures it gets."""
+        state = self.state
+        if state.scores is not None:
+            return
+        scores = self.renderer.scores(state.pose.scene, state.frame, state.camera, state.mask_correction)
+        self.change(scores=scores)
+        project = self._editor.project
+        known = scores.dice is None or state.unsaved or project.state.figures(state.index) is not None
+        if project.writable and not known and not state.playing:
+            project.record_figures({state.index: Figures(dice=scores.dice)}, project.state)
+            self.change(project=self._editor.view)
+
+    def forget_pins(self) -> None:
+        """Drop what was said about where keypoints are."""
+        if self.state.keypoints.pins:
+            self.change(keypoints=replace(self.state.keypoints, pins=(), residuals=()))

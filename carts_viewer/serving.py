@@ -1,0 +1,91 @@
+"""`carts view`: serves the viewer of a sequence until somebody ends it."""
+
+import os
+import sys
+import time
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from typing import TextIO
+
+from carts_core.console import log_to_stderr, visible
+from carts_core.errors import CartsError
+from carts_viewer.app import ViewerApp
+from carts_viewer.ending import EndRequest
+from carts_viewer.opening import opened_in_browser
+
+
+def serve(
+    sequence_path: Path,
+    *,
+    project: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    device: str = "cpu",
+    weights: tuple[Path, ...] = (),
+    open_browser: bool = False,
+) -> None:
+    """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
+
+    Args:
+        sequence_path: The sequence file.
+        project: The project file, begun if it is not there; None for the default place.
+        host: The address to listen on; one that other computers can reach makes the url carry a token.
+        port: 0 picks a free port; a busy one moves up to the next free one.
+        device: Where to render and optimize, say `cpu` or `cuda`.
+        weights: Weights files; a network that none is given of is the shipped one.
+        open_browser: Open the page in the default browser.
+
+    Raises:
+        SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
+            when corrections could not be saved, or not in the project that was opened.
+    """
+    log_to_stderr()
+    began = time.monotonic()
+    with EndRequest() as end:
+        try:
+            app = ViewerApp.open(
+                sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_say_doing
+            )
+        except CartsError as error:
+            print(f"error: {visible(str(error))}", file=sys.stderr)
+            raise SystemExit(2) from error
+        end.ready()
+        browser = opened_in_browser(app.url) if open_browser else nullcontext()
+        try:
+            _say(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.")
+            with browser:
+                end.wait()
+            _say("\nClosing.")
+        finally:
+            _close(app)
+
+
+def _close(app: ViewerApp) -> None:
+    """Save and close.
+
+    Raises:
+        SystemExit: see `serve`.
+    """
+    try:
+        app.close()
+        problem = app.project.incident
+    except CartsError as error:
+        problem = f"error: {error}"
+    if problem is not None:
+        _say(visible(problem), sys.stderr)
+        raise SystemExit(1)
+
+
+def _say_doing(line: str) -> None:
+    _say(f"  {visible(line)} …")
+
+
+def _say(text: str, to: TextIO | None = None) -> None:
+    """Print; a terminal that is gone, as it is after SIGHUP, keeps nothing from being saved."""
+    stream: TextIO = to or sys.stdout
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        with suppress(OSError, ValueError):
+            # Python flushes once more at the end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -1,0 +1,63 @@
+"""The private parts of viser's widgets, scene nodes and tabs that the viewer uses.
+
+Nothing else reaches into them but `outgoing.py`, which replaces viser's message queue. viser is pinned to one minor
+version, tests/viewer/test_transport.py names every attribute that is used, and the browser tests drive them all.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import viser
+from viser._messages import RunJavascriptMessage
+
+
+def element_id(handle: Any) -> str:
+    """The `id` that the input of a widget carries in the page."""
+    return handle._impl.uuid
+
+
+def widgets(server: viser.ViserServer) -> Iterable[Any]:
+    """All widgets that hold a value."""
+    return server.gui._gui_input_handle_from_uuid.values()
+
+
+def value_of(server: viser.ViserServer, element: str) -> Any:
+    """The present value of the widget with this id; None when there is no such widget."""
+    handle = server.gui._gui_input_handle_from_uuid.get(element)
+    return None if handle is None else handle._impl.value
+
+
+def command_id(server: viser.ViserServer, label: str) -> str:
+    """The id by which a tab triggers the command with this label.
+
+    Raises:
+        StopIteration: there is no such command.
+    """
+    commands = server.gui._command_handle_from_uuid
+    return next(element for element, command in commands.items() if command.label == label)
+
+
+def image_file(handle: viser.ImageHandle) -> bytes:
+    """The PNG or JPEG file that an image was last sent as."""
+    return handle._data
+
+
+def run_script(client: viser.ClientHandle, source: str) -> None:
+    """Run JavaScript in one tab. Never broadcast: viser replays a broadcast script to every tab that joins later."""
+    client._websock_connection.queue_message(RunJavascriptMessage(source=source))
+
+
+def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
+    """Call `callback(value)` on the event loop whenever a tab sends a new value for a widget.
+
+    By the time that viser's own `on_update` reads the widget, the worker may have written an older value into it, and
+    what the tab has sent would be lost.
+    """
+    impl = handle._impl
+    update_other_tabs = impl.sync_cb
+
+    def sent(client_id: int, updates: dict[str, Any]) -> None:
+        update_other_tabs(client_id, updates)
+        callback(updates["value"])
+
+    impl.sync_cb = sent

@@ -1,0 +1,107 @@
+"""How the two packages are built: no modules that import one another in a circle, none too long to be read at once."""
+
+import ast
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("carts_core", "carts_viewer")
+LONGEST_MODULE = 300
+LONGEST_FUNCTION = 60
+TOO_LONG = frozenset({"carts_core/optimization/sequence.py", "carts_core/project/project.py", "read_weights"})
+"""Modules, and functions, that are still longer; this list only ever gets shorter."""
+
+
+def _sources() -> dict[str, Path]:
+    """Every module of the packages by its dotted name."""
+    paths = (path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
+
+
+def imports(name: str, source: str, *, package: bool, modules: frozenset[str]) -> set[str]:
+    """The modules that a module imports anywhere in its text, for type checkers included.
+
+    A package that re-exports what its modules define imports them, and they do not import it; so `from package import
+    module` counts as an import of the module alone.
+    """
+    found: set[str] = set()
+    here = name.split(".") if package else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = here[: len(here) - node.level + 1] if node.level else []
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            for alias in node.names:
+                found.add(f"{base}.{alias.name}" if f"{base}.{alias.name}" in modules else base)
+    return (found & modules) - {name}
+
+
+def cycle(graph: Mapping[str, set[str]]) -> list[str]:
+    """Modules that import one another in a circle, the first one also at the end; empty when there is no circle."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def too_long(name: str, source: str) -> Iterator[str]:
+    """What of a module is longer than it may be."""
+    if len(source.splitlines()) > LONGEST_MODULE:
+        yield name
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
+            if node.end_lineno - node.lineno + 1 > LONGEST_FUNCTION:
+                yield node.name
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    sources = _sources()
+    modules = frozenset(sources)
+    graph = {
+        name: imports(name, path.read_text(encoding="utf-8"), package=path.stem == "__init__", modules=modules)
+        for name, path in sources.items()
+    }
+    assert len(graph) > 200 and sum(map(len, graph.values())) > 500
+    assert cycle(graph) == []
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        "import p.a",
+        "from p import a",
+        "from . import a",
+        "from .a import x",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from p.a import x",
+        "def late():\n    from .a import x",
+    ],
+)
+def test_a_circle_of_two_modules_is_found(second: str) -> None:
+    modules = frozenset({"p", "p.a", "p.b"})
+    texts = {"p.a": "from p.b import y", "p.b": second}
+    graph = {name: imports(name, text, package=False, modules=modules) for name, text in texts.items()}
+    assert set(cycle(graph)) == {"p.a", "p.b"}
+
+
+def test_modules_that_only_share_a_third_one_are_no_circle() -> None:
+    assert cycle({"p.a": {"p.c"}, "p.b": {"p.c", "p.a"}, "p.c": set()}) == []
+
+
+def test_no_module_and_no_function_is_too_long() -> None:
+    found = {
+        what
+        for path in _sources().values()
+        for what in too_long(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
+    }
+    assert found == TOO_LONG
+
+
+def test_a_long_module_and_a_long_function_are_found() -> None:
+    assert list(too_long("m.py", "x = 1\n" * 301)) == ["m.py"]
+    assert list(too_long("m.py", "def f():\n" + "    x = 1\n" * 60)) == ["f"]
+    assert not list(too_long("m.py", "def f():\n" + "    x = 1\n" * 59))

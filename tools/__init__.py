@@ -1,0 +1,1 @@
+"""Measurements of the packages, and a tab without a browser. None of it is installed."""
