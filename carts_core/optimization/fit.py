@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from jaxtyping import Float
 from torch import Tensor
 
-from ..settings.stages import Descend, Evaluate, FirstOrder, Observe
+from ..settings.stages import Descend, FirstOrder, Observe
 from .evaluation import Evaluation
 from .factors import Linearization
 from .solvers import FirstOrderDescent, LevenbergMarquardt
@@ -97,7 +97,7 @@ class Fit:
         """Of the best point of the last descent [1]; infinite before any."""
         return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
 
-    def evaluate(self, stage: Descend | Evaluate | FirstOrder, *, gradient: bool = True) -> Point:
+    def evaluate(self, stage: Descend | FirstOrder, *, gradient: bool = True) -> Point:
         """Evaluate the present estimate."""
         self.used += 1
         evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..scene import Scene
 from ..settings import SurfaceSolver
-from ..settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, first_observe
+from ..settings.stages import AlignEdges, Descend, Given, Observe, first_observe
 from ..surface import COVERAGE
 from ..threads import total
 from .counterfactual import Backgrounds
@@ -131,29 +131,28 @@ class FrameProblem:
             self._given, self._images, self._edges = (images, {**given, **masks}), {}, None
         return bool(self.proposed)
 
-    def factor(self, blur: float, robust: float) -> SurfaceFactor:
-        """The surface factor of the last observation under a blur."""
-        if (blur, robust) not in self._factors:
-            self._factors[blur, robust] = SurfaceFactor(
+    def factor(self, stage: Descend) -> SurfaceFactor:
+        """The surface factor of the last observation, as a stage compares it."""
+        key = blur, robust = stage.blur, stage.robust
+        if key not in self._factors:
+            self._factors[key] = SurfaceFactor(
                 self.scene, self.variables, self.observation, self.settings, blur=blur, robust=robust
             )
-        return self._factors[blur, robust]
+        return self._factors[key]
 
     def epoch(self, blur: float) -> tuple[int, float]:
         """Losses compare within an epoch: an observation, and where nobody watches one blur."""
         return self.observations, 0.0 if self._live else blur
 
     @torch.no_grad()
-    def costs(self, offsets: Float[Tensor, "batch n"], blur: float, robust: float) -> Float[Tensor, " batch"]:
-        """The objective at each of a batch of points."""
-        return self.factor(blur, robust).costs(offsets) + self.prior.costs(offsets)
+    def costs(self, offsets: Float[Tensor, "batch n"], stage: Descend) -> Float[Tensor, " batch"]:
+        """The objective at each of a batch of points, as a stage compares it."""
+        return self.factor(stage).costs(offsets) + self.prior.costs(offsets)
 
     @torch.no_grad()
-    def evaluate(
-        self, offsets: Float[Tensor, " n"], stage: "Descend | Evaluate", *, gradient: bool = True
-    ) -> Evaluation:
+    def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:
         """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
-        factor = self.factor(stage.blur, stage.robust)
+        factor = self.factor(stage)
         prior = self.prior.linearize(offsets)
         slope, hessian, known = torch.zeros_like(offsets), None, None
         if gradient:
@@ -172,7 +171,7 @@ class FrameProblem:
             compared = factor.compare(offsets)
         shown, final = factor, compared
         if self._live and stage.blur > _SHOWN_BLUR:
-            shown = self.factor(_SHOWN_BLUR, Descend.robust)
+            shown = self.factor(Descend(_SHOWN_BLUR))
             final = shown.compare(offsets)
         coverage = final.rendering.maps[:, COVERAGE].sum(1)
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])

@@ -12,7 +12,7 @@ from ..data import Frame
 from ..scene import Scene
 from ..settings import SequenceSettings, SurfaceSolver
 from ..settings.presets import COMPARE, reduced
-from ..settings.stages import Evaluate, Stage, first_observe
+from ..settings.stages import FINEST, Stage, first_observe
 from .counterfactual import Backgrounds
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation
@@ -27,9 +27,6 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _QUICK_SCALE = 1.0
 """Largest `Observe.scale` of a quick cold start [1]."""
-
-_END = Evaluate()
-"""How a given correction is compared."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ class FrameSolver:
         problem = self._problem(frame, variables, _prior(expected, variables))
         offsets = torch.from_numpy(correction).to(variables.lower)
         problem.observe(first_observe(self._warm), offsets)
-        evaluation = problem.evaluate(offsets, _END)
+        evaluation = problem.evaluate(offsets, FINEST)
         information = _information(offsets, evaluation, problem.prior).scaled(self._share)
         return Measurement(correction, information, evaluation.stage_loss, 0)
 
@@ -105,7 +102,7 @@ class FrameSolver:
         for correction in corrections:
             offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
             problem.observe(first_observe(COMPARE), offsets)
-            found.append(problem.evaluate(offsets, _END, gradient=False).stage_loss)
+            found.append(problem.evaluate(offsets, FINEST, gradient=False).stage_loss)
         return found
 
     def _problem(self, frame: Frame, variables: Variables, prior: Prior | None) -> FrameProblem:

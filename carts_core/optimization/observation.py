@@ -31,8 +31,6 @@ class Observation:
     """What each pixel counts: 0 far from the arms and where an occluder is known to be."""
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
-    searching: bool
-    """Whether it shows the whole image and not the surroundings of the arms."""
 
     @property
     def coverage(self) -> Float[Tensor, "cameras h w"]:
@@ -75,4 +73,4 @@ def observe(
     near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
     weight = window.of(images.weight) * near[:, None]
     certain = window.of(images.certainty) if stage.haze else torch.ones_like(weight)
-    return Observation(images, window, maps, weight, certain, whole)
+    return Observation(images, window, maps, weight, certain)

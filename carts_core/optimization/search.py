@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..settings.stages import Descend, Given, Observe, PreferStart, RandomRestart, ShaftSearch
+from ..settings.stages import FINEST, Given, Observe, PreferStart, RandomRestart, ShaftSearch, first_descend
 from ..threads import total
 from .frame_problem import FrameProblem
 
@@ -53,7 +53,7 @@ def best_random_start(
         trials[1:, columns] = (drawn * deviation[columns]).to(best)
         trials[1, columns] = 0.0
         trials = problem.variables.clamp(trials)
-        best = trials[problem.costs(trials, stage.blur, Descend.robust).argmin()]
+        best = trials[problem.costs(trials, first_descend(stage.then)).argmin()]
     return best
 
 
@@ -68,7 +68,7 @@ def best_along_shafts(
 
     def cost(trial: Tensor) -> float:
         problem.observe(Observe(), trial)
-        return float(problem.costs(trial[None], stage.blur, Descend.robust))
+        return float(problem.costs(trial[None], first_descend(stage.then)))
 
     best, lowest = None, cost(offsets)
     for index in problem.variables.prismatic:
@@ -97,7 +97,7 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
         return False
     problem.observe(Observe(given=Given.START), offsets)
     points = torch.stack([start, offsets])
-    at_start, at_estimate = problem.factor(stage.blur, Descend.robust).costs(points).tolist()
+    at_start, at_estimate = problem.factor(FINEST).costs(points).tolist()
     gain = at_start - at_estimate + float(problem.prior.costs(start) - problem.prior.costs(offsets))
     as_well = gain < stage.improvement and at_start < stage.ratio * at_estimate
     if not as_well:

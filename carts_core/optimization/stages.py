@@ -8,6 +8,7 @@ from functools import singledispatch
 import torch
 
 from ..settings.stages import (
+    FINEST,
     AlignEdges,
     Descend,
     Evaluate,
@@ -109,7 +110,7 @@ def _(stage: PreferStart, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
-    point = fit.evaluate(stage, gradient=kept)
+    point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
         # Edges have no deviation of their own: that of the descent before stands.
         before = known.evaluation

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from .stages import (
+    FINEST,
     AlignEdges,
     Descend,
     Evaluate,
@@ -22,7 +23,6 @@ _FAR = Observe(margin=27, attention=27, haze=False)
 _COARSE = Descend(blur=8.0, robust=2.0, tolerance=0.06)
 _MEDIUM = Descend(blur=3.0, tolerance=0.06)
 _FINE = Descend(blur=1.6, tolerance=0.06)
-_FINEST = Descend(blur=0.8)
 
 SEARCH: tuple[Stage, ...] = (
     # A small image first: a good estimate is there soon.
@@ -39,7 +39,7 @@ SEARCH: tuple[Stage, ...] = (
 )
 """From measured kinematics to a fine estimate."""
 
-FRAME: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), _FINEST, AlignEdges(), PreferStart(), Evaluate())
+FRAME: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST, AlignEdges(), PreferStart(), Evaluate())
 """One frame alone: the default."""
 
 OCCLUDED: tuple[Stage, ...] = (
@@ -52,7 +52,7 @@ OCCLUDED: tuple[Stage, ...] = (
 NONE: tuple[Stage, ...] = (Observe(), Evaluate())
 """Nothing moves: the start is compared ("CaRTS without optimization")."""
 
-COLD: tuple[Stage, ...] = (*SEARCH, Observe(), _FINEST)
+COLD: tuple[Stage, ...] = (*SEARCH, Observe(), FINEST)
 """A frame of a sequence that nothing is known of but its measured kinematics; `WARM` follows."""
 
 _NEAR_FINEST = Observe(margin=27, attention=27)
@@ -71,7 +71,7 @@ CALIBRATION: tuple[Stage, ...] = (
     Descend(blur=3.0),
     Descend(blur=1.6),
     Observe(),
-    _FINEST,
+    FINEST,
 )
 """Many frames that share base frames and cameras."""
 

@@ -60,13 +60,17 @@ class Descend:
         require(0 <= self.tolerance < 1, "Descend.tolerance", self.tolerance, "0 to 1")
 
 
+FINEST = Descend(blur=0.8)
+"""How estimates are compared in the end."""
+
+
 @dataclass(frozen=True)
 class RandomRestart:
     """Where the fit is bad or an arm was lost: draw random states, compare them with the whole image, and descend
     again from the best."""
 
     then: tuple["Stage", ...]
-    """What runs from there."""
+    """What runs from there. States are compared as the first `Descend` of these compares them."""
     if_loss: float = 0.045
     """Loss from which a fit is bad [1]."""
     candidates: int = 64
@@ -75,8 +79,6 @@ class RandomRestart:
     """Their deviation, in expected errors [1]."""
     scale: float = 0.75
     """Of the whole image that they are compared with, as `Observe.scale` [1]."""
-    blur: float = 8.0
-    """Under which they are compared, as `Descend.blur` [px]."""
 
     def __post_init__(self) -> None:
         require(0 <= self.if_loss <= 10, "RandomRestart.if_loss", self.if_loss, "0 to 10")
@@ -90,13 +92,11 @@ class ShaftSearch:
     on from the best. A network that is conditioned on a shaft which ends too early may see it end there."""
 
     then: tuple["Stage", ...]
-    """What runs where another place was better."""
+    """What runs where another place was better. Places are compared as the first `Descend` of these compares them."""
     if_loss: float = 0.03
     """Loss from which a fit is doubtful [1]."""
     step: float = 5e-3
     """How far arms are moved [m]."""
-    blur: float = 3.0
-    """Under which places are compared, as `Descend.blur` [px]."""
 
     def __post_init__(self) -> None:
         require(0 <= self.if_loss <= 10, "ShaftSearch.if_loss", self.if_loss, "0 to 10")
@@ -127,8 +127,6 @@ class PreferStart:
     """Beyond this many times the estimate's cost, the start never explains the image as well [1]."""
     overlap: float = 0.9
     """Dice of both silhouettes below which the start is not tried [1]."""
-    blur: float = 0.8
-    """Under which both are compared, as `Descend.blur` [px]."""
 
     def __post_init__(self) -> None:
         require(0 < self.improvement <= 1e6, "PreferStart.improvement", self.improvement, "above 0, at most 1e6")
@@ -146,12 +144,7 @@ class IgnoreOccluders:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare the present estimate once more, for the record."""
-
-    blur: float = 0.8
-    """As `Descend.blur` [px]."""
-    robust: float = 0.5
-    """As `Descend.robust` [1]."""
+    """Compare the present estimate once more, as `FINEST` does, for the record."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +167,11 @@ class FirstOrder:
 Stage = (
     Observe | Descend | RandomRestart | ShaftSearch | AlignEdges | PreferStart | IgnoreOccluders | Evaluate | FirstOrder
 )
+
+
+def first_descend(stages: tuple[Stage, ...]) -> Descend:
+    """The first descent of a solver, the finest one if it has none."""
+    return next((stage for stage in stages if isinstance(stage, Descend)), FINEST)
 
 
 def first_observe(stages: tuple[Stage, ...]) -> Observe:

@@ -217,7 +217,7 @@ def test_many_states_are_compared_at_once_as_each_alone(
     )
     maps = Renderer(scene).surface_maps(scene.state(frame.truth or {}))
     ones = torch.ones_like(maps[:, :1])
-    observation = Observation(images, Window(0, 0, 320, 240), maps, ones, ones, searching=False)
+    observation = Observation(images, Window(0, 0, 320, 240), maps, ones, ones)
     factor = SurfaceFactor(scene, variables, observation, settings, blur=4.0, robust=0.5)
     offsets = torch.linspace(-0.1, 0.1, 5)[:, None] * torch.ones(len(variables))
     costs = factor.costs(offsets)
@@ -225,7 +225,7 @@ def test_many_states_are_compared_at_once_as_each_alone(
     assert costs.tolist() == pytest.approx(alone, rel=1e-4)
     assert factor.linearize(offsets[1]).cost == pytest.approx(alone[1], rel=1e-4)
     assert len({round(cost, 1) for cost in alone}) == len(alone)
-    monkeypatch.setattr("carts_core.optimization.factors.surface._STATES_AT_ONCE", 2)
+    monkeypatch.setattr("carts_core.optimization.factors.surface._PIXELS_AT_ONCE", 2 * factor.window.area)
     assert torch.equal(factor.costs(offsets), costs), "in parts where they are too many"
 
 

@@ -28,8 +28,8 @@ from .base import Linearization
 _REDUCTIONS = (1, 2, 4, 8)
 """How many times smaller than the observed images those of a factor can be."""
 
-_STATES_AT_ONCE, _PIXELS_AT_ONCE = 128, 1 << 20
-"""Most states, and most pixels of all of them, that are rendered at once."""
+_PIXELS_AT_ONCE = 1 << 20
+"""Most pixels of all states together that are rendered at once."""
 
 _SMALLEST_BLUR = 1.2
 """Images are reduced as far as the blur stays at least this [px of the reduced image]."""
@@ -88,7 +88,7 @@ class SurfaceFactor:
         """Cost of each of a batch of points, as many at once as memory allows."""
         states = self._variables.state(offsets)
         pixels = self.window.area * states.intrinsics.shape[-2]
-        at_once = max(min(_STATES_AT_ONCE, _PIXELS_AT_ONCE // pixels), 1)
+        at_once = max(_PIXELS_AT_ONCE // pixels, 1)
         found = []
         for first in range(0, len(states.intrinsics), at_once):
             part = states.map(lambda values, first=first: values[first : first + at_once])
