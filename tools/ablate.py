@@ -103,7 +103,7 @@ def shared_problem(shared: Shared, variant: Variant) -> type[FrameProblem]:
             self.observation = shared.get(
                 ("observe", *what, self.settings.dehaze, images_of),
                 lambda: observe(
-                    self.images(stage.scale), self._predictor, self.variables.state(given), stage, whole=whole
+                    self.images(stage.scale), self.predictor, self.variables.state(given), stage, whole=whole
                 ),
             )
 
@@ -194,6 +194,8 @@ def run(args: argparse.Namespace) -> None:
             missing = [variant for variant in chosen if (variant.name, job) not in done]
             if number % shares != share or not missing:
                 continue
+            if not number // shares:
+                run_one(job, missing[0], Shared(), _open(job.recording), extractor)  # Compiles kernels, loads meshes.
             shared, began = Shared(), time.perf_counter()
             for variant in missing:
                 row = run_one(job, variant, shared, _open(job.recording), extractor)

@@ -14,7 +14,7 @@ from ..errors import SettingsError
 from ..features.extractor import FeatureExtractor
 from ..scene import Scene, SceneState
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
-from ..settings.stages import Evaluate
+from ..settings.stages import FINEST, Evaluate
 from .base_frame_gain import base_frame_gain
 from .counterfactual import Backgrounds
 from .evaluation import Evaluation
@@ -177,14 +177,14 @@ class FrameOptimizer:
         """The points of the stages, and the start where the image contradicts what they end with."""
         yield from points
         last, problem, fit = self._best_point, self._problem, self._fit
-        stages = [stage for stage in self.settings.stages if isinstance(stage, Evaluate)]
-        if last is None or not stages or not isinstance(problem, FrameProblem):
+        evaluated = any(isinstance(stage, Evaluate) for stage in self.settings.stages)
+        if last is None or not evaluated or not isinstance(problem, FrameProblem):
             return
         self.assessment = self._assess(problem, last)
         if self.assessment.verdict is not Verdict.FAILED or not bool(last.offsets.any()):
             return
         ended, fit.offsets = fit.offsets, torch.zeros_like(fit.offsets)
-        start = replace(fit.evaluate(stages[-1]), epoch=(*last.epoch, "start"))
+        start = replace(fit.evaluate(FINEST), epoch=(*last.epoch, "start"))
         if self.assessment.nothing_there or self._assess(problem, start).probability <= self.assessment.probability:
             fit.stop_reason = StopReason.FAILED
             yield start
