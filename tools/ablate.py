@@ -107,7 +107,7 @@ def shared_problem(shared: Shared, variant: Variant) -> type[FrameProblem]:
                 ),
             )
 
-        def _key(self, offsets) -> Hashable:
+        def _key(self, offsets) -> tuple[Hashable, ...]:
             weights = replace(self.settings, stages=AS_IS.stages)
             return id(self.observation), offsets.numpy().tobytes(), weights, images_of, surface_of
 
