@@ -1,1 +1,1 @@
-"""The browser app: look at a sequence, move the arms by hand, let the optimizer bring them back, take the masks."""
+"""The browser app: browse a sequence, move the arms by hand, run the optimizer, export masks."""

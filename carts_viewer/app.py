@@ -28,7 +28,7 @@ from carts_viewer.worker import Worker
 _log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-"""Told, line by line, what takes long."""
+"""Called with a line for people about what takes long."""
 
 
 class ViewerApp:
@@ -108,7 +108,7 @@ class ViewerApp:
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: Where to render and optimize, say `cpu` or `cuda`.
             weights: Weights files; a network that none is given of is the shipped one.
-            report: Told what takes long.
+            report: Called with a line about what takes long.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
@@ -212,7 +212,7 @@ class ViewerApp:
             cameras = {camera.name: camera for camera in self.scene.cameras}
             stroke = read_stroke(text, len(self.sequence), cameras)
         except CartsError as error:
-            # Our page sends no such thing, and others that look on did nothing wrong.
+            # Our page sends no such thing, and the other tabs did nothing wrong.
             _log.info("Refused: %s", error)
         else:
             self.queue.put(intents.Paint(tab, stroke))

@@ -120,7 +120,7 @@ class Context:
     def leave_frame(self) -> None:
         """Save the shown frame before another one is shown. Errors as `save`."""
         self.save()
-        # What a project that takes no edits could not save was for looking at only.
+        # A project that takes no edits cannot save it.
         self._editor.drop()
         self._loss = None
 

@@ -114,7 +114,7 @@ class Controller:
         self._watch()
 
     def _watch(self) -> None:
-        """See now and then that the project's file is still there: nobody may be editing while it is deleted."""
+        """Check now and then that the project's file still exists: it may be deleted while nobody edits."""
         project = self._editor.project
         if project.writable and time.monotonic() >= self._watch_at:
             self._watch_at = time.monotonic() + WATCH_EVERY
@@ -152,7 +152,7 @@ class Controller:
         self._context.save()
 
     def say(self, text: str | None) -> None:
-        """Tell the user what is being prepared; None when nothing is."""
+        """Show the user what is being prepared; None when nothing is."""
         self._context.change(busy=text)
 
     def score(self) -> None:

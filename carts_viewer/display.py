@@ -69,7 +69,7 @@ class PageDisplay:
         self._shown = state
 
     def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
-        """Tell tabs that their strokes are in the overlay that was just sent, and need not be drawn any more."""
+        """Acknowledge strokes that are in the overlay that was just sent: their tabs need not draw them any more."""
         clients = self._page.server.get_clients()
         for tab, number in new.items():
             if old.get(tab) != number and tab in clients:

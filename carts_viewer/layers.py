@@ -34,7 +34,7 @@ TRUTH_COLORS = {
 """The paper's colours for the comparison with a true mask."""
 
 ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
-"""Colours of pixels that somebody added to the mask, removed from it, or told the optimizer to ignore."""
+"""Colours of pixels that somebody added to the mask, removed from it, or excluded from the optimizer."""
 
 Rgba = UInt8[np.ndarray, "height width 4"]
 ArmIds = Int[np.ndarray, "height width"]

@@ -37,7 +37,7 @@ class Optimizer(Protocol):
 
     @property
     def best(self) -> Iterate | None:
-        """The best iterate so far: of the present look, the one of the lowest loss; at the end, the last."""
+        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
 
     @property
     def stop_reason(self) -> str | None:
@@ -45,13 +45,13 @@ class Optimizer(Protocol):
 
     @property
     def assessment(self) -> Assessment | None:
-        """At the end, how far the result is to be believed; None before, and where it is not assessed."""
+        """At the end, how far the result can be relied on; None before, and where it is not assessed."""
 
     def step(self) -> Iterate | None:
         """The next iterate, the start itself at first; None when there are no more."""
 
     def base_frame_gain(self) -> float | None:
-        """At the end, what free base frames would explain of the difference that is left [1]; None if not known."""
+        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
 
 
 class OptimizerFactory:
@@ -62,7 +62,7 @@ class OptimizerFactory:
         Args:
             weights: Weights files; a network that none is given of is the shipped one.
             device: Where to compute.
-            report: Told, for people, what takes long.
+            report: Called with a line for people about what takes long.
         """
         self._weights = weights
         self._device = device
@@ -211,9 +211,9 @@ class SequenceRun:
         """How it goes, for people."""
         done, total = self._optimizer.progress
         if done == 0:
-            return "Looking at some frames to find where to begin"
+            return "Estimating a few frames to choose where to begin"
         if done == total:
-            return f"All {total} frames seen, looking again where they disagree"
+            return f"All {total} frames estimated, revising those that disagree"
         seconds = self._optimizer.seconds_left
         left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         return f"Frame {done} of {total}, about {left} left"
@@ -241,11 +241,11 @@ class ActiveRun:
         return self._optimizer.step()
 
     def best(self) -> Iterate | None:
-        """The best iterate so far: of the present look, the one of the lowest loss; at the end, the last."""
+        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
         return self._optimizer.best
 
     def verdict(self) -> str | None:
-        """At the end, for people, why the result is not to be believed and what to try; None where it is."""
+        """At the end, for people, why the result is not reliable and what to try; None where it is."""
         found = self._optimizer.assessment
         if found is None or found.verdict is Verdict.GOOD:
             return None
@@ -253,7 +253,7 @@ class ActiveRun:
         return f"{found.verdict.value.capitalize()}: {found.reason}{kept} {found.remedy}"
 
     def base_frame_gain(self) -> float | None:
-        """At the end, what free base frames would explain of the difference that is left [1]; None if not known."""
+        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
         return self._optimizer.base_frame_gain()
 
     def pose(self, iterate: Iterate) -> Pose:

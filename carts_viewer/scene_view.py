@@ -154,6 +154,6 @@ def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
 
 
 def _mixed(color, accent: tuple[int, int, int]) -> tuple[int, int, int]:
-    """A link's own colour with a touch of the arm's, so that arms can be told apart."""
+    """A link's own colour with a touch of the arm's, so that arms can be distinguished."""
     own = np.asarray(color, float)[:3] * 255
     return tuple(int(value) for value in np.clip(0.75 * own + 0.25 * np.array(accent), 0, 255))  # type: ignore[return-value]

@@ -109,7 +109,7 @@ class Session:
         joints = {**measured, **{name: c.joint_positions for name, c in corrections.items()}}
         state = _calibrated(self.scene, self.scene.state(joints), project)
         sources = {correction.provenance.source for correction in corrections.values()}
-        return Pose(state, next((source for source in _TELLING_FIRST if source in sources), Source.MEASURED))
+        return Pose(state, next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED))
 
     def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
         """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
@@ -246,8 +246,8 @@ def joint_correction(
     return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
 
 
-_TELLING_FIRST = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
-"""Of a frame whose arms come from different sources, the one to tell people."""
+_SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
+"""Of a frame whose arms come from different sources, the first one of these is shown."""
 
 
 def _calibrated(scene: Scene, state: SceneState, project: ProjectState) -> SceneState:

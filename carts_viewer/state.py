@@ -61,8 +61,8 @@ class Curves:
     seconds: tuple[float, ...] = ()
     """Duration of each iteration [s]."""
     best: int = 0
-    """Index of the iterate that is kept so far. Losses of different looks at the image do not compare, so it need not
-    be the one of the lowest loss."""
+    """Index of the iterate that is kept so far. Losses of different observations of the image do not compare, so it
+    need not be the one of the lowest loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class RunState:
     reason: str | None = None
     """Why the run stopped, for people."""
     base_frame_gain: float | None = None
-    """What free base frames would explain of the difference that is left [1]; None where it is not known."""
+    """The share of the remaining residual that free base frames would explain [1]; None where it is not known."""
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@
     };
   }
 
-  /** Keep the image in sight: centred along a side that fits, without a gap along one that does not. */
+  /** Keep the image in view: centred along a side that fits, without a gap along one that does not. */
   function clampPan(image, aspect) {
     const shown = visibleRectangle(image, aspect);
     const clamp = (centre, share) =>
@@ -234,7 +234,7 @@
     window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }
 
-  // ---- Tell the server what has been drawn, and when a drag is over ------------------------------------------------
+  // ---- Report to the server what has been drawn, and when a drag is over ------------------------------------------------
 
   const tab = Math.random().toString(36).slice(2);
   let reports = 0;
@@ -293,7 +293,7 @@
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
     if (view.endoscope) mutable.camera.layers.disable(SCENE_LAYER);
     else mutable.camera.layers.enable(SCENE_LAYER);
-    // A new camera or image size changes the plane, about which three.js tells nobody.
+    // A new camera or image size changes the plane, which three.js does not report.
     const now = JSON.stringify([view.endoscope, imageRectangle()]);
     if (now !== shape) { shape = now; refresh(); }
     reportDrawn();

@@ -2,7 +2,7 @@
 
     python -m tools.soak [SEQUENCE] --minutes 60
 
-In every round the optimizer runs while others look on, frames are scrubbed, a joint is dragged, and one tab is
+In every round the optimizer runs while other tabs watch, frames are scrubbed, a joint is dragged, and one tab is
 reloaded; then everything comes to rest and is checked. Server and tabs share one process, so its memory is theirs too.
 """
 
@@ -123,7 +123,7 @@ class Soaking:
         dice.choice(self._tabs).set(self._run, True)
         end = time.monotonic() + self._run_seconds
         while time.monotonic() < end:
-            # Looking on: a change of opacity needs a new picture, but does not end the run.
+            # Watching: a change of opacity needs a new picture, but does not end the run.
             dice.choice(self._tabs).set(self._opacity, dice.randrange(20, 100, 5))
             time.sleep(0.5)
         self.seen.iterations += max(len(self._app.state.run.curves.loss) - 1, 0)

@@ -114,7 +114,7 @@ class PropagatingHandler:
         self._context.change(playing=False, error=None)
         self._run = self._make(frames, kept)
         self._work = self._bits(self._run)
-        self._context.change(busy=None, solve=SolveState(frames, text="Looking at the first frame"))
+        self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 
     @handle.register
     def _(self, intent: intents.StopSolving) -> None:

@@ -1,7 +1,7 @@
 """What a person can ask for.
 
 A control that streams values (a slider that is being dragged) gives its intents a key: a newer one replaces the older
-one that nobody has looked at yet, so work never piles up and the last value is always the one that counts.
+one that is still waiting, so work never piles up and the last value is always the one that counts.
 """
 
 from .annotating import AcceptAndNext as AcceptAndNext

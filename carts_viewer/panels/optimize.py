@@ -92,13 +92,13 @@ def observability_lines(state: ViewState) -> str:
 
 
 def calibration_line(state: ViewState) -> str:
-    """That base frames look wrong, if what the run left of the difference says so, as HTML."""
+    """That base frames may be wrong, if the residual of the run says so, as HTML."""
     gain = state.run.base_frame_gain
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (
-        '<p class="carts-caption">Base frames or the camera\'s pose look wrong: free base frames would take '
-        f"{100 * gain:.0f} % off what is left of the difference. Tick <b>Base frames</b> under Free parameters and "
+        '<p class="carts-caption">Base frames or the camera\'s pose may be wrong: free base frames would reduce '
+        f"the remaining residual by {100 * gain:.0f} %. Tick <b>Base frames</b> under Free parameters and "
         "run again, or use <code>carts calibrate</code>.</p>"
     )
 

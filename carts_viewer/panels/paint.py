@@ -28,7 +28,7 @@ _MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
 
 
 class PaintPanel:
-    """Tools and layers; it also tells every tab's page what is in hand."""
+    """Tools and layers; it also sends the chosen tool to every tab."""
 
     def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui

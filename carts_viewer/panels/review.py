@@ -1,4 +1,4 @@
-"""What people say about frames, and which one to look at next."""
+"""Reviews of frames, and which one to review next."""
 
 from collections import Counter
 

@@ -80,7 +80,7 @@ def _bars(project: ProjectState) -> str:
 
 
 def _strip(project: ProjectState) -> str:
-    """Who made the frames: of neighbours that share a column, the one that tells most."""
+    """Who made the frames: of neighbours that share a column, the most informative one."""
     frames = len(project.identity.frame_ids)
     columns = min(frames, _COLUMNS)
     ranks = list(SOURCE_COLORS)

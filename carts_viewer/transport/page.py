@@ -205,7 +205,7 @@ class Page:
         return value_of(self.server, element) if hasattr(self, "server") else None
 
     def _static(self, name: str) -> Response:
-        # Only names that a listing of the folder gave are looked up, so no path can leave it.
+        # Only names that a listing of the folder gave are served, so no path can leave it.
         file = self._files.get(name)
         if file is None:
             return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")

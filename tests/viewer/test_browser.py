@@ -64,9 +64,9 @@ def test_the_3d_view_turns_and_the_endoscope_view_comes_back_exactly(
 ) -> None:
     tab = open_tab(open_marked())
     tab.canvas.eventually_registered()
-    straight = tab.canvas.look()
+    straight = tab.canvas.screenshot()
     tab.button("3D view")
-    eventually(tab.canvas.look, lambda look: np.abs(look.astype(int) - straight).mean() > 5)
+    eventually(tab.canvas.screenshot, lambda image: np.abs(image.astype(int) - straight).mean() > 5)
     tab.page.mouse.move(640, 400)
     tab.page.mouse.down()
     tab.page.mouse.move(740, 440, steps=5)
@@ -87,7 +87,7 @@ def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
     app = open_marked()
     tab = open_tab(app)
     tab.canvas.eventually_registered()
-    before = tab.canvas.look()
+    before = tab.canvas.screenshot()
     slider = app.joints.slider("PSM1", 0)
     value = round(slider.value + 4.0, 2)
     tab.type_value(slider, value)
@@ -95,7 +95,7 @@ def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
         lambda: float(app.state.pose.scene.joint_positions[0][0]), lambda at: abs(at - math.radians(value)) < 1e-4
     )
     assert tab.canvas.eventually_registered() <= 1.5
-    assert np.abs(tab.canvas.look().astype(int) - before).max() > 100
+    assert np.abs(tab.canvas.screenshot().astype(int) - before).max() > 100
 
 
 def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value(

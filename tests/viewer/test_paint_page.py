@@ -31,9 +31,9 @@ class Hand:
     def __init__(self, tab: Tab) -> None:
         self._mouse, self._keyboard = tab.page.mouse, tab.page.keyboard
         self._tab = tab
-        self.look()
+        self.locate()
 
-    def look(self) -> None:
+    def locate(self) -> None:
         """Find out where the picture is."""
         self.map = self._tab.canvas.where()
         box = self._tab.page.locator("canvas").first.bounding_box()
@@ -114,18 +114,18 @@ def test_a_stroke_is_in_the_project_and_in_every_tab_and_undo_takes_it_out(
     hand.steps(1)
     assert _same(_ignored(app), _line((240, 320), *points, width=20))
     for seen in (tab, other):
-        eventually(lambda seen=seen: _violet(seen.canvas.look()), lambda pixels: pixels > 500)
+        eventually(lambda seen=seen: _violet(seen.canvas.screenshot()), lambda pixels: pixels > 500)
     # Neither was the picture moved, nor is anything left of the stroke that the page drew by itself.
     assert tab.canvas.where() == pytest.approx(hand.map, abs=0.5)
     tab.page.keyboard.press("Control+z")
     hand.steps(0)
     assert not _ignored(app).any()
     for seen in (tab, other):
-        eventually(lambda seen=seen: _violet(seen.canvas.look()), lambda pixels: pixels == 0)
+        eventually(lambda seen=seen: _violet(seen.canvas.screenshot()), lambda pixels: pixels == 0)
 
 
-def _violet(look: np.ndarray) -> int:
-    return int((np.linalg.norm(look.astype(float) - IGNORED_COLOR, axis=-1) < 40).sum())
+def _violet(image: np.ndarray) -> int:
+    return int((np.linalg.norm(image.astype(float) - IGNORED_COLOR, axis=-1) < 40).sum())
 
 
 @pytest.mark.browser

@@ -152,20 +152,20 @@ def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
             stranger.close()
 
 
-def _call_of_a_link(app: ViewerApp, browser: Browser, wait_time: float, *, policy: bool = True) -> float | None:
+def _call_of_a_link(app: ViewerApp, browser: Browser, timeout: float, *, policy: bool = True) -> float | None:
     """Follow a link that names another server, and wait until the page calls it.
 
     Args:
         app: Whose page it is.
         browser: Which follows the link.
-        wait_time: How long to wait when the page is there [s].
+        timeout: How long to wait when the page is there [s].
         policy: Whether the page comes with the header that says whom it may call.
 
     Returns:
         The time from the click to the call [s]; None when there is none.
     """
     with closing(browser.new_context()) as context, closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        listener.settimeout(wait_time)
+        listener.settimeout(timeout)
         link = f"{app.url}/?websocket=ws://127.0.0.1:{listener.getsockname()[1]}"
         page = context.new_page()
         if not policy:

@@ -50,7 +50,7 @@ class Canvas:
         self._page = page
         self._renderer = OverlayRenderer(app.sequence)
 
-    def look(self) -> np.ndarray:
+    def screenshot(self) -> np.ndarray:
         """RGB [height, width, 3] of the canvas as a person sees it, the tool bar blanked."""
         box = self._page.locator("canvas").first.bounding_box()
         assert box is not None
@@ -65,9 +65,9 @@ class Canvas:
         assert bar is not None and box is not None
         return int(bar["y"] + bar["height"] - box["y"]) + 1
 
-    def screen_from_image(self, look: np.ndarray) -> np.ndarray | None:
+    def screen_from_image(self, image: np.ndarray) -> np.ndarray | None:
         """The affine map [2, 3] from image to canvas coordinates that the red discs show; None when they do not."""
-        red = (look[..., 0] > 120) & (look[..., 1] < 90) & (look[..., 2] < 90)
+        red = (image[..., 0] > 120) & (image[..., 1] < 90) & (image[..., 2] < 90)
         _, _, stats, centroids = cv2.connectedComponentsWithStats(red.astype(np.uint8))
         order = np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:4] + 1
         if len(order) < 4:
@@ -83,13 +83,13 @@ class Canvas:
 
     def misregistration(self) -> float:
         """95th percentile of the distance [px of the screen] between the overlay's outline and where it should be."""
-        look = self.look()
-        map_ = self.screen_from_image(look)
+        image = self.screenshot()
+        map_ = self.screen_from_image(image)
         if map_ is None:
             return float("inf")
-        shown = np.linalg.norm(look.astype(float) - ARM_COLORS[0], axis=-1) < 60
+        shown = np.linalg.norm(image.astype(float) - ARM_COLORS[0], axis=-1) < 60
         arm_ids = self._renderer.arm_ids(self._app.state.pose.scene, self._app.state.camera)
-        wanted = _warped(arm_ids >= 0, map_, look.shape[:2])
+        wanted = _warped(arm_ids >= 0, map_, image.shape[:2])
         wanted[: self._bar_height()] = False
         if not shown.any() or not wanted.any():
             return float("inf")
@@ -97,7 +97,9 @@ class Canvas:
 
     def where(self, good: Callable[[np.ndarray], bool] = lambda map_: True) -> np.ndarray:
         """Wait until the frame is seen, at a good place, and give the map from image to canvas coordinates."""
-        map_ = eventually(lambda: self.screen_from_image(self.look()), lambda map_: map_ is not None and good(map_))
+        map_ = eventually(
+            lambda: self.screen_from_image(self.screenshot()), lambda map_: map_ is not None and good(map_)
+        )
         assert map_ is not None
         return map_
 

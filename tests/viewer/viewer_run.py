@@ -1,4 +1,4 @@
-"""A run that is still going on whenever a test looks."""
+"""A run that is still going on as long as a test needs it."""
 
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
