@@ -58,7 +58,10 @@ class Lives:
     def live(self, seed: int) -> None:
         """Work in a new process until it is killed, and look what is left."""
         ours, theirs = self._processes.Pipe(duplex=False)
-        victim = self._processes.Process(target=viewer_victim.serve, args=(self._sequence_path, self._weights, theirs))
+        # A daemon, so that a test that fails before the kill does not keep pytest from ending.
+        victim = self._processes.Process(
+            target=viewer_victim.serve, args=(self._sequence_path, self._weights, theirs), daemon=True
+        )
         victim.start()
         theirs.close()
         assert ours.poll(120), "the app did not start"

@@ -42,7 +42,8 @@ def _live(sequence_path: Path, weights: Path, number: int, seed: int) -> int:
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["carts_viewer.app"])
     ours, theirs = processes.Pipe(duplex=False)
-    victim = processes.Process(target=_serve_until_signal, args=(sequence_path, weights, theirs))
+    # A daemon, so that a test that fails before the signal does not keep pytest from ending.
+    victim = processes.Process(target=_serve_until_signal, args=(sequence_path, weights, theirs), daemon=True)
     victim.start()
     theirs.close()
     assert ours.poll(120), "the app did not start"
@@ -108,7 +109,8 @@ def test_a_note_that_nobody_has_left_yet_is_saved(
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["carts_viewer.app"])
     ours, theirs = processes.Pipe(duplex=False)
-    victim = processes.Process(target=_serve_until_signal, args=(path, untrained_weights, theirs))
+    # A daemon, so that a test that fails before the signal does not keep pytest from ending.
+    victim = processes.Process(target=_serve_until_signal, args=(path, untrained_weights, theirs), daemon=True)
     victim.start()
     assert ours.poll(120), "the app did not start"
     ids = ours.recv()
