@@ -22,9 +22,6 @@ STEP = 1e-3
 APART = 2 * STEP
 """Distance of these from each other [rad]."""
 
-_FOCAL_SCALE = 1.0
-"""One unit of a focal unknown is a factor of e; a principal point moves by the focal length."""
-
 
 @dataclass(frozen=True)
 class _Block:
@@ -135,7 +132,7 @@ class Variables:
         """Per unknown its name, the unit that a person reads (deg, mm, px; % of a focal length), and that unit's number
         per radian-like unit."""
         radian, length = ("deg", math.degrees(1.0)), ("mm", 1000.0 * self._length_scale)
-        focal = ("%", 100.0 * _FOCAL_SCALE)
+        focal = ("%", 100.0)
         read: list[tuple[str, float]] = []
         for block in self._blocks:
             if block.kind == "joints":
@@ -250,7 +247,8 @@ class Variables:
 
 
 def _scaled_intrinsics(K: Tensor, step: Tensor) -> Tensor:
-    focal = K[..., :2] * torch.exp(_FOCAL_SCALE * step[..., :2])
+    # One unit of a focal unknown is a factor of e; a principal point moves by the focal length.
+    focal = K[..., :2] * torch.exp(step[..., :2])
     return torch.cat([focal, K[..., 2:] + K[..., :2] * step[..., 2:]], -1)
 
 
