@@ -65,10 +65,11 @@ def _predictions(examples: Panels) -> Figure:
 
 
 def _page(config: dict, history: History, columns: dict[str, str]) -> str:
+    steps = int(history.losses[-1]["step"]) if history.losses else 0
     lines = [
         f"# Training of the {config['network']} network",
         "",
-        f"{counted(config['steps'], 'step')} of {counted(config['batch_size'], 'sample')}, "
+        f"{counted(steps, 'step')} of {counted(config['batch_size'], 'sample')}, "
         f"{counted(round(history.seconds / 60), 'minute')}, robots: "
         f"{', '.join(map(in_markdown, config['robots']))}.",
         "",

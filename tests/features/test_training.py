@@ -116,6 +116,7 @@ def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None and checkpoint.step == events[-1].step
     assert checkpoint.history.losses[-1]["step"] == checkpoint.step
+    assert f"{checkpoint.step} steps of 2 samples" in result.report.read_text()
     assert train(config, tmp_path).seconds == result.seconds
 
 
