@@ -13,12 +13,12 @@ from ..errors import SettingsError
 from ..settings import CALIBRATION, FreeParameters
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
-from .selection import Network, Selection, SequencePath, output_folder
+from .observing import Observing
+from .selection import Selection, SequencePath, output_folder
 from .solver_options import CalibrationOptions
 
 if TYPE_CHECKING:
     from ..data import Sequence
-    from ..features.extractor import FeatureExtractor
     from ..optimization import CalibrationOptimizer, CalibrationResult
 
 _SPREAD = "spread:"
@@ -45,14 +45,13 @@ class Calibrate:
     """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
     all that is written."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
-    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
 
     def run(self) -> None:
         """Calibrate; on Ctrl-C or an error nothing is written."""
         from ..data import Sequence
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
-        from ..features.extractor import FeatureExtractor
         from ..files import MARKER, published, write_text
         from ..optimization import CalibrationOptimizer
         from .hints import print_hints
@@ -62,13 +61,13 @@ class Calibrate:
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
         indices = frame_indices(self.frames, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
-        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        observer = self.network.observer(self.solving.chosen)
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [sequence.frame(index, self.domain, cameras) for index in indices]
             optimizer = CalibrationOptimizer(
                 sequence.scene,
                 frames,
-                extractor,
+                observer.predictor,
                 settings=self.solving.chosen,
                 free=self.free,
                 joint_prior_deg=self.joint_prior_deg,
@@ -77,19 +76,21 @@ class Calibrate:
             result = _optimized(optimizer, console)
             residuals = frame_residuals(sequence, frames, result)
             write_calibration(folder, output.path, sequence, result, residuals)
-            write_text(folder / MARKER, json.dumps(self._summary(extractor, indices, cameras), indent=1))
+            write_text(folder / MARKER, json.dumps(self._summary(observer.weights, indices, cameras), indent=1))
         for camera in cameras:
             if (means := mean_dice(residuals, camera)) is not None:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
+        print_hints(console, self.network.caution)
         console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
         print_hints(console, remark(sequence.scene, result))
 
-    def _summary(self, extractor: "FeatureExtractor", indices: list[int], cameras: list[str]) -> dict:
+    def _summary(self, weights: str, indices: list[int], cameras: list[str]) -> dict:
         """How the folder was made."""
         return {
             "format": "calibration",
             "sequence": str(self.sequence),
-            "weights": extractor.sha256,
+            "weights": weights,
+            "observed": self.network.observe,
             "frames": indices,
             "cameras": cameras,
             "domain": self.domain,

@@ -10,11 +10,11 @@ import tyro
 
 from ..console import Terminal, track
 from ..errors import SettingsError
-from ..settings import FreeParameters
 from ..stopping import when_stopped
 from ..wording import counted
-from .selection import Mode, Network, Perturbation, Selection, SequencePath, check_writable
-from .solver_options import SolverOptions
+from .observing import Observing
+from .selection import Mode, Perturbation, Selection, SequencePath, check_writable
+from .solver_options import FreeInFrames, SolverOptions
 
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
@@ -34,8 +34,8 @@ class Evaluate:
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
-    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
-    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:
@@ -50,7 +50,6 @@ class Evaluate:
         """Print a table of means, and write the JSON file if one is named."""
         from ..data import Sequence
         from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
-        from ..features.extractor import FeatureExtractor
         from ..files import write_text
         from ..optimization import Backgrounds
         from .hints import base_frame_hint, kept_start_hint, print_hints
@@ -63,16 +62,16 @@ class Evaluate:
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
-        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        observer = self.network.observer(self.solving.chosen)
         run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
         found = run(
             sequence,
-            extractor,
+            observer.predictor,
             frames=frames,
             cameras=cameras,
             domains=domains,
             settings=self.solving.chosen,
-            free=self.free,
+            free=self.solving.freed(self.free),
             perturb_deg=self.start.perturb_deg,
             seed=self.start.seed,
             together=self.together,
@@ -81,6 +80,7 @@ class Evaluate:
         with when_stopped("nothing was written"):
             scores = list(track(found, "optimizing", total=total, console=console))
         console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
+        print_hints(console, self.network.caution)
         for group in camera_groups(cameras, self.together):
             where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
             print_hints(
@@ -93,5 +93,5 @@ class Evaluate:
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:
-            write_text(self.json, json.dumps(to_json(scores), indent=1))
+            write_text(self.json, json.dumps({"observed": self.network.observe, **to_json(scores)}, indent=1))
             console.print(f"wrote {self.json}")

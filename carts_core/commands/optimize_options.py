@@ -7,9 +7,9 @@ from typing import Annotated
 import tyro
 
 from ..errors import SettingsError
-from ..settings import FreeParameters
-from .selection import Mode, Network, Perturbation, Selection, SequencePath
-from .solver_options import SolverOptions
+from .observing import Observing
+from .selection import Mode, Perturbation, Selection, SequencePath
+from .solver_options import FreeInFrames, SolverOptions
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class OptimizeOptions:
     """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
-    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = field(default_factory=FreeParameters)
-    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:

@@ -14,7 +14,6 @@ from ..console import Bar, Terminal, track
 from ..data import Frame, Sequence
 from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
-from ..features.extractor import FeatureExtractor
 from ..files import remove_file
 from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, StopReason, sequence_checkpoint
@@ -52,11 +51,12 @@ class Optimizing:
 
     def __init__(self, asked: OptimizeOptions) -> None:
         self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
+        self._free = asked.solving.freed(asked.free)
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
         self._frames = asked.select.frame_indices(self._sequence)
         self._keyframes = self._read_keyframes()
         self._looking: SequenceOptimizer | None = None
-        self._extractor = FeatureExtractor.load(*asked.network.weights, device=asked.network.device)
+        self._observer = asked.network.observer(self._solver)
 
     def run(self) -> None:
         """Optimize what is not there yet.
@@ -80,7 +80,7 @@ class Optimizing:
         scene = sequence.scene.with_cameras(cameras)
         start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
         # Made for its errors: no name of what is free or locked may be wrong.
-        Variables(scene, start, asked.free, self._solver.length_scale)
+        Variables(scene, start, self._free, self._solver.length_scale)
         folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
         return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
 
@@ -145,7 +145,7 @@ class Optimizing:
             sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
         )
         load = starts.frame if asked.mode == "sequence" else load
-        return Origins(sequence, part.cameras, self._extractor, load, backgrounds.images)
+        return Origins(sequence, part.cameras, self._observer, load, backgrounds.images)
 
     def _kept(self, part: _Part) -> str:
         """What there is of a part that was stopped."""
@@ -167,10 +167,10 @@ class Optimizing:
                 sequence.scene,
                 frame,
                 backgrounds,
-                self._extractor,
+                self._observer.predictor,
                 start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
                 settings=self._solver,
-                free=asked.free,
+                free=self._free,
                 cameras=cameras,
                 live=False,
             )
@@ -202,10 +202,10 @@ class Optimizing:
             sequence.scene,
             starts.frame,
             starts.times(frames),
-            self._extractor,
+            self._observer.predictor,
             settings=self._solver,
             model=asked.solving.sequence,
-            free=asked.free,
+            free=self._free,
             keyframes=self._keyframes,
             backgrounds=backgrounds,
             cameras=cameras,
@@ -248,9 +248,11 @@ class Optimizing:
             "sequence": str(asked.sequence.resolve()),
             "perturb_deg": asked.start.perturb_deg,
             "seed": asked.start.seed,
-            "free": asdict(asked.free),
+            "free": asdict(self._free),
             "solver": to_plain(self._solver),
         }
+        if asked.network.observe != "network":
+            settings["observe"] = asked.network.observe
         if asked.mode == "sequence":
             from ..files.reading import TABLE, read_bytes
 

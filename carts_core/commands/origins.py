@@ -6,8 +6,8 @@ from collections.abc import Sequence as Indices
 import numpy as np
 
 from ..data import Frame, Sequence
-from ..features.extractor import FeatureExtractor
 from ..fingerprints import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
+from .observing import Observer
 
 Origin = Mapping[str, str]
 """Kind of input -> its fingerprint; the kinds are those of `_CHANGED`."""
@@ -19,6 +19,7 @@ _CHANGED = {
     "calibration": "the calibration changed",
     "joints": "the measured joint positions changed",
     "images": "the images changed",
+    "masks": "the masks changed",
     "background": "the background changed",
     "together": "they were solved together with other frames",
 }
@@ -42,7 +43,7 @@ class Origins:
 
     Args:
         sequence, cameras: whose frames these are.
-        extractor: the networks.
+        observer: who says what images show.
         load: the frame at a position, its `measured` where the optimization starts.
         backgrounds: camera name -> mean background that frames are compared with, where there is one.
     """
@@ -51,15 +52,15 @@ class Origins:
         self,
         sequence: Sequence,
         cameras: tuple[str, ...],
-        extractor: FeatureExtractor,
+        observer: Observer,
         load: Callable[[int], Frame],
         backgrounds: Mapping[str, np.ndarray],
     ) -> None:
-        self._sequence, self._load = sequence, load
+        self._sequence, self._load, self._masked = sequence, load, observer.masked
         recorded = [sequence.recorded_camera(name) for name in cameras]
         self._common = {
             "code": code_fingerprint(_CODE),
-            "weights": fingerprint(extractor.sha256, str(extractor.device)),
+            "weights": fingerprint(observer.weights, str(observer.predictor.device)),
             "robot": fingerprint(*(robot_fingerprint(arm.robot) for arm in sequence.scene.arms)),
             "calibration": calibration_fingerprint(sequence.scene, recorded),
             "background": fingerprint([(name, backgrounds[name]) for name in sorted(backgrounds)]),
@@ -80,15 +81,18 @@ class Origins:
         arms = self._sequence.measured
         joints = [(name, frame.measured[name], arms[name][index]) for name in sorted(frame.measured)]
         images = [(name, frame.images[name]) for name in sorted(frame.images)]
-        return {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
+        origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
+        return origin | ({"masks": fingerprint(sorted((frame.masks or {}).items()))} if self._masked else {})
 
     def of_all(self, indices: Indices[int]) -> Origin:
         """Of frames that are corrected together: each depends on what all are made from."""
         each = [self.of(index) for index in indices]
         stamps = self._sequence.timestamps
         times = [None if stamps is None else float(stamps[index]) for index in indices]
+        masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._masked else {}
         return {
             **self._common,
+            **masks,
             "joints": fingerprint(*(origin["joints"] for origin in each)),
             "images": fingerprint(*(origin["images"] for origin in each)),
             "together": fingerprint(indices, [self._sequence.frame_ids[index] for index in indices], repr(times)),
@@ -100,10 +104,10 @@ def changes(before: Origin, now: Origin) -> str | None:
     different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
     if "together" in different:
         # With other frames, these are of other frames too.
-        different = [kind for kind in different if kind not in ("joints", "images")]
+        different = [kind for kind in different if kind not in ("joints", "images", "masks")]
     if "calibration" in different:
         # Images are compared without their distortion, which belongs to the calibration.
-        different = [kind for kind in different if kind not in ("images", "background")]
+        different = [kind for kind in different if kind not in ("images", "masks", "background")]
     if "joints" in different or "images" in different:
         # A background is made from frames.
         different = [kind for kind in different if kind != "background"]

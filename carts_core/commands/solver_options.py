@@ -10,9 +10,16 @@ import tomlkit
 import tyro
 
 from ..errors import SettingsError
-from ..settings import CALIBRATION_SETTINGS, SequenceSettings, SolverName, SolverSettings, SurfaceSolver
+from ..settings import CALIBRATION_SETTINGS, FreeParameters, SequenceSettings, SolverName, SolverSettings, SurfaceSolver
 from ..settings import solver as named_solver
 from ..settings.serialization import changed, to_plain
+
+
+@dataclass(frozen=True)
+class FreeInFrames(FreeParameters):
+    """The same without what is rarely needed for frames; --settings has it."""
+
+    locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
 
 
 @dataclass(frozen=True)
@@ -24,10 +31,10 @@ class SolverOptions:
     `paper` compare image features as the paper does; `none` only compares the start."""
     settings: tuple[str, ...] = ()
     """Settings that differ from the solver's: TOML files as --print-settings writes them, or single ones such as
-    `iterations=20` and `sequence.initial_frames=3`."""
+    `iterations=20`, `sequence.initial_frames=3` and `free.locked_cameras=["left"]`."""
 
     def __post_init__(self) -> None:
-        _ = self.chosen, self.sequence  # A file that cannot be used is reported at once.
+        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # A file that cannot be used is reported at once.
 
     @property
     def chosen(self) -> SolverSettings:
@@ -38,6 +45,10 @@ class SolverOptions:
     def sequence(self) -> SequenceSettings:
         """Settings of sequence mode."""
         return changed(SequenceSettings(), _table(self.settings, "sequence"), "[sequence]")
+
+    def freed(self, free: FreeParameters) -> FreeParameters:
+        """What is free, with what the settings say of it."""
+        return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
         """See that the solver is the one that knows how certain it is.
@@ -89,10 +100,12 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
     for text in given:
         single = "=" in text and not Path(text).exists()
         content = _parsed(text, _of_solver(text) if single else _read(Path(text)))
-        strangers = set(content) - {"solver", "sequence"}
+        strangers = set(content) - {"solver", "sequence", "free"}
         if strangers or not all(isinstance(table, dict) for table in content.values()):
             wrong = ", ".join(sorted(strangers)) or "values outside tables"
-            raise SettingsError(f"--settings {text} has {wrong}; allowed are the tables [solver] and [sequence].")
+            raise SettingsError(
+                f"--settings {text} has {wrong}; allowed are the tables [solver], [sequence] and [free]."
+            )
         found.update(content.get(name, {}))
     return found
 

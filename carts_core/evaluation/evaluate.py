@@ -10,7 +10,14 @@ import numpy as np
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import Assessment, Backgrounds, FrameOptimizer, FreeParameters, SolverSettings
+from ..optimization import (
+    Assessment,
+    Backgrounds,
+    FrameOptimizer,
+    FreeParameters,
+    SolverSettings,
+    SurfacePredictor,
+)
 from ..perturbation import perturb
 from ..rendering import Renderer
 from ..scene import SceneState
@@ -44,7 +51,7 @@ class FrameScore:
 
 def evaluate(
     sequence: Sequence,
-    extractor: FeatureExtractor,
+    networks: FeatureExtractor | SurfacePredictor,
     *,
     frames: Names[int],
     cameras: Names[str],
@@ -59,7 +66,7 @@ def evaluate(
 
     Args:
         sequence: with masks, true kinematics, both or neither.
-        extractor: the feature network.
+        networks: the networks, or another predictor of surface maps.
         frames: positions in the sequence.
         cameras: names; every one sees the frame alone, unless they look `together`.
         domains: names.
@@ -79,7 +86,7 @@ def evaluate(
                 start = start_positions(sequence, frame, perturb_deg, seed)
                 began = time.perf_counter()
                 optimizer = FrameOptimizer(
-                    scene, frame, backgrounds, extractor, start=start, settings=settings, free=free, live=False
+                    scene, frame, backgrounds, networks, start=start, settings=settings, free=free, live=False
                 )
                 for _ in optimizer:
                     pass

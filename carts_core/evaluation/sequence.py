@@ -6,14 +6,21 @@ from dataclasses import dataclass, replace
 
 from ..data import Frame, Sequence
 from ..features.extractor import FeatureExtractor
-from ..optimization import Backgrounds, FreeParameters, SequenceOptimizer, SequenceSettings, SolverSettings
+from ..optimization import (
+    Backgrounds,
+    FreeParameters,
+    SequenceOptimizer,
+    SequenceSettings,
+    SolverSettings,
+    SurfacePredictor,
+)
 from ..rendering import Renderer
 from .evaluate import FrameScore, camera_groups, frame_score, start_positions
 
 
 def evaluate_sequence(
     sequence: Sequence,
-    extractor: FeatureExtractor,
+    networks: FeatureExtractor | SurfacePredictor,
     *,
     frames: Names[int],
     cameras: Names[str],
@@ -39,7 +46,7 @@ def evaluate_sequence(
                 scene,
                 starts.frame,
                 starts.times(frames),
-                extractor,
+                networks,
                 settings=settings,
                 model=model,
                 free=free,

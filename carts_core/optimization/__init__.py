@@ -18,6 +18,8 @@ from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
+from .masks import MaskPredictor as MaskPredictor
+from .predictor import ImagePredictor as ImagePredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
 from .resumable import sequence_checkpoint as sequence_checkpoint
@@ -42,7 +44,9 @@ __all__ = [
     "FrameEstimate",
     "FrameOptimizer",
     "FreeParameters",
+    "ImagePredictor",
     "Iterate",
+    "MaskPredictor",
     "NetworkPredictor",
     "Origin",
     "Progress",

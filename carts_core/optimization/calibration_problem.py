@@ -114,7 +114,7 @@ class CalibrationProblem:
             problem = FrameProblem(
                 scene,
                 frame.images,
-                predictor,
+                predictor.for_frame(frame, [camera.name for camera in scene.cameras]),
                 unknowns,
                 settings,
                 ignore[index] if ignore else None,

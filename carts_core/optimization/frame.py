@@ -123,7 +123,7 @@ class FrameOptimizer:
         known = backgrounds if isinstance(backgrounds, Backgrounds) else Backgrounds(backgrounds)
         self._problem: FrameProblem | FeatureProblem
         if isinstance(settings, SurfaceSolver):
-            predictor = predictor_of(networks)
+            predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
             self._problem = FrameProblem(
                 scene, frame.images, predictor, self._variables, settings, ignore or {}, backgrounds=known, live=live
             )

@@ -67,8 +67,10 @@ class FrameImages:
         unit, _ = working_size(scene, working_width, predictor.stride)
         size = working_size(scene, round(working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
-        through, explained, changed = transmission(stacked, dehaze), None, None
-        if backgrounds is not None and backgrounds.covers(scene):
+        # Given masks know through haze, and before any background, where arms are.
+        through = transmission(stacked, dehaze if predictor.knows_parts else 0.0)
+        explained, changed = None, None
+        if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, dehaze, predictor)
             changed = background.changed(stacked, size[0] / unit)
             if background.deceptive:
@@ -81,7 +83,7 @@ class FrameImages:
             images=dehazed(stacked, through),
             weight=pixel_weights(scene, ignore, size).to(predictor.device),
             # Smoke misleads the network by more than noise does: docs/experiments.
-            certainty=certainty(through).square(),
+            certainty=torch.ones_like(through) if predictor.masked else certainty(through).square(),
             explained=explained,
             changed=changed,
             renderer=Renderer(scene, width=size[0], height=size[1], device=predictor.device),

@@ -177,7 +177,7 @@ class FrameProblem:
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(
-            value=compared.pixels / self.settings.noise**2 + prior.cost,
+            value=compared.pixels / factor.noise**2 + prior.cost,
             loss=self._loss(shown, final),
             stage_loss=self._loss(factor, compared),
             prior=prior.cost,

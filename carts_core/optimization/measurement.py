@@ -109,7 +109,7 @@ class FrameSolver:
         return FrameProblem(
             self._scene,
             frame.images,
-            self._predictor,
+            self._predictor.for_frame(frame, [camera.name for camera in self._scene.cameras]),
             variables,
             self._settings,
             self._ignore(frame.index),

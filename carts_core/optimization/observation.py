@@ -31,6 +31,10 @@ class Observation:
     """What each pixel counts: 0 far from the arms and where an occluder is known to be."""
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
+    knows_parts: bool = True
+    """Whether parts and normals are predicted, and not only the coverage of the whole arm."""
+    masked: bool = False
+    """Whether the coverage is that of given masks."""
 
     @property
     def coverage(self) -> Float[Tensor, "cameras h w"]:
@@ -63,14 +67,15 @@ def observe(
         whole: predict the whole image, and have all of it count.
     """
     given = images.renderer.surface_maps(state)
-    margin = max(images.size) if whole else round(stage.margin * images.scale)
+    everything = whole or predictor.masked
+    margin = max(images.size) if everything else round(stage.margin * images.scale)
     reach = round(stage.attention * images.scale)
     window = Window.around(given[:, COVERAGE].sum(1), margin, predictor.stride, images.size)
     maps = predictor.predict(images.images, given, window)
     if images.explained is not None:
         maps = maps * (1.0 - window.of(images.explained))
     silhouette = window.of((given[:, COVERAGE].sum(1) > 0).to(given))
-    near = attention(silhouette, reach) if silhouette.any() and not whole else torch.ones_like(silhouette)
+    near = attention(silhouette, reach) if silhouette.any() and not everything else torch.ones_like(silhouette)
     weight = window.of(images.weight) * near[:, None]
     certain = window.of(images.certainty) if stage.haze else torch.ones_like(weight)
-    return Observation(images, window, maps, weight, certain)
+    return Observation(images, window, maps, weight, certain, predictor.knows_parts, predictor.masked)

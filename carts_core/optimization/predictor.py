@@ -1,18 +1,32 @@
 """Who says what an image shows: the surface network, given masks, or in tests somebody who is always right."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..data import Frame
 from ..features.extractor import FeatureExtractor
 from .window import Window
 
 
 class SurfacePredictor(Protocol):
     """Predicts the surface maps of images (`carts_core.surface`)."""
+
+    @property
+    def masked(self) -> bool:
+        """Whether given masks say where arms are. Then haze, empty backgrounds and edges of the images do not count,
+        and the whole image does."""
+        ...
+
+    @property
+    def knows_parts(self) -> bool:
+        """Whether it knows parts and normals, and not only the coverage of the whole arm, which is then in the first
+        channel."""
+        ...
 
     @property
     def device(self) -> torch.device:
@@ -39,9 +53,24 @@ class SurfacePredictor(Protocol):
         """
         ...
 
+    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> "SurfacePredictor":
+        """The predictor of one frame, as some cameras see it."""
+        ...
+
+
+class ImagePredictor:
+    """To be derived from by predictors that know nothing but the images that they are shown."""
+
+    masked = False
+    knows_parts = True
+
+    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> Self:
+        """The same for all frames; see `SurfacePredictor.for_frame`."""
+        return self
+
 
 @dataclass(frozen=True)
-class NetworkPredictor:
+class NetworkPredictor(ImagePredictor):
     """The surface network. Two of the same networks are equal, so that what they predict once can be kept."""
 
     extractor: FeatureExtractor

@@ -60,7 +60,8 @@ class ResumableFrameSolver(FrameSolver):
 def _key(method: str, frame: Frame, *arguments: Any) -> str:
     images = [(name, frame.images[name]) for name in sorted(frame.images)]
     measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
-    return fingerprint(method, frame.index, images, measured, _plain(arguments))
+    masks = sorted((frame.masks or {}).items())
+    return fingerprint(method, frame.index, images, masks, measured, _plain(arguments))
 
 
 def _plain(arguments: Iterable[Any]) -> list[Any]:

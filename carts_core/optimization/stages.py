@@ -85,7 +85,7 @@ def _(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def _(stage: ShaftSearch, fit: Fit) -> Iterator[Point]:
-    if fit.loss < stage.if_loss:
+    if fit.loss < stage.if_loss or _one_frame(fit).predictor.masked:
         return
     found = best_along_shafts(_one_frame(fit), fit.offsets, stage)
     if found is not None:
@@ -96,6 +96,8 @@ def _(stage: ShaftSearch, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     assert fit.reached is not None, "AlignEdges follows a Descend"
+    if _one_frame(fit).predictor.masked:
+        return
     fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
     yield from ()
 

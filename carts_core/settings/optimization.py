@@ -58,6 +58,8 @@ class SurfaceSolver:
     """Width of the working image [px]; stages say how many times larger their images are."""
     noise: float = 1.33
     """Deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
+    mask_noise: float = 0.5
+    """The same of given masks [1]."""
     parts_weight: float = 0.1
     """Weight of the coverage of single parts beside that of the whole arm [1]."""
     normals_weight: float = 0.05
@@ -83,6 +85,7 @@ class SurfaceSolver:
         require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
         require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
         require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
+        require(1e-3 <= self.mask_noise <= 100, "mask_noise", self.mask_noise, "0.001 to 100")
         require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
         require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         require(0 <= self.dehaze <= 1, "dehaze", self.dehaze, "0 to 1")

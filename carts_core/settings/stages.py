@@ -89,7 +89,8 @@ class RandomRestart:
 @dataclass(frozen=True)
 class ShaftSearch:
     """Where the fit is doubtful: move each arm along its shaft either way, observe again conditioned on that, and go
-    on from the best. A network that is conditioned on a shaft which ends too early may see it end there."""
+    on from the best. A network that is conditioned on a shaft which ends too early may see it end there; given masks do
+    not, and skip this."""
 
     then: tuple["Stage", ...]
     """What runs where another place was better. Places are compared as the first `Descend` of these compares them."""
@@ -105,7 +106,8 @@ class ShaftSearch:
 
 @dataclass(frozen=True)
 class AlignEdges:
-    """Draw the outlines of the arms to edges of the image, weighed against what the network saw."""
+    """Draw the outlines of the arms to edges of the image, weighed against what the network saw. Skipped where given
+    masks are the target: they say where outlines are."""
 
     steps: int = 24
     """Largest number of steps [1]."""

@@ -6,6 +6,7 @@ import torch
 from torch.nn import functional
 
 from carts_core.data import Sequence
+from carts_core.optimization import ImagePredictor
 from carts_core.optimization.window import Window
 from carts_core.rendering import Renderer
 from carts_core.scene import SceneState
@@ -13,7 +14,7 @@ from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import Stage
 
 
-class PerfectPredictor:
+class PerfectPredictor(ImagePredictor):
     """Predicts the surface map of the truth, whatever it is shown."""
 
     device = torch.device("cpu")

@@ -18,6 +18,7 @@ from carts_core.optimization import (
     CalibrationOptimizer,
     DescentSolver,
     FreeParameters,
+    ImagePredictor,
 )
 from carts_core.optimization.calibration import with_fixed_gauge
 from carts_core.optimization.calibration_problem import frame_weights
@@ -35,7 +36,7 @@ DESCENTS = (Descend(6.0), Descend(2.0), Descend(0.8))
 SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, stages=(FAR, *DESCENTS), dehaze=0.0)
 
 
-class PerfectPredictor:
+class PerfectPredictor(ImagePredictor):
     """Knows a frame by its images' colour, and predicts the surface map of its truth."""
 
     device = torch.device("cpu")

@@ -12,7 +12,7 @@ from carts_core.benchmark.rooms import made_rooms
 from carts_core.data import Sequence
 from carts_core.evaluation import dice
 from carts_core.features import FeatureExtractor
-from carts_core.optimization import Backgrounds, FrameOptimizer
+from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor
 from carts_core.optimization.counterfactual import Background, without_background
 from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.window import Window
@@ -24,7 +24,7 @@ SIZE = {"width": 320, "height": 240}
 BAR, ARM = (slice(40, 120), slice(20, 200)), (slice(150, 200), slice(100, 240))
 
 
-class DarkIsArm:
+class DarkIsArm(ImagePredictor):
     """A predictor that takes whatever is dark for an arm."""
 
     device, stride = torch.device("cpu"), 16

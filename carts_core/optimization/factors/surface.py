@@ -47,6 +47,7 @@ class SurfaceFactor:
         robust: difference beyond which a pixel loses its weight [1].
 
     Attributes:
+        noise: deviation of what is observed, per pixel [1].
         area: of a pixel [px of the working image].
         size: width and height of the compared images [px].
         window: the part of them that is compared [px].
@@ -68,8 +69,8 @@ class SurfaceFactor:
         factor = max(f for f in _REDUCTIONS if f == 1 or blur / f >= _SMALLEST_BLUR)
         self._variables, self._blur, self._robust = variables, blur / factor, robust
         self.area = (factor / images.scale) ** 2
-        self._noise = settings.noise
-        self._precision = self.area / settings.noise**2
+        self.noise = settings.mask_noise if observation.masked else settings.noise
+        self._precision = self.area / self.noise**2
         self.size = images.size[0] // factor, images.size[1] // factor
         self.window = observation.window.reduced(factor)
         device = observation.maps.device
@@ -78,11 +79,15 @@ class SurfaceFactor:
         )
         self._weight = functional.avg_pool2d(observation.weight, factor)
         self.certainty = functional.avg_pool2d(observation.certainty, factor)
-        maps = functional.avg_pool2d(observation.maps * observation.weight, factor)
-        self._observed = with_total(smoothed(maps, self._blur))
+        self._total_only = not observation.knows_parts
+        self._observed = self._blurred(functional.avg_pool2d(observation.maps * observation.weight, factor))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=device)
         self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
+        # Parts and normals are the network's, whoever knows the whole.
+        self._channels[1:] *= (self.noise / settings.noise) ** 2
+        if self._total_only:
+            self._channels = self._channels[: COVERAGE.start + 1]
 
     def costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
         """Cost of each of a batch of points, as many at once as memory allows."""
@@ -96,7 +101,7 @@ class SurfaceFactor:
             with one_thread():
                 sums = (squared * ratio * self.certainty).flatten(1).sum(1)
             found.append(0.5 * self.area * sums)
-        return torch.cat(found) / self._noise**2
+        return torch.cat(found) / self.noise**2
 
     def compare(self, offsets: Float[Tensor, " n"]) -> "Comparison":
         """Compare the state at a point."""
@@ -117,7 +122,7 @@ class SurfaceFactor:
         gradient, hessian, outline = self._normal_equations(
             rendering.jacobian, residual, grown, weight, len(self._variables)
         )
-        return SurfaceLinearization(comparison.pixels / self._noise**2, gradient, hessian, comparison, outline)
+        return SurfaceLinearization(comparison.pixels / self.noise**2, gradient, hessian, comparison, outline)
 
     def _comparison(self, rendering: SurfaceRendering, squared: Tensor, ratio: Tensor) -> "Comparison":
         return Comparison(
@@ -129,10 +134,16 @@ class SurfaceFactor:
 
     def _difference(self, maps: Float[Tensor, "*batch cameras 6 h w"]) -> tuple[Tensor, Tensor, Tensor]:
         """Maps under the blur, the squared residual of each pixel, and what is left of that for being large [1]."""
-        model = with_total(smoothed(maps * self._weight, self._blur))
+        model = self._blurred(maps * self._weight)
         squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         return model, squared, 1.0 / (1.0 + squared / self._robust**2)
+
+    def _blurred(self, maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch channels h w"]:
+        """What is compared of surface maps: all their channels, or where no parts are known the coverage alone."""
+        if self._total_only:
+            return smoothed(maps[..., COVERAGE, :, :].sum(-3, keepdim=True), self._blur)
+        return with_total(smoothed(maps, self._blur))
 
     def _normal_equations(
         self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
@@ -144,7 +155,7 @@ class SurfaceFactor:
         for block in jacobian:
             rows, columns = block.values.shape[-2:]
             window = Window(block.left, block.top, columns, rows)
-            values = with_total(smoothed(block.values * window.of(self._weight), self._blur))
+            values = self._blurred(block.values * window.of(self._weight))
             weighted = (values * window.of(weight)).flatten(1)
             gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
             outline[block.unknowns] = weighted @ window.of(grown).flatten()
