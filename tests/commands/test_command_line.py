@@ -233,7 +233,7 @@ def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: p
     [
         (["--arms", "PSM9"], "no arm is called 'PSM9'"),
         (["--locked-joints", "elbow"], "locked joint 'elbow' does not exist"),
-        (["--extrinsics", "--locked-cameras", "third"], "no camera is called 'third'"),
+        (["--extrinsics", "--settings", 'free.locked_cameras=["third"]'], "no camera is called 'third'"),
         (["--no-joints"], "nothing is free"),
         (["--domain", "regular", "fog"], "domain 'fog' is not in"),
         (["--mode", "sequence", "--keyframes", "nowhere.csv"], "nowhere.csv is not a readable kinematics table"),
