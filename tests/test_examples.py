@@ -97,6 +97,11 @@ def test_a_recording_is_synthesized_and_opens(run: Callable[..., str], tmp_path:
     assert (tmp_path / "made" / "sequence.toml").is_file()
 
 
+def test_a_mask_with_holes_is_fitted_without_a_network(run: Callable[..., str]) -> None:
+    start, fitted = floats(r"Dice (\S+)", run(11))
+    assert start < 0.7 and fitted > 0.97
+
+
 def test_there_are_at_least_ten_examples() -> None:
     assert [int(path.name[:2]) for path in EXAMPLES] == list(range(1, len(EXAMPLES) + 1)) and len(EXAMPLES) >= 10
 
