@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .camera import Camera
-from .robot import Robot
-from .scene import Scene
+from .model.camera import Camera
+from .model.robot import Robot
+from .model.scene import Scene
 
 _NOT_CODE = {"bench.py", "cli.py", "wording.py"}
 _PROBES = (0.0, 0.1, -0.2)

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.optimization import FreeParameters, SurfaceSolver
+from carts_core.recording import Sequence
 from carts_viewer import intents
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any, Protocol
 
+from carts_core.model.scene import SceneState
 from carts_core.project import Edits, Figures, Provenance, Source
 from carts_core.project.keys import WHOLE_PROJECT
-from carts_core.scene import SceneState
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from carts_core.keypoints import Keypoint, keypoints, project_keypoints
+from carts_core.model.keypoints import Keypoint, keypoints, project_keypoints
+from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization.keypoints import Pin
-from carts_core.scene import Scene, SceneState
 from carts_viewer.layers import Rgba
 
 _RING, _CROSS, _EDGE = (255, 255, 255, 255), (250, 204, 21, 255), (0, 0, 0, 255)

@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from carts_core.data import Frame, Sequence
 from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.model.scene import SceneState
 from carts_core.project import MaskCorrection
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
-from carts_core.scene import SceneState
 from carts_viewer import layers
 from carts_viewer.layers import Layer
 from carts_viewer.state import Maps, Scores

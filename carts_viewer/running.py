@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from carts_core.data import Sequence as Recording
-from carts_core.features import FeatureExtractor
+from carts_core.model.scene import Scene, SceneState
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import (
     Assessment,
     Backgrounds,
@@ -26,7 +26,7 @@ from carts_core.optimization import (
 )
 from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
-from carts_core.scene import Scene, SceneState
+from carts_core.recording import Sequence as Recording
 from carts_core.settings import Direction
 from carts_core.settings.serialization import to_plain
 from carts_viewer.state import Pose

@@ -9,8 +9,8 @@ import viser
 from jaxtyping import Float, UInt8
 from viser import transforms
 
-from carts_core.camera import Camera
-from carts_core.scene import Scene, SceneState
+from carts_core.model.camera import Camera
+from carts_core.model.scene import Scene, SceneState
 from carts_viewer.layers import ARM_COLORS, Rgba
 from carts_viewer.transport.viser_private import image_file
 

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from carts_core.data import Frame, FrameReader, Sequence
 from carts_core.errors import CartsError
-from carts_core.perturbation import perturb
+from carts_core.model.perturbation import perturb
+from carts_core.model.scene import Arm, Scene, SceneState
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -24,7 +24,7 @@ from carts_core.project import (
     Provenance,
     Source,
 )
-from carts_core.scene import Arm, Scene, SceneState
+from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.editing import Editor
 from carts_viewer.state import Pose
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
-from carts_core.data import Frame
+from carts_core.model.scene import SceneState
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings
 from carts_core.optimization.keypoints import Pin
 from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
-from carts_core.scene import SceneState
+from carts_core.recording import Frame
 from carts_core.settings import Direction, SolverName
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Brush

@@ -4,9 +4,9 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from carts_core.data import Sequence
 from carts_core.errors import ProjectError
 from carts_core.project import DamagedProject, Project, default_path
+from carts_core.recording import Sequence
 
 
 @dataclass(frozen=True)

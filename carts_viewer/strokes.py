@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from carts_core.camera import Camera
 from carts_core.errors import SettingsError
+from carts_core.model.camera import Camera
 from carts_core.project import IgnoreRegion, MaskCorrection
 
 DIAMETERS = (1, 300)

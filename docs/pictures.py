@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
-from carts_core.keypoints import project_keypoints
+from carts_core.model.keypoints import project_keypoints
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
 from carts_viewer import intents

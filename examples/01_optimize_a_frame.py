@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import tyro
 
-from carts_core.data import Sequence
 from carts_core.export import image_and_mask, overlay
-from carts_core.features import FeatureExtractor
+from carts_core.model.perturbation import perturb
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer
-from carts_core.perturbation import perturb
 from carts_core.process import tune_process
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 

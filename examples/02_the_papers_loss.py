@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import tyro
 
-from carts_core.data import Sequence
 from carts_core.evaluation import dice
 from carts_core.export import image_and_mask, outlined
-from carts_core.features import FeatureExtractor
+from carts_core.model.perturbation import perturb
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
-from carts_core.perturbation import perturb
 from carts_core.process import tune_process
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 

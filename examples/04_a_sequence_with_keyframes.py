@@ -9,11 +9,11 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from carts_core.data import Sequence
 from carts_core.evaluation import joint_mae_deg
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import SequenceOptimizer
 from carts_core.process import tune_process
+from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 
 

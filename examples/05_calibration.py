@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import tyro
 
-from carts_core.data import Frame, Sequence, spread
 from carts_core.export import image_and_mask, outlined
-from carts_core.features import FeatureExtractor
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CALIBRATION, CalibrationOptimizer
 from carts_core.process import tune_process
+from carts_core.recording import Frame, Sequence, spread
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
-from carts_core.scene import Scene
 
 
 def moved(scene: Scene, arm: str, metres: tuple[float, float, float]) -> Scene:

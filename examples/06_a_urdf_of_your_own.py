@@ -15,11 +15,11 @@ import trimesh
 import tyro
 from kornia.filters import gaussian_blur2d
 
-from carts_core.camera import Camera
 from carts_core.export import image_and_mask, outlined
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene
 from carts_core.rendering import Renderer
-from carts_core.robot import Robot
-from carts_core.scene import Arm, Scene
 
 LENGTHS = {"upper": 0.05, "lower": 0.04, "hand": 0.02}  # of the rods, each along its own z [m]
 

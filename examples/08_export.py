@@ -10,11 +10,11 @@ import numpy as np
 import tyro
 from pycocotools.coco import COCO
 
-from carts_core.data import Sequence
 from carts_core.export import Dataset, ExportFrame, Monitor, export
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer
 from carts_core.process import tune_process
+from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 
 

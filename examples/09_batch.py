@@ -11,12 +11,12 @@ from pathlib import Path
 import tyro
 from matplotlib.figure import Figure
 
-from carts_core.data import Sequence, spread
 from carts_core.errors import CartsError
 from carts_core.evaluation import FrameScore, evaluate
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.process import tune_process
+from carts_core.recording import Sequence, spread
 from carts_core.resources import sample_sequence
 
 

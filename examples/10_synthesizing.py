@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import tyro
 
-from carts_core.data import Sequence
 from carts_core.export import image_and_mask, outlined
+from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
 
 DOMAINS = ("regular", "low_brightness", "bleeding", "smoke")
 

@@ -12,10 +12,10 @@ import pytest
 import torch
 from tiny import TinyScene, tiny_scene
 
+from carts_core.model.robot import Robot
 from carts_core.process import tune_process
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
-from carts_core.robot import Robot
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -22,7 +22,7 @@ def run_command(command: str) -> None:
     if arguments[:1] == ["view"]:
         serve(arguments)
         return
-    from carts_core import cli  # noqa: PLC0415  pages without commands do without it
+    from carts_core.cli import command_line as cli  # noqa: PLC0415  pages without commands do without it
 
     try:
         cli.main(arguments)

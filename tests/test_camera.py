@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.camera import Camera, rigid_transform
 from carts_core.errors import SettingsError
+from carts_core.model.camera import Camera, rigid_transform
 
 INTRINSICS = (110.0, 115.0, 63.0, 46.0)
 BARREL = (-0.3, 0.08, 0.002, -0.001)

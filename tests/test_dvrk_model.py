@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from carts_core import extras
-from carts_core.cli import BAD_INPUT, main
-from carts_core.dvrk_model import dvrk_urdf, list_instruments
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError, RobotError
-from carts_core.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward
-from carts_core.robot import Robot
+from carts_core.model.dvrk_model import dvrk_urdf, list_instruments
+from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward
+from carts_core.model.robot import Robot
 
 XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="PSM1">'
 JOINT = '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>'

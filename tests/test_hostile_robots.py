@@ -8,10 +8,10 @@ import pytest
 import torch
 import trimesh
 
-from carts_core import decimation
-from carts_core.decimation import DecimationError, decimated
 from carts_core.errors import RobotError
-from carts_core.robot import Robot
+from carts_core.model import decimation
+from carts_core.model.decimation import DecimationError, decimated
+from carts_core.model.robot import Robot
 
 BALL = '<mesh filename="ball.stl" scale="1 1 1"/>'
 URDF = """<robot name="two">

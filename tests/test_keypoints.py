@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from tiny import tiny_scene
 
-from carts_core.keypoints import MOST_KEYPOINTS, keypoints, project_keypoints
-from carts_core.robot import Robot
-from carts_core.scene import Arm
+from carts_core.model.keypoints import MOST_KEYPOINTS, keypoints, project_keypoints
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm
 
 
 def test_the_shipped_instrument_has_both_tips_and_the_wrist(shipped_psm: Robot) -> None:

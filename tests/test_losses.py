@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from carts_core.losses import attention, attentional_loss, cosine_similarity, smooth_l1
+from carts_core.optimization.losses import attention, attentional_loss, cosine_similarity, smooth_l1
 from carts_core.settings import Loss
 
 

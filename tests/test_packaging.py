@@ -84,7 +84,7 @@ def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
 
 def test_the_wheel_holds_both_packages_typed_and_the_licence_but_no_tests(wheel: Path) -> None:
     inside = set(zipfile.ZipFile(wheel).namelist())
-    assert {"carts_core/py.typed", "carts_viewer/py.typed", "carts_core/cli.py", "carts_viewer/app.py"} <= inside
+    assert {"carts_core/py.typed", "carts_core/cli/command_line.py", "carts_viewer/app.py"} <= inside
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in inside)
     assert {PurePosixPath(name).parts[0] for name in inside if ".dist-info/" not in name} == {
         "carts_core",

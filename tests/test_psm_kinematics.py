@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward, inverse
+from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward, inverse
 
 GEOMETRIES = {"classic": CLASSIC, "Si": SI, "classic ProGrasp": replace(CLASSIC, wrist_length=0.0107)}
 

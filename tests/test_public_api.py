@@ -17,7 +17,7 @@ ROOTS = [Path(package.__path__[0]) for package in (carts_core, carts_viewer)]
 SOURCES = sorted(path for root in ROOTS for path in root.rglob("*.py"))
 CORE_SOURCES = [path for path in SOURCES if path.is_relative_to(ROOTS[0])]
 # The one place where the core reaches for the app: `carts view`, when it is called and not before.
-COMMAND_LINE = ROOTS[0] / "commands" / "view.py"
+COMMAND_LINE = ROOTS[0] / "cli" / "view.py"
 
 
 def _named(path: Path) -> str:

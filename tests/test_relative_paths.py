@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from pytest import MonkeyPatch
 
-from carts_core.data import Sequence
+from carts_core.model.robot import Robot
+from carts_core.recording import Sequence
 from carts_core.resources import shipped_robot
-from carts_core.robot import Robot
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from carts_core.errors import RobotError
-from carts_core.meshes import face_budget
+from carts_core.model.meshes import face_budget
+from carts_core.model.robot import Robot
 from carts_core.resources import shipped_robot
-from carts_core.robot import Robot
 
 LENGTH_RCC, LENGTH_TOOL, PITCH_TO_YAW, YAW_TO_TIP = 0.4318, 0.4162, 0.0091, 0.0102
 HALF = np.pi / 2

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.data import Sequence
 from carts_core.evaluation import start_positions
-from carts_core.features.extractor import FeatureExtractor
+from carts_core.networks.extractor import FeatureExtractor
 from carts_core.optimization import FrameOptimizer
+from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_core.settings import SurfaceSolver
 from carts_core.threads import one_thread, total

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import torch
 
-from carts_core.camera import Camera
-from carts_core.robot import Robot
-from carts_core.scene import Arm, Scene
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene
 
 FOCAL_PER_WIDTH = 1.2
 BIAS = 0.01

@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from ablation_variants import AS_IS, VARIANTS, Variant
 
-from carts_core.data import Sequence
 from carts_core.evaluation.evaluate import frame_score, start_positions
-from carts_core.features.extractor import FeatureExtractor
+from carts_core.networks.extractor import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer
 from carts_core.optimization.evaluation import Evaluation
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.observation import observe
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings.stages import Given
 

@@ -14,16 +14,16 @@ import torch
 from rich.table import Table
 
 from carts_core.console import Terminal
-from carts_core.data import Sequence
 from carts_core.evaluation import start_positions
-from carts_core.features import FeatureExtractor
+from carts_core.model.scene import SceneState
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
 from carts_core.process import tune_process
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, visibility_torch
 from carts_core.rendering.geometry import link_transforms, vertices_in_camera
 from carts_core.rendering.visibility_numba import rasterize
 from carts_core.resources import sample_sequence
-from carts_core.scene import SceneState
 from carts_core.wording import counted
 
 

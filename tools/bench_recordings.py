@@ -16,9 +16,9 @@ import numpy as np
 from rich.table import Table
 
 from carts_core.console import Terminal
-from carts_core.data import FrameReader, Sequence
 from carts_core.files import OutputPath, output_path, output_stream, write_bytes, write_text
 from carts_core.process import tune_process
+from carts_core.recording import FrameReader, Sequence
 from tools.memory import resident_megabytes
 
 WIDTH, HEIGHT = 640, 480

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..camera import Camera
-from ..data import Frame, Sequence
+from ..model.camera import Camera
+from ..model.scene import Arm, Scene
 from ..optimization import CalibrationResult
+from ..recording import Frame, Sequence
 from ..rendering import Renderer
-from ..scene import Arm, Scene
 from .metrics import dice
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..console import in_markdown
-from ..data import Sequence, calibrated_sequence_file
 from ..files import OutputPath, output_stream, write_text
 from ..optimization import CalibrationResult
+from ..recording import Sequence, calibrated_sequence_file
 from ..wording import counted
 from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames, remark
 

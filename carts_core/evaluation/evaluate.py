@@ -8,19 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Frame, Sequence
-from ..features.extractor import FeatureExtractor
-from ..optimization import (
-    Assessment,
-    Backgrounds,
-    FrameOptimizer,
-    FreeParameters,
-    SolverSettings,
-    SurfacePredictor,
-)
-from ..perturbation import perturb
+from ..model.perturbation import perturb
+from ..model.scene import SceneState
+from ..networks.extractor import FeatureExtractor
+from ..optimization import Assessment, Backgrounds, FrameOptimizer, FreeParameters, SolverSettings, SurfacePredictor
+from ..recording import Frame, Sequence
 from ..rendering import Renderer
-from ..scene import SceneState
 from .metrics import dice, joint_mae_deg, joint_std_deg
 
 

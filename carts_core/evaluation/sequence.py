@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from collections.abc import Sequence as Names
 from dataclasses import dataclass, replace
 
-from ..data import Frame, Sequence
-from ..features.extractor import FeatureExtractor
+from ..networks.extractor import FeatureExtractor
 from ..optimization import (
     Backgrounds,
     FreeParameters,
@@ -14,6 +13,7 @@ from ..optimization import (
     SolverSettings,
     SurfacePredictor,
 )
+from ..recording import Frame, Sequence
 from ..rendering import Renderer
 from .evaluate import FrameScore, camera_groups, frame_score, start_positions
 

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
 from scipy.ndimage import distance_transform_edt
 
-from ..camera import Camera
-from ..data import Sequence
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, unique_file_names, write_bytes
+from ..model.camera import Camera
+from ..model.scene import Scene
+from ..recording import Sequence
 from ..rendering import Renderer
-from ..scene import Scene
 from ..settings import Parts
 from ..wording import counted
 from .frames import ExportFrame

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..camera import Camera
 from ..files import OutputPath, write_text
-from ..scene import Arm
+from ..model.camera import Camera
+from ..model.scene import Arm
 from .dataset import Dataset
 from .monitor import Monitor
 

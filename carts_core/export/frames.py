@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from jaxtyping import Bool
 from numpy import ndarray
 
-from ..data import Sequence
 from ..errors import SequenceError
+from ..recording import Sequence
 from .kinematics import KinematicsRow
 
 

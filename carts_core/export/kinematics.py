@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import SequenceError
 from ..files import csv_cell, text_of_cell
 from ..files.reading import TABLE, open_regular
-from ..scene import Scene
+from ..model.scene import Scene
 from ..wording import shortened
 
 

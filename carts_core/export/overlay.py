@@ -5,8 +5,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
+from ..model.scene import SceneState
 from ..rendering import Renderer
-from ..scene import SceneState
 
 _CONTOUR = (80, 255, 120)
 

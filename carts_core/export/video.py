@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from ..camera import Camera
 from ..files import OutputPath, output_stream, unique_file_names
+from ..model.camera import Camera
 from .dataset import Dataset, View
 from .monitor import Monitor
 from .overlay import image_and_mask, outlined, overlay

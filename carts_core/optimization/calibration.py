@@ -9,10 +9,10 @@ import roma
 import torch
 from jaxtyping import Float
 
-from ..data import Frame
 from ..errors import SettingsError
-from ..features.extractor import FeatureExtractor
-from ..scene import Scene, SceneState
+from ..model.scene import Scene, SceneState
+from ..networks.extractor import FeatureExtractor
+from ..recording import Frame
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import Descend
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored

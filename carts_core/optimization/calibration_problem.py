@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data import Frame
-from ..scene import Scene
+from ..model.scene import Scene
+from ..recording import Frame
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe
 from .elimination import Eliminated, eliminate

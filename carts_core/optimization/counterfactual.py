@@ -16,14 +16,14 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from ..data import MeanBackground
 from ..errors import SequenceError
-from ..scene import Scene
-from ..surface import COVERAGE, SURFACE_CHANNELS
-from .haze import dehazed, transmission
+from ..imaging.haze import dehazed, transmission
+from ..imaging.window import Window
+from ..model.scene import Scene
+from ..model.surface import COVERAGE, SURFACE_CHANNELS
+from ..recording import MeanBackground
 from .inputs import pixel_weights, stacked_images
 from .predictor import SurfacePredictor
-from .window import Window
 
 _PATCH = 3
 """Side of the patches over which differences are averaged [px of the working image]."""

@@ -7,17 +7,17 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ..features.extractor import FeatureExtractor
-from ..features.hybrid import hybrid
-from ..losses import attention, attentional_loss, cosine_similarity, smooth_l1
+from ..imaging.window import Window
+from ..model.scene import Scene
+from ..networks.extractor import FeatureExtractor
+from ..networks.hybrid import hybrid
 from ..rendering import Renderer
-from ..scene import Scene
 from ..settings import DescentSolver, Loss
 from ..settings.stages import FirstOrder, Observe, Stage
 from .evaluation import Evaluation
 from .inputs import blurred, stacked_images, working_size
+from .losses import attention, attentional_loss, cosine_similarity, smooth_l1
 from .variables import Variables
-from .window import Window
 
 _SURROUNDINGS = 16
 """What the network sees beyond the attention [px of the working image]."""

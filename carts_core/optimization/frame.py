@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
-from ..data import Frame
 from ..errors import SettingsError
-from ..features.extractor import FeatureExtractor
-from ..scene import Scene, SceneState
+from ..model.scene import Scene, SceneState
+from ..networks.extractor import FeatureExtractor
+from ..recording import Frame
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import FINEST, Evaluate
 from .base_frame_gain import base_frame_gain

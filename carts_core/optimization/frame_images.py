@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from ..imaging.haze import certainty, dehazed, transmission
+from ..model.scene import Scene
 from ..rendering import Renderer
-from ..scene import Scene
 from .counterfactual import Backgrounds, without_background
-from .haze import certainty, dehazed, transmission
 from .inputs import pixel_weights, stacked_images, working_size
 from .predictor import SurfacePredictor
 

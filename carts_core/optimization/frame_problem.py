@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from ..scene import Scene
+from ..model.scene import Scene
+from ..model.surface import COVERAGE
 from ..settings import SurfaceSolver
 from ..settings.stages import AlignEdges, Descend, Given, Observe, first_observe
-from ..surface import COVERAGE
 from ..threads import total
 from .counterfactual import Backgrounds
 from .edge_alignment import align_edges

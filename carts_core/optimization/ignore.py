@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..scene import Scene
+from ..model.scene import Scene
 
 _CONTRADICTS = 0.5
 """Similarity below which a pixel contradicts the estimate: 1 minus the squared difference of surface maps."""

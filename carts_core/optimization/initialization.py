@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ..data import Frame
+from ..recording import Frame
 from .measurement import FrameSolver
 from .variables import Variables
 

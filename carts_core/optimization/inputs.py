@@ -12,7 +12,7 @@ from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
 from ..errors import SettingsError
-from ..scene import Scene
+from ..model.scene import Scene
 
 _CHANNELS = 96
 """Channels that OpenCV filters at a time; it allows 128."""

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from ..errors import SettingsError
-from ..keypoints import Keypoint, project_keypoints
-from ..scene import Scene, SceneState
+from ..model.keypoints import Keypoint, project_keypoints
+from ..model.scene import Scene, SceneState
 from ..settings import FreeParameters, SurfaceSolver
 from .variables import Variables
 

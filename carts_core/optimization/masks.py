@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data import Frame
 from ..errors import SettingsError
-from ..surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ..imaging.window import Window
+from ..model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ..recording import Frame
 from .predictor import SurfacePredictor
-from .window import Window
 
 GivenMask = Bool[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
 """Which share of each pixel the arms cover, all of them together; a soft edge has values between 0 and 1."""

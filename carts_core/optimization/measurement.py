@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data import Frame
-from ..scene import Scene
+from ..model.scene import Scene
+from ..recording import Frame
 from ..settings import SequenceSettings, SurfaceSolver
 from ..settings.presets import COMPARE, reduced
 from ..settings.stages import FINEST, Stage, first_observe

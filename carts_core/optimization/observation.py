@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..losses import attention
-from ..scene import SceneState
+from ..imaging.window import Window
+from ..model.scene import SceneState
+from ..model.surface import COVERAGE
 from ..settings.stages import Observe
-from ..surface import COVERAGE
 from ..threads import total
 from .frame_images import FrameImages
+from .losses import attention
 from .predictor import SurfacePredictor
-from .window import Window
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..data import Frame
-from ..features.extractor import FeatureExtractor
-from .window import Window
+from ..imaging.window import Window
+from ..networks.extractor import FeatureExtractor
+from ..recording import Frame
 
 
 class SurfacePredictor(Protocol):
-    """Predicts the surface maps of images (`carts_core.surface`)."""
+    """Predicts the surface maps of images (`carts_core.model.surface`)."""
 
     @property
     def masked(self) -> bool:

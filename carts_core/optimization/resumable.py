@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..checkpoint import Checkpoint
-from ..data import Frame
 from ..files import OutputPath
 from ..fingerprints import fingerprint
+from ..recording import Frame
 from .error_model import Gaussian, Information
 from .measurement import FrameSolver, Measurement
 from .variables import Variables

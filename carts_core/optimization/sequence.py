@@ -14,11 +14,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checkpoint import Checkpoint
-from ..data import Frame
-from ..data.background import spread
 from ..errors import CartsError, SettingsError
-from ..features.extractor import FeatureExtractor
-from ..scene import Scene, SceneState
+from ..model.scene import Scene, SceneState
+from ..networks.extractor import FeatureExtractor
+from ..recording import Frame
+from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, SurfaceSolver
 from .counterfactual import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, combined, information_shares, remove_measurement

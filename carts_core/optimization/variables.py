@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import SettingsError
-from ..scene import Scene, SceneState
+from ..model.scene import Scene, SceneState
 from ..settings import FreeParameters, SurfaceSolver
 from .factors import Prior
 

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..losses import attention
-from ..scene import SceneState
-from ..surface import COVERAGE
+from ..imaging.window import Window
+from ..model.scene import SceneState
+from ..model.surface import COVERAGE
 from .frame_images import FrameImages
+from .losses import attention
 from .predictor import SurfacePredictor
-from .window import Window
 
 _MARGIN, _NEAR = 16, 8
 """What the network is shown beyond the arms, and how far from them predictions count [px of the working image]."""

@@ -11,7 +11,7 @@ from ..files.reading import SEQUENCE, TABLE, parse_toml, read_text
 from ..wording import counted
 
 if TYPE_CHECKING:
-    from ..data import Sequence
+    from ..recording import Sequence
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from .store import Store
 from .values import Figures
 
 if TYPE_CHECKING:
-    from ..data import Sequence
+    from ..recording import Sequence
 
 LONGEST_NAME = 200
 """Characters of a step's name."""

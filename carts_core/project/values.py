@@ -12,8 +12,8 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from ..camera import rigid_transform
 from ..errors import ProjectError, SettingsError
+from ..model.camera import rigid_transform
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
 

@@ -1,11 +1,9 @@
-"""Recordings of other people's formats, and what they know of themselves."""
+"""Recordings: the sequence format and its loader."""
 
-from .alignment import at_times as at_times
-from .alignment import clock_offset as clock_offset
-from .dvrk_files import DvrkBaseFrame as DvrkBaseFrame
-from .dvrk_files import read_base_frames as read_base_frames
-from .instrument import CANDIDATES as CANDIDATES
-from .instrument import BaseFrame as BaseFrame
-from .instrument import InstrumentCheck as InstrumentCheck
-from .instrument import check_instrument as check_instrument
-from .instrument import fit_base_frame as fit_base_frame
+from .background import MeanBackground as MeanBackground
+from .background import background_of_recording as background_of_recording
+from .background import spread as spread
+from .calibrated import calibrated_sequence_file as calibrated_sequence_file
+from .frame_reader import FrameReader as FrameReader
+from .sequence import Frame as Frame
+from .sequence import Sequence as Sequence

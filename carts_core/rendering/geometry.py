@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..meshes import is_closed
-from ..parts import link_parts
-from ..robot import Robot
-from ..scene import Scene, SceneState
+from ..model.meshes import is_closed
+from ..model.parts import link_parts
+from ..model.robot import Robot
+from ..model.scene import Scene, SceneState
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class SceneGeometry:
     face_links: Int[Tensor, " F"]
     face_arms: Int[Tensor, " F"]
     face_parts: Int[Tensor, " F"]
-    """Index into `carts_core.parts.PARTS`."""
+    """Index into `carts_core.model.parts.PARTS`."""
     face_surfaces: Int[Tensor, " F"]
     """Index of the closed surface that a triangle is part of, -1 for none; a camera outside sees no back of it."""
     face_colors: Float[Tensor, "3 F"]

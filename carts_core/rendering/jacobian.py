@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..surface import NORMALS
+from ..model.surface import NORMALS
 from .jacobian_numba import fill_jacobian
 from .points import VisiblePoints
 

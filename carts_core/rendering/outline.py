@@ -36,7 +36,7 @@ class Outline:
     normal: Float[Tensor, "2 K"]
     """Unit vectors, outwards."""
     parts: Int[Tensor, " K"]
-    """Index into `carts_core.parts.PARTS`."""
+    """Index into `carts_core.model.parts.PARTS`."""
     motion: Float[Tensor, "unknowns K"]
     """Along the normal [px per unit of each unknown]."""
 

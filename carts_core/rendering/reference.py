@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..scene import Light
+from ..model.scene import Light
 from .visibility_numba import BACKGROUND, NEAR
 
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..scene import Scene, SceneState
-from ..surface import SURFACE_CHANNELS
+from ..model.scene import Scene, SceneState
+from ..model.surface import SURFACE_CHANNELS
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .jacobian import Tangents, map_jacobian
 from .motion import carry_motion
@@ -133,7 +133,7 @@ class Renderer:
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
-        """Surface maps of all hypotheses, see `carts_core.surface`, and nothing else."""
+        """Surface maps of all hypotheses, see `carts_core.model.surface`, and nothing else."""
         Ts, intrinsics = self._views(state)
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
         face_ids, inverse_depth = self._visibility(views_T, views_K)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..scene import Light
+from ..model.scene import Light
 
 
 def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..surface import NORMALS, SURFACE_CHANNELS
+from ..model.surface import NORMALS, SURFACE_CHANNELS
 from .jacobian import JacobianBlock
 
 
@@ -15,7 +15,7 @@ class SurfaceRendering:
     """Surface maps of all cameras, without autograd."""
 
     maps: Float[Tensor, "cameras 6 height width"]
-    """See `carts_core.surface`."""
+    """See `carts_core.model.surface`."""
     image: Float[Tensor, "cameras 3 height width"]
     """Shaded, linear RGB in [0, 1]."""
     jacobian: tuple[JacobianBlock, ...]
@@ -23,8 +23,8 @@ class SurfaceRendering:
 
 
 def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, "6 K"]:
-    """Surface map where points are seen, from their parts (index into `carts_core.parts.PARTS`) and their normals,
-    which point to the camera."""
+    """Surface map where points are seen, from their parts (index into `carts_core.model.parts.PARTS`) and their
+    normals, which point to the camera."""
     values = normal.new_zeros(SURFACE_CHANNELS, len(parts))
     values[parts, torch.arange(len(parts), device=parts.device)] = 1.0
     values[NORMALS] = normal

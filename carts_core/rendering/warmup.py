@@ -5,10 +5,10 @@ Both are kept on disk, so that the first picture does not wait for them.
 
 import numpy as np
 
-from ..camera import Camera
+from ..model.camera import Camera
+from ..model.robot import Robot
+from ..model.scene import Arm, Scene
 from ..resources import shipped_robot
-from ..robot import Robot
-from ..scene import Arm, Scene
 from .renderer import Renderer
 
 

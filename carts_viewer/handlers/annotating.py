@@ -6,11 +6,11 @@ from dataclasses import replace
 from functools import singledispatchmethod
 
 from carts_core.errors import CartsError
-from carts_core.keypoints import project_keypoints
+from carts_core.model.keypoints import project_keypoints
+from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import LONGEST_NOTE
-from carts_core.scene import SceneState
 from carts_viewer import intents
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun

@@ -12,8 +12,8 @@ from jaxtyping import Bool
 from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, mask_png
 from carts_core.files import OutputPath, file_name, output_path
+from carts_core.model.scene import SceneState
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
-from carts_core.scene import SceneState
 from carts_viewer import intents
 from carts_viewer.archive import zipped
 from carts_viewer.checks import unknown

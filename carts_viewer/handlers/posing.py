@@ -4,8 +4,8 @@ import math
 from functools import singledispatchmethod
 
 from carts_core.errors import CartsError
+from carts_core.model.scene import SceneState
 from carts_core.project import Key
-from carts_core.scene import SceneState
 from carts_viewer import intents
 from carts_viewer.checks import clamped, finite, unknown
 from carts_viewer.context import Context, OpenRun

@@ -9,16 +9,7 @@ import numpy as np
 
 from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
-from carts_core.project import (
-    Edits,
-    Figures,
-    Key,
-    Keyframe,
-    ProjectState,
-    Review,
-    ReviewState,
-    between_kept,
-)
+from carts_core.project import Edits, Figures, Key, Keyframe, ProjectState, Review, ReviewState, between_kept
 from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.checks import unknown

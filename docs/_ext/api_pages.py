@@ -6,25 +6,24 @@ from collections.abc import Iterator
 from types import ModuleType
 
 PUBLIC = (
-    "camera",
-    "data",
-    "dvrk_model",
     "errors",
     "evaluation",
     "export",
-    "features",
-    "keypoints",
-    "losses",
+    "model.camera",
+    "model.dvrk_model",
+    "model.keypoints",
+    "model.perturbation",
+    "model.psm_kinematics",
+    "model.robot",
+    "model.scene",
+    "networks",
     "optimization",
-    "perturbation",
     "project",
-    "psm_kinematics",
     "recording",
+    "recording.importing",
     "rendering",
     "resources",
-    "robot",
-    "scene",
-    "synthesis",
+    "lab.synthesis",
 )
 """What others may import from `carts_core`, besides the settings, which have a page of their own."""
 

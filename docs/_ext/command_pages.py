@@ -7,7 +7,7 @@ import typing
 
 import tyro
 
-from carts_core import cli
+from carts_core.cli import command_line as cli
 
 WIDTH = 88
 """Columns of the help text."""

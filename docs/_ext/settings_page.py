@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import typing
+from pathlib import Path
 
 from sphinx.pycode import ModuleAnalyzer
 
@@ -50,7 +51,7 @@ def _default(field: dataclasses.Field) -> str:
         return f"{type(value).__name__}(...)"
     if isinstance(value, tuple) and value and all(dataclasses.is_dataclass(one) for one in value):
         return f"({', '.join(type(one).__name__ for one in value)})"
-    return value.name if hasattr(value, "parent") and hasattr(value, "name") else repr(value)
+    return value.name if isinstance(value, Path) else repr(value)
 
 
 def _code(text: str) -> str:

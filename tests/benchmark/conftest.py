@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.benchmark import Benchmark, ResultsFile, Scope, Source, methods, plan
-from carts_core.data import Sequence
-from carts_core.features import FeatureExtractor
 from carts_core.files import output_path
+from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, methods, plan
+from carts_core.lab.synthesis import DOMAINS
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import SolverSettings
-from carts_core.synthesis import DOMAINS
+from carts_core.recording import Sequence
 
 TINY = Scope(
     frames=1,

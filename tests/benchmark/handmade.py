@@ -1,6 +1,6 @@
 """Measurements made by hand."""
 
-from carts_core.benchmark import Measurement, Run, Score
+from carts_core.lab.benchmark import Measurement, Run, Score
 
 
 def make_measurement(

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.benchmark import QUICK, plan, room_sources
-from carts_core.benchmark.another_room import AnotherRoom, pasted
-from carts_core.benchmark.rooms import Room, made_rooms, photographs
-from carts_core.data import Sequence
 from carts_core.errors import SettingsError
+from carts_core.lab.benchmark import QUICK, plan, room_sources
+from carts_core.lab.benchmark.another_room import AnotherRoom, pasted
+from carts_core.lab.benchmark.rooms import Room, made_rooms, photographs
+from carts_core.recording import Sequence
 
 SIZE = {"width": 160, "height": 120}
 GREEN = Room("green", "tuning", lambda width, height: np.full((height, width, 3), (40, 160, 90), np.uint8))

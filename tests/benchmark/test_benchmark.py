@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from carts_core.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
-from carts_core.benchmark.runner import _Bench
-from carts_core.cli import BAD_INPUT, main
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import output_path
+from carts_core.lab.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
+from carts_core.lab.benchmark.runner import _Bench
 
 QUIET = Console(quiet=True)
 RUNS = 46
@@ -183,7 +183,7 @@ def test_measurements_of_other_settings_weights_or_code_are_not_used(
     other.extractor.sha256 = "0" * 64
     changed = Benchmark(other.scope, other.sources.values(), other.extractor, other.results, other.runs)
     assert not set(changed.runs.values()) & set(reference.values())
-    monkeypatch.setattr("carts_core.benchmark.fingerprints.code_fingerprint", lambda: "edited")
+    monkeypatch.setattr("carts_core.lab.benchmark.fingerprints.code_fingerprint", lambda: "edited")
     assert not set(tiny_benchmark().runs.values()) & set(reference.values())
 
 
@@ -194,9 +194,9 @@ def test_a_killed_benchmark_leaves_lines_that_are_all_valid(tmp_path: Path, tiny
         "import sys\n"
         "from pathlib import Path\n"
         "from rich.console import Console\n"
-        "from carts_core.benchmark import Benchmark, QUICK, ResultsFile, Run, Source\n"
-        "from carts_core.data import Sequence\n"
-        "from carts_core.features import FeatureExtractor\n"
+        "from carts_core.lab.benchmark import Benchmark, QUICK, ResultsFile, Run, Source\n"
+        "from carts_core.recording import Sequence\n"
+        "from carts_core.networks import FeatureExtractor\n"
         "from carts_core.files import output_path\n"
         "source = Source('synthetic', 'tiny', 'left', [0], 'tiny', lambda progress: Sequence.open(sys.argv[1]))\n"
         "runs = [Run('synthetic', 'regular', 0, 'start', float(error)) for error in range(int(sys.argv[3]))]\n"

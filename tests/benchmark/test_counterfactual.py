@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.benchmark import QUICK, real_source, sources
-from carts_core.benchmark import backdrop as backdrop_module
-from carts_core.benchmark.backdrop import backdrop
-from carts_core.benchmark.counterfactual import Counterfactual
-from carts_core.benchmark.real_surface import DISTANCE, RealSurface
-from carts_core.data import Sequence
 from carts_core.errors import CartsError, SettingsError
-from carts_core.synthesis import DOMAINS, path_tracer
-from carts_core.synthesis.tissue import Tissue
+from carts_core.lab.benchmark import QUICK, real_source, sources
+from carts_core.lab.benchmark import backdrop as backdrop_module
+from carts_core.lab.benchmark.backdrop import backdrop
+from carts_core.lab.benchmark.counterfactual import Counterfactual
+from carts_core.lab.benchmark.real_surface import DISTANCE, RealSurface
+from carts_core.lab.synthesis import DOMAINS, path_tracer
+from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.recording import Sequence
 
 SIZE = {"width": 160, "height": 120}
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.benchmark.occlusion import SHARE, occlude
-from carts_core.data import Sequence
+from carts_core.lab.benchmark.occlusion import SHARE, occlude
+from carts_core.recording import Sequence
 
 
 @pytest.fixture

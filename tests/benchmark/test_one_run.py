@@ -11,10 +11,10 @@ import torch
 from handmade import make_measurement
 from tiny import tiny_scene
 
-from carts_core.benchmark import Measurement, Run, Score
-from carts_core.benchmark.frame import start_of, tip_depth_error_mm
-from carts_core.data import Sequence
-from carts_core.robot import Robot
+from carts_core.lab.benchmark import Measurement, Run, Score
+from carts_core.lab.benchmark.frame import start_of, tip_depth_error_mm
+from carts_core.model.robot import Robot
+from carts_core.recording import Sequence
 
 
 def test_a_measurement_survives_its_json_line() -> None:

@@ -2,10 +2,10 @@
 
 import pytest
 
-from carts_core.benchmark import FULL, QUICK, Run, Source, plan
-from carts_core.data import Sequence
 from carts_core.errors import SettingsError
-from carts_core.synthesis import DOMAINS
+from carts_core.lab.benchmark import FULL, QUICK, Run, Source, plan
+from carts_core.lab.synthesis import DOMAINS
+from carts_core.recording import Sequence
 
 METHODS = ("unet", "start", "l1", "paper", "ours")
 

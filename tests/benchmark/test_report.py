@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from handmade import make_measurement
 
-from carts_core.benchmark import Facts, Measurement, Run, Score, write_report
-from carts_core.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
-from carts_core.benchmark.accuracy_targets import accuracy_targets
-from carts_core.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
-from carts_core.benchmark.speed_tables import pair_table, worse_table
-from carts_core.benchmark.statistics import Measurements
 from carts_core.files import output_path
-from carts_core.synthesis import DOMAINS
+from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_report
+from carts_core.lab.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
+from carts_core.lab.benchmark.accuracy_targets import accuracy_targets
+from carts_core.lab.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
+from carts_core.lab.benchmark.speed_tables import pair_table, worse_table
+from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.synthesis import DOMAINS
 
 FACTS = Facts("quick", 200, {"synthetic": "seed 5 <b>"}, "abc", "def", "0.1")
 

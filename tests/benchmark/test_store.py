@@ -4,8 +4,8 @@ from pathlib import Path
 
 from handmade import make_measurement
 
-from carts_core.benchmark import ResultsFile
 from carts_core.files import output_path
+from carts_core.lab.benchmark import ResultsFile
 
 
 def test_what_was_appended_is_found_again_under_its_fingerprint_only(tmp_path: Path) -> None:

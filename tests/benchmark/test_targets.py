@@ -4,9 +4,9 @@ from dataclasses import replace
 
 from handmade import make_measurement
 
-from carts_core.benchmark import Measurement, Target, targets
-from carts_core.benchmark.statistics import Measurements
-from carts_core.synthesis import DOMAINS
+from carts_core.lab.benchmark import Measurement, Target, targets
+from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.synthesis import DOMAINS
 
 
 def _target(start: str, *measurements) -> Target:

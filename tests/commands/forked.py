@@ -10,9 +10,8 @@ import sys
 import threading
 from pathlib import Path
 
-from carts_core.cli import main
-from carts_core.commands import calibrate, optimizing, render, train
-from carts_core.features import training
+from carts_core.cli import calibrate, main, optimizing, render, train
+from carts_core.lab.training import training
 from carts_core.optimization import CalibrationOptimizer, SequenceOptimizer
 
 LOADED = (calibrate, optimizing, render, train, training, CalibrationOptimizer, SequenceOptimizer)

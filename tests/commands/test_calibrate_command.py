@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.data import Sequence, calibrated_sequence_file
+from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.recording import Sequence, calibrated_sequence_file
 
 CAUTION = "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame"
 QUICK = ["--frames", "spread:2", "--settings", "iterations=3"]

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.commands.selection import parse_frames
+from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.cli.selection import parse_frames
 from carts_core.errors import SettingsError
 
 SCORE_KEYS = {

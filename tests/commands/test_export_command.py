@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.data import Sequence
-from carts_core.data.images import read_image, read_mask
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.export import FORMATS, FormatName, KinematicsRow, kinematics_csv
+from carts_core.recording import Sequence
+from carts_core.recording.images import read_image, read_mask
 
 _REPEATED = """
 import sys

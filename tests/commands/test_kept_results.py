@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.features.weights import read_weights, save_weights
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import locked_folder
+from carts_core.networks.weights import read_weights, save_weights
 from carts_core.resources import shipped_robot, shipped_weights
 
 Outcome = Callable[..., str]

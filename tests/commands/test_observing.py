@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.features.extractor import FeatureExtractor
+from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.networks.extractor import FeatureExtractor
 
 CAUTION = "Dice is against the masks that were fitted"
 

@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 import pytest
 
-from carts_core.cli import BAD_INPUT
+from carts_core.cli.command_line import BAD_INPUT
 
 HEAVY = {"torch", "numba", "cv2", "kornia", "scipy", "trimesh", "matplotlib", "viser", "mitsuba"}
 COMMANDS = ("view", "optimize", "evaluate", "calibrate", "render", "export", "synthesize", "train", "bench")
@@ -20,7 +20,7 @@ def _answer(*arguments: str) -> tuple[int, str, set[str]]:
     lines = finished.stderr.splitlines()
     modules = {line.rpartition("|")[2].strip() for line in lines if line.startswith("import time:")}
     errors = [line for line in lines if not line.startswith("import time:")]
-    assert "carts_core.cli" in modules or "carts_core.commands.optimize" in modules
+    assert "carts_core.cli" in modules or "carts_core.cli.optimize" in modules
     return finished.returncode, " ".join((finished.stdout + "\n".join(errors)).split()), modules
 
 

@@ -17,8 +17,8 @@ import cv2
 import pytest
 
 from carts_core.cli import main
-from carts_core.features.checkpoint import load_checkpoint
-from carts_core.features.weights import read_weights
+from carts_core.lab.training.checkpoint import load_checkpoint
+from carts_core.networks.weights import read_weights
 
 POLITE = [signal.SIGTERM, signal.SIGHUP]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}

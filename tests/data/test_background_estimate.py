@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from carts_core.data.background import estimate_background, fill, spread, widen
 from carts_core.errors import SequenceError
+from carts_core.recording.background import estimate_background, fill, spread, widen
 
 RNG = np.random.default_rng(5)
 SCENE = RNG.integers(30, 220, (60, 80, 3)).astype(np.uint8)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.data import FrameReader, Sequence
-from carts_core.data import frame_reader as module
 from carts_core.errors import SequenceError
+from carts_core.recording import FrameReader, Sequence
+from carts_core.recording import frame_reader as module
 
 FRAMES = 60
 MAIN = threading.current_thread()

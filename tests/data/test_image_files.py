@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.data.images import read_image, read_mask
 from carts_core.errors import SequenceError
+from carts_core.recording.images import read_image, read_mask
 
 RNG = np.random.default_rng(3)
 PICTURE = cv2.GaussianBlur(RNG.integers(0, 256, (90, 120, 3), dtype=np.uint8), (9, 9), 0)

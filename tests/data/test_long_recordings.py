@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from carts_core.data import Sequence
+from carts_core.recording import Sequence
 from tools.bench_recordings import browse, make_recording, open_seconds
 
 FRAMES = 60
@@ -31,9 +31,9 @@ def test_opening_decodes_no_image(recording, monkeypatch):
     def refuse(*arguments: object):
         raise AssertionError("an image was decoded")
 
-    monkeypatch.setattr("carts_core.data.images.cv2.imdecode", refuse)
-    monkeypatch.setattr("carts_core.data.video_index.decoded_frames", refuse)
-    monkeypatch.setattr("carts_core.data.video.decoded_frames", refuse)
+    monkeypatch.setattr("carts_core.recording.images.cv2.imdecode", refuse)
+    monkeypatch.setattr("carts_core.recording.video_index.decoded_frames", refuse)
+    monkeypatch.setattr("carts_core.recording.video.decoded_frames", refuse)
     for path in recording.values():
         sequence = Sequence.open(path)
         with pytest.raises(AssertionError, match="an image was decoded"):
@@ -41,8 +41,8 @@ def test_opening_decodes_no_image(recording, monkeypatch):
 
 
 def test_browsing_keeps_no_more_than_the_cache_may_hold(recording, monkeypatch):
-    monkeypatch.setattr("carts_core.data.sequence.CACHE_BYTES", 10 * IMAGE_BYTES)
-    monkeypatch.setattr("carts_core.data.frame_reader.CACHE_BYTES", 10 * IMAGE_BYTES)
+    monkeypatch.setattr("carts_core.recording.sequence.CACHE_BYTES", 10 * IMAGE_BYTES)
+    monkeypatch.setattr("carts_core.recording.frame_reader.CACHE_BYTES", 10 * IMAGE_BYTES)
     for path in recording.values():
         sequence = Sequence.open(path)
         times, memory = browse(sequence, range(FRAMES))

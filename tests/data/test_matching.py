@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from videos import write_timed_video
 
-from carts_core.data import Sequence
 from carts_core.errors import SequenceError
+from carts_core.recording import Sequence
 
 ROWS = np.arange(0.0, 2.0, 0.01)
 """Times of the table's rows [s]."""

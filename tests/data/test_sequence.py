@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.camera import Camera
-from carts_core.data import Sequence
-from carts_core.data.images import read_image
+from carts_core.model.camera import Camera
+from carts_core.recording import Sequence
+from carts_core.recording.images import read_image
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 
@@ -258,7 +258,7 @@ def test_a_background_is_estimated_once_per_camera_and_domain(tiny_sequence, mon
     sequence = Sequence.open(tiny_sequence(domains=("regular", "dark")))
     regular, dark = sequence.background("left"), sequence.background("left", "dark")
     assert dark.mean() < 0.7 * regular.mean()
-    monkeypatch.setattr("carts_core.data.sequence.background_of_recording", None)
+    monkeypatch.setattr("carts_core.recording.sequence.background_of_recording", None)
     regular[:] = 0
     assert sequence.background("left").any()
 

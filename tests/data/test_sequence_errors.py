@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.data import Sequence
 from carts_core.errors import RobotError, SequenceError
+from carts_core.recording import Sequence
 from carts_core.resources import shipped_robot
 
 Edit = Callable[[str], str]

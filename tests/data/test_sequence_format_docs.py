@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from videos import write_timed_video
 
-from carts_core.data import Sequence
-from carts_core.data.matching import TimeMatching
+from carts_core.recording import Sequence
+from carts_core.recording.matching import TimeMatching
 from carts_core.resources import shipped_robot
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "sequence_format.md"

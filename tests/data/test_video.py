@@ -9,11 +9,11 @@ import pytest
 from av.video.frame import PictureType
 from videos import write_timed_video
 
-from carts_core.data import Sequence
-from carts_core.data.images import read_image
-from carts_core.data.video import Video
-from carts_core.data.video_index import index_video, open_video
 from carts_core.errors import SequenceError
+from carts_core.recording import Sequence
+from carts_core.recording.images import read_image
+from carts_core.recording.video import Video
+from carts_core.recording.video_index import index_video, open_video
 
 FRAMES = 150
 SIZE = (96, 72)
@@ -99,7 +99,7 @@ def test_a_timed_video_is_what_its_name_says(timed_video):
 
 @pytest.mark.parametrize("kept_bytes", [1, 32 * 2**20])
 def test_with_reordered_frames_each_is_the_one_asked_for(timed_video, kept_bytes, monkeypatch):
-    monkeypatch.setattr("carts_core.data.video._KEPT_BYTES", kept_bytes)
+    monkeypatch.setattr("carts_core.recording.video._KEPT_BYTES", kept_bytes)
     video = Video(timed_video, tuple(range(FRAMES)))
     jumps = np.random.default_rng(1).integers(0, FRAMES, 40).tolist()
     order = [FRAMES - 1, *range(0, FRAMES, 3), *range(FRAMES - 1, -1, -5), *jumps]
@@ -176,7 +176,7 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
         container, stream = open_video(path)
         return Inexact(container), stream
 
-    monkeypatch.setattr("carts_core.data.video.open_video", inexact)
+    monkeypatch.setattr("carts_core.recording.video.open_video", inexact)
     video = Video(path, tuple(range(FRAMES)))
     order = [100, 3, 77, 76, 0, 149]
     assert [number_of(video.read(index)) for index in order] == order

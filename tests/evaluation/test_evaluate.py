@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.data import Sequence
 from carts_core.evaluation import evaluate, evaluate_sequence
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FreeParameters, SequenceSettings, SurfaceSolver
+from carts_core.recording import Sequence
 
 
 @pytest.mark.parametrize("together", [False, True])

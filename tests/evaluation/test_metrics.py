@@ -5,8 +5,8 @@ import pytest
 from tiny import tiny_scene
 
 from carts_core.evaluation import dice, joint_mae_deg, normalized_surface_distance
-from carts_core.perturbation import perturb
-from carts_core.robot import Robot
+from carts_core.model.perturbation import perturb
+from carts_core.model.robot import Robot
 
 
 def test_dice_of_equal_disjoint_and_half_overlapping_masks() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from awkward import ARMS, CAMERA, SOURCES, awkward
 
-from carts_core.data import Sequence
 from carts_core.export import Dataset, ExportFrame, Monitor, measured_frames
+from carts_core.recording import Sequence
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from awkward import ARMS, CAMERA, all_views, expected_masks
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError, SequenceError, SettingsError
 from carts_core.export import Dataset, KinematicsRow, corrected_frames, measured_frames
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 
 

@@ -13,8 +13,8 @@ from awkward import ARMS, CAMERA, SOURCES, Masks, all_views, assert_same_masks, 
 from PIL import Image
 from pycocotools.coco import COCO
 
-from carts_core.data.images import read_image
 from carts_core.export import Dataset, export
+from carts_core.recording.images import read_image
 
 
 def _read_coco(folder: Path) -> tuple[Any, Masks]:

@@ -14,7 +14,7 @@ from carts_core.errors import SequenceError
 from carts_core.export import Dataset, FormatName, export, read_kinematics_csv
 from carts_core.export.kinematics import joint_columns, kinematics_csv
 from carts_core.export.video import frame_rate
-from carts_core.recording import read_base_frames
+from carts_core.recording.importing import read_base_frames
 
 
 def _positions(dataset: Dataset) -> np.ndarray:

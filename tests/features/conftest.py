@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from carts_core.features.domain_randomization import ImageSettings, PairGenerator, TrainingPair
-from carts_core.features.network import FeatureNetwork
-from carts_core.features.weights import save_weights
-from carts_core.robot import Robot
+from carts_core.lab.randomization import ImageSettings, PairGenerator, TrainingPair
+from carts_core.model.robot import Robot
+from carts_core.networks.network import FeatureNetwork
+from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.features.domain_randomization import (
+from carts_core.lab.randomization import (
     BACKGROUND,
     HEAD,
     SHAFT,
@@ -16,17 +16,17 @@ from carts_core.features.domain_randomization import (
     TrainingPair,
     variants,
 )
-from carts_core.features.domain_randomization.backgrounds import MAKERS, random_background
-from carts_core.features.domain_randomization.clutter import contact_shadow
-from carts_core.features.domain_randomization.gbuffer import render_gbuffer
-from carts_core.features.domain_randomization.geometry import RobotGeometry
-from carts_core.features.domain_randomization.lens import tone
-from carts_core.features.domain_randomization.occluders import occlude
-from carts_core.features.domain_randomization.photographs import Photographs
-from carts_core.features.domain_randomization.placement import perturbed, random_intrinsics, random_placement
-from carts_core.features.domain_randomization.shading import shade
-from carts_core.features.domain_randomization.things import add_things, random_thing
-from carts_core.robot import Robot
+from carts_core.lab.randomization.backgrounds import MAKERS, random_background
+from carts_core.lab.randomization.clutter import contact_shadow
+from carts_core.lab.randomization.gbuffer import render_gbuffer
+from carts_core.lab.randomization.geometry import RobotGeometry
+from carts_core.lab.randomization.lens import tone
+from carts_core.lab.randomization.occluders import occlude
+from carts_core.lab.randomization.photographs import Photographs
+from carts_core.lab.randomization.placement import perturbed, random_intrinsics, random_placement
+from carts_core.lab.randomization.shading import shade
+from carts_core.lab.randomization.things import add_things, random_thing
+from carts_core.model.robot import Robot
 from carts_core.settings import DARKEST_BRIGHTNESS
 
 SIZE = (192, 160)

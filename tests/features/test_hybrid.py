@@ -1,6 +1,6 @@
 import torch
 
-from carts_core.features import hybrid
+from carts_core.networks import hybrid
 
 
 def test_a_hybrid_shows_the_rendering_inside_the_silhouette_and_the_background_outside():

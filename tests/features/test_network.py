@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.features.network import FeatureNetwork, standardize
+from carts_core.networks.network import FeatureNetwork, standardize
 from carts_core.settings import Architecture
 
 

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError, WeightsError
-from carts_core.features import FeatureExtractor
-from carts_core.features.checkpoint import CHECKPOINT_FILE, load_checkpoint
-from carts_core.features.domain_randomization import ImageSettings
-from carts_core.features.loader import training_batches, validation_set
-from carts_core.features.training import TrainingProgress, schedule, train
-from carts_core.features.weights import read_weights
+from carts_core.lab.randomization import ImageSettings
+from carts_core.lab.training.checkpoint import CHECKPOINT_FILE, load_checkpoint
+from carts_core.lab.training.loader import training_batches, validation_set
+from carts_core.lab.training.training import TrainingProgress, schedule, train
+from carts_core.networks import FeatureExtractor
+from carts_core.networks.weights import read_weights
 from carts_core.settings import Architecture, TrainingConfig
 
 SMALL = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from planted import contents, treasure
 
-from carts_core.cli import BAD_INPUT, main
+from carts_core.cli.command_line import BAD_INPUT, main
 
 PARTS = [
     *("..", ".", "/", "//", "\\", "~", "home", "out", "tmp", "\0", "\n", "\t", "\x1b[2J", "\x7f", "\u2028", "\u202e"),

@@ -13,13 +13,13 @@ READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt", "fromfi
 ALLOWED = {
     "files": "decides what may be read",
     "project": "reads its own database, lock and log",
-    "benchmark": "reads its own results, its source, and the machine's description",
-    "synthesis": "reads what it wrote",
-    "commands/frame_folder.py": "reads what an earlier run of the same command wrote",
-    "commands/result_records.py": "reads what an earlier run of the same command wrote",
+    "lab/benchmark": "reads its own results, its source, and the machine's description",
+    "lab/synthesis": "reads what it wrote",
+    "cli/frame_folder.py": "reads what an earlier run of the same command wrote",
+    "cli/result_records.py": "reads what an earlier run of the same command wrote",
     "checkpoint.py": "reads what an earlier run of the same command wrote",
     "fingerprints.py": "reads the source of the package",
-    "recording/writing.py": "reads back the sequence that it writes",
+    "recording/importing/writing.py": "reads back the sequence that it writes",
 }
 
 

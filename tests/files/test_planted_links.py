@@ -10,9 +10,9 @@ import pytest
 from planted import PLANTED, PRECIOUS, contents, plant, treasure
 from tracing import places, traced
 
-from carts_core.cli import BAD_INPUT, main
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
-from carts_core.features.training import train
+from carts_core.lab.training.training import train
 from carts_core.settings import Architecture, ImageSettings, TrainingConfig
 
 QUICK = ["--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"]

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.data.images import read_image
-from carts_core.data.toml_table import read_toml
-from carts_core.data.video_index import index_video
 from carts_core.errors import CartsError, RobotError, SequenceError, WeightsError
-from carts_core.features.weights import read_weights
 from carts_core.files.reading import Kind, RefusedFileError, parse_json, parse_toml, read_bytes
-from carts_core.mesh_files import mesh_path, read_mesh
-from carts_core.robot import Robot
+from carts_core.model.mesh_files import mesh_path, read_mesh
+from carts_core.model.robot import Robot
+from carts_core.networks.weights import read_weights
+from carts_core.recording.images import read_image
+from carts_core.recording.toml_table import read_toml
+from carts_core.recording.video_index import index_video
 
 SMALL = Kind("note", 10)
 READERS: dict[str, Callable[[Path], object]] = {

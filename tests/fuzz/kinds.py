@@ -11,15 +11,15 @@ import numpy as np
 import torch
 import trimesh
 
-from carts_core.data import Sequence
-from carts_core.data.images import read_image, read_mask
-from carts_core.data.video import Video
-from carts_core.data.video_index import index_video
 from carts_core.export.kinematics import KinematicsRow, kinematics_csv, read_kinematics_csv
-from carts_core.features.checkpoint import History, load_checkpoint, save_checkpoint
-from carts_core.features.network import FeatureNetwork
-from carts_core.features.weights import read_weights, save_weights
-from carts_core.robot import Robot
+from carts_core.lab.training.checkpoint import History, load_checkpoint, save_checkpoint
+from carts_core.model.robot import Robot
+from carts_core.networks.network import FeatureNetwork
+from carts_core.networks.weights import read_weights, save_weights
+from carts_core.recording import Sequence
+from carts_core.recording.images import read_image, read_mask
+from carts_core.recording.video import Video
+from carts_core.recording.video_index import index_video
 from carts_core.settings import Architecture
 from fuzz.mutations import mutated_bytes, mutated_png, mutated_safetensors, mutated_text
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch.nn import functional
 
-from carts_core.data import Sequence
+from carts_core.imaging.window import Window
+from carts_core.model.scene import SceneState
 from carts_core.optimization import ImagePredictor
-from carts_core.optimization.window import Window
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.scene import SceneState
 from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import Stage
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.data import Sequence
 from carts_core.evaluation import start_positions
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer
+from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 
 REAL = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"

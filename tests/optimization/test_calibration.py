@@ -10,8 +10,9 @@ import roma
 import torch
 from torch.nn import functional
 
-from carts_core.data import Frame, Sequence
 from carts_core.errors import RobotError, SettingsError
+from carts_core.imaging.window import Window
+from carts_core.model.scene import Scene
 from carts_core.optimization import (
     CALIBRATION,
     CALIBRATION_SETTINGS,
@@ -23,9 +24,8 @@ from carts_core.optimization import (
 from carts_core.optimization.calibration import with_fixed_gauge
 from carts_core.optimization.calibration_problem import frame_weights
 from carts_core.optimization.elimination import eliminate
-from carts_core.optimization.window import Window
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
-from carts_core.scene import Scene
 from carts_core.settings.stages import Descend, Observe
 
 FRAMES, SIZE = 6, (320, 240)

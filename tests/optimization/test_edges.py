@@ -9,15 +9,15 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor, with_stage, without
 
-from carts_core.data import Sequence
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice, start_positions
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.optimization.edge_alignment import align_edges
 from carts_core.optimization.factors import Linearization, Prior
 from carts_core.optimization.factors.edges import EdgeFactor
 from carts_core.optimization.variables import Variables
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 from carts_core.settings import SurfaceSolver

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.benchmark.another_room import AnotherRoom
-from carts_core.benchmark.rooms import made_rooms
-from carts_core.data import Sequence
 from carts_core.evaluation import dice
-from carts_core.features import FeatureExtractor
+from carts_core.imaging.window import Window
+from carts_core.lab.benchmark.another_room import AnotherRoom
+from carts_core.lab.benchmark.rooms import made_rooms
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor
 from carts_core.optimization.counterfactual import Background, without_background
 from carts_core.optimization.frame_images import FrameImages
-from carts_core.optimization.window import Window
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.scene import Scene
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 SIZE = {"width": 320, "height": 240}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from carts_core.data import Frame, Sequence
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import Loss, solver
 from carts_core.settings.optimization import Method

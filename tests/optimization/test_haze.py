@@ -4,8 +4,8 @@ from pathlib import Path
 
 import torch
 
-from carts_core.data import Sequence
-from carts_core.optimization.haze import certainty, dehazed, transmission
+from carts_core.imaging.haze import certainty, dehazed, transmission
+from carts_core.recording import Sequence
 
 
 def image_of(sequence: Sequence, domain: str) -> torch.Tensor:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.data import Sequence
-from carts_core.features import FeatureExtractor
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, SurfaceSolver, propose_ignore
-from carts_core.scene import Scene
+from carts_core.recording import Sequence
 from carts_core.settings import presets
 
 WIDTH, HEIGHT = 320, 240

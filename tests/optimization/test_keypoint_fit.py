@@ -8,10 +8,10 @@ import torch
 from tiny import TinyScene, tiny_scene
 
 from carts_core.errors import RobotError, SettingsError
-from carts_core.keypoints import keypoints, project_keypoints
+from carts_core.model.keypoints import keypoints, project_keypoints
+from carts_core.model.perturbation import perturb
+from carts_core.model.robot import Robot
 from carts_core.optimization.keypoints import KeypointSettings, Pin, fit_keypoints
-from carts_core.perturbation import perturb
-from carts_core.robot import Robot
 
 TRUTH = np.array([0.1, -0.05, 0.16, 0.4, 0.3, -0.3, 0.4])
 """[rad, m]; no joint at a limit, and the wrist bent so that its joints can be told apart."""

@@ -10,9 +10,11 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor
 
-from carts_core.data import Frame, Sequence
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
+from carts_core.imaging.window import Window
+from carts_core.model.perturbation import perturb
+from carts_core.model.surface import COVERAGE
 from carts_core.optimization import (
     Backgrounds,
     CalibrationOptimizer,
@@ -21,11 +23,9 @@ from carts_core.optimization import (
     SequenceOptimizer,
     SurfaceSolver,
 )
-from carts_core.optimization.window import Window
-from carts_core.perturbation import perturb
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import FreeParameters
-from carts_core.surface import COVERAGE
 
 SIZE = {"width": 320, "height": 240}
 

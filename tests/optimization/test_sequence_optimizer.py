@@ -10,7 +10,6 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor
 
-from carts_core.data import Frame, Sequence
 from carts_core.errors import RobotError, SequenceError, SettingsError
 from carts_core.optimization import (
     DescentSolver,
@@ -24,6 +23,7 @@ from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.initialization import initial_correction
 from carts_core.optimization.measurement import FrameSolver, Measurement
 from carts_core.optimization.variables import Variables
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import presets
 from carts_core.settings.stages import AlignEdges

@@ -9,14 +9,14 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor
 
-from carts_core.data import Sequence
+from carts_core.imaging.window import Window
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.evaluation import Evaluation
 from carts_core.optimization.fit import Fit, StopReason
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.stages import run_stage, run_stages
 from carts_core.optimization.variables import Variables
-from carts_core.optimization.window import Window
+from carts_core.recording import Sequence
 from carts_core.settings import FreeParameters as Free
 from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, PreferStart, RandomRestart, Stage

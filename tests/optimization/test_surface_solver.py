@@ -10,30 +10,22 @@ import torch
 from perfect_predictor import PerfectPredictor, with_stage, without
 from torch.nn import functional
 
-from carts_core.data import Sequence
 from carts_core.evaluation import dice, start_positions
-from carts_core.features import FeatureExtractor
+from carts_core.imaging.window import Window
+from carts_core.model.scene import Scene
+from carts_core.model.surface import COVERAGE
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors.surface import SurfaceFactor
 from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.observation import Observation
 from carts_core.optimization.variables import Variables
-from carts_core.optimization.window import Window
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
-from carts_core.scene import Scene
 from carts_core.settings import presets
-from carts_core.settings.stages import (
-    AlignEdges,
-    Descend,
-    Evaluate,
-    Observe,
-    PreferStart,
-    RandomRestart,
-    ShaftSearch,
-)
-from carts_core.surface import COVERAGE
+from carts_core.settings.stages import AlignEdges, Descend, Evaluate, Observe, PreferStart, RandomRestart, ShaftSearch
 
 
 @pytest.fixture

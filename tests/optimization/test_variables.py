@@ -6,10 +6,10 @@ import torch
 from tiny import tiny_scene
 
 from carts_core.errors import RobotError, SettingsError
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Scene
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import Variables
-from carts_core.robot import Robot
-from carts_core.scene import Scene
 
 LENGTH_SCALE = 0.15
 

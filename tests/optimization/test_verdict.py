@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.commands.hints import verdict_hints
-from carts_core.data import Sequence
+from carts_core.cli.hints import verdict_hints
 from carts_core.evaluation import evaluate
-from carts_core.features import FeatureExtractor
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, SurfaceSolver, Verdict
 from carts_core.optimization.verdict import assess
+from carts_core.recording import Sequence
 
 CONVINCING = Evidence(
     area=0.05,

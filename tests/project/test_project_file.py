@@ -11,9 +11,9 @@ import pytest
 from project_model import HAND, IDENTITY
 from sql_file import rows
 
-from carts_core.data import Sequence
 from carts_core.errors import ProjectError
 from carts_core.project import CorrectedTransform, JointCorrection, Key, Project, Review, ReviewState
+from carts_core.recording import Sequence
 
 ACCEPTED = Review(ReviewState.ACCEPTED, "clean")
 

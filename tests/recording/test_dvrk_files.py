@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from carts_core.errors import SequenceError
 from carts_core.export.dvrk import T_DVRK_OPENCV
-from carts_core.recording import read_base_frames
+from carts_core.recording.importing import read_base_frames
 
 T_CAMERA_BASE = np.eye(4)
 T_CAMERA_BASE[:3, :3] = Rotation.from_rotvec([2.0, 0.3, -0.5]).as_matrix()

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from carts_core.errors import CartsError
-from carts_core.psm_kinematics import CLASSIC, SI, forward, inverse
-from carts_core.recording import CANDIDATES, at_times, check_instrument, clock_offset, fit_base_frame
+from carts_core.model.psm_kinematics import CLASSIC, SI, forward, inverse
+from carts_core.recording.importing import CANDIDATES, at_times, check_instrument, clock_offset, fit_base_frame
 
 
 def motion(rows: int = 200) -> np.ndarray:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.camera import Camera
-from carts_core.robot import Robot
-from carts_core.scene import Arm, Scene, SceneState
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene, SceneState
 
 _JOINTS = [0.1, -0.1, 0.13, 0.3, 0.6, -0.5, 0.7]
 _WIDTH, _HEIGHT = 96, 72

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.nn import functional
 
-from carts_core.data import Sequence
+from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.inputs import smoothed
 from carts_core.optimization.variables import APART, Variables
+from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, jacobian
-from carts_core.scene import Scene, SceneState
 
 _BLUR = 1.5
 

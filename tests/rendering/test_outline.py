@@ -8,12 +8,12 @@ import torch
 from scipy.spatial import KDTree
 from tiny import tiny_scene
 
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Outline, Renderer
 from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
-from carts_core.robot import Robot
-from carts_core.scene import Scene, SceneState
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
 

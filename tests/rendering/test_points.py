@@ -7,13 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from carts_core.data import Sequence
-from carts_core.rendering.geometry import (
-    SceneGeometry,
-    link_transforms,
-    vertices_in_camera,
-    vertices_in_camera_at_once,
-)
+from carts_core.recording import Sequence
+from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera, vertices_in_camera_at_once
 from carts_core.rendering.points import visible_points, visible_points_torch
 from carts_core.rendering.visibility_numba import rasterize
 

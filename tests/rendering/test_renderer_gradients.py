@@ -8,9 +8,9 @@ import roma
 import torch
 from tiny import tiny_scene
 
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Scene, SceneState
 from carts_core.rendering import Renderer
-from carts_core.robot import Robot
-from carts_core.scene import Scene, SceneState
 
 WIDTH, HEIGHT, SUPERSAMPLING = 640, 480, 3
 FUNCTIONALS = 6

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import torch
 
+from carts_core.model.parts import PARTS, link_parts
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Scene, SceneState
+from carts_core.model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import Variables
-from carts_core.parts import PARTS, link_parts
 from carts_core.rendering import Renderer
 from carts_core.resources import shipped_robot
-from carts_core.robot import Robot
-from carts_core.scene import Scene, SceneState
-from carts_core.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 
 
 def test_parts_are_told_by_what_moves_them(shipped_psm: Robot) -> None:

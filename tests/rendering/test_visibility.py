@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from carts_core.data import Sequence
-from carts_core.meshes import LinkMesh, is_closed
+from carts_core.model.meshes import LinkMesh, is_closed
+from carts_core.recording import Sequence
 from carts_core.rendering import visibility, visibility_torch
 from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
 from carts_core.rendering.reference import visibility_ref

@@ -5,8 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SensorConfig, SynthesisConfig, synthesize
-from carts_core.synthesis.tissue import EXTENT, Tissue
+from carts_core.lab.synthesis import (
+    EndoscopeConfig,
+    MotionConfig,
+    RenderConfig,
+    SensorConfig,
+    SynthesisConfig,
+    synthesize,
+)
+from carts_core.lab.synthesis.tissue import EXTENT, Tissue
 
 
 @pytest.fixture(scope="session")

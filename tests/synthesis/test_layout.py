@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.camera import Camera
 from carts_core.errors import RobotError
-from carts_core.robot import Robot
-from carts_core.synthesis import EndoscopeConfig, SynthesisConfig
-from carts_core.synthesis.layout import WORK_POINTS, load_robot, place_arms, place_cameras
+from carts_core.lab.synthesis import EndoscopeConfig, SynthesisConfig
+from carts_core.lab.synthesis.layout import WORK_POINTS, load_robot, place_arms, place_cameras
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
 
 ARM_URDF = """<robot name="two"><link name="a"/><link name="b"><visual><geometry><box size="0.1 0.1 0.1"/></geometry>
 </visual></link><joint name="turn" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.synthesis import MeasurementError
-from carts_core.synthesis.measurement import measure
+from carts_core.lab.synthesis import MeasurementError
+from carts_core.lab.synthesis.measurement import measure
 
 TIMES = np.arange(400) / 20.0
 

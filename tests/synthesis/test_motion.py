@@ -7,15 +7,15 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from carts_core.camera import Camera
 from carts_core.errors import SettingsError
+from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, SynthesisConfig
+from carts_core.lab.synthesis.layout import place_arms, place_cameras
+from carts_core.lab.synthesis.motion import plan_motion, reach_tip
+from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene
 from carts_core.rendering import Renderer
-from carts_core.robot import Robot
-from carts_core.scene import Arm, Scene
-from carts_core.synthesis import EndoscopeConfig, MotionConfig, SynthesisConfig
-from carts_core.synthesis.layout import place_arms, place_cameras
-from carts_core.synthesis.motion import plan_motion, reach_tip
-from carts_core.synthesis.tissue import Tissue
 
 CONFIG = SynthesisConfig(seed=11, motion=MotionConfig(frames=8, frame_rate=4.0))
 

@@ -5,16 +5,16 @@ import sys
 import numpy as np
 import pytest
 
-from carts_core.camera import Camera
 from carts_core.errors import CartsError
+from carts_core.lab.synthesis import EndoscopeConfig, RenderConfig, path_tracer
+from carts_core.lab.synthesis.layout import place_arms, place_cameras
+from carts_core.lab.synthesis.path_tracer import PathTracer
+from carts_core.lab.synthesis.stage import Stage
+from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene
 from carts_core.rendering import Renderer
-from carts_core.robot import Robot
-from carts_core.scene import Arm, Scene
-from carts_core.synthesis import EndoscopeConfig, RenderConfig, path_tracer
-from carts_core.synthesis.layout import place_arms, place_cameras
-from carts_core.synthesis.path_tracer import PathTracer
-from carts_core.synthesis.stage import Stage
-from carts_core.synthesis.tissue import Tissue
 
 JOINTS = np.array([[0.02, -0.05, 0.13, 0.3, 0.4, -0.3, 0.6]])
 

@@ -13,10 +13,10 @@ from manifold3d import Manifold
 from scipy.spatial import KDTree
 
 from carts_core.errors import RobotError
+from carts_core.lab.synthesis import psm
+from carts_core.model.robot import Robot
 from carts_core.rendering import visibility
 from carts_core.resources import shipped_robot
-from carts_core.robot import Robot
-from carts_core.synthesis import psm
 
 JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
 MESHES = sorted((shipped_robot().parent / "meshes").glob("*.ply"))
@@ -139,11 +139,11 @@ def test_a_part_that_is_empty_is_reported_by_name() -> None:
 
 
 def test_without_manifold3d_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("carts_core.synthesis.psm")]:
+    for name in [name for name in sys.modules if name.startswith("carts_core.lab.synthesis.psm")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "manifold3d", None)
     with pytest.raises(RobotError, match=r"carts\[synthesis\]"):
-        importlib.import_module("carts_core.synthesis.psm")
+        importlib.import_module("carts_core.lab.synthesis.psm")
 
 
 def _silhouette(robot: Robot, q: np.ndarray, T_camera_base: np.ndarray) -> np.ndarray:

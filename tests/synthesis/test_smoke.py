@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from carts_core.synthesis import DomainConfig
-from carts_core.synthesis.smoke import Smoke, SmokeOverlay
+from carts_core.lab.synthesis import DomainConfig
+from carts_core.lab.synthesis.smoke import Smoke, SmokeOverlay
 
 EYE = np.zeros(3)
 H, W = 60, 80

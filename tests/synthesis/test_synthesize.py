@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.data.sequence import Sequence
 from carts_core.errors import SettingsError
+from carts_core.lab.synthesis import DOMAINS, SynthesisConfig, progress_bar, synthesize
+from carts_core.recording.sequence import Sequence
 from carts_core.rendering import Renderer
-from carts_core.synthesis import DOMAINS, SynthesisConfig, progress_bar, synthesize
 
 
 def _files(folder: Path) -> dict[str, str]:

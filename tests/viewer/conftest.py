@@ -14,10 +14,10 @@ from viewer_canvas import Canvas, mark_frames
 from viewer_desk import Desk
 from viewer_tab import Tab
 
-from carts_core.data import Sequence
-from carts_core.features.network import FeatureNetwork
-from carts_core.features.weights import save_weights
+from carts_core.networks.network import FeatureNetwork
+from carts_core.networks.weights import save_weights
 from carts_core.project import Project
+from carts_core.recording import Sequence
 from carts_core.settings import Architecture
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp

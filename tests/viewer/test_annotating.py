@@ -5,7 +5,7 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError
-from carts_core.keypoints import project_keypoints
+from carts_core.model.keypoints import project_keypoints
 from carts_core.project import Figures, Project, ReviewState, Source
 from carts_viewer import intents
 from carts_viewer.marks import draw_keypoints, labelled_keypoints

@@ -19,9 +19,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from carts_core.data import Sequence
 from carts_core.errors import ProjectError, SequenceError, SettingsError
 from carts_core.project import Project, ProjectState
+from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer import editing, intents
 from carts_viewer.app import ViewerApp

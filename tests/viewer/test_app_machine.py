@@ -12,9 +12,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from many_actions import check_after_each_of_10000_actions
 from viewer_desk import Desk
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.project import Project, ReviewState, Source
+from carts_core.recording import Sequence
 from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 

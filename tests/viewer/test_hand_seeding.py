@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
 
-from carts_core.keypoints import project_keypoints
+from carts_core.model.keypoints import project_keypoints
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.marks import labelled_keypoints

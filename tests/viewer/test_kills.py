@@ -12,8 +12,8 @@ import viewer_victim
 from viewer_client import Client
 from viewer_victim import Widgets
 
-from carts_core.data import Sequence
 from carts_core.project import Project
+from carts_core.recording import Sequence
 from tools.raw_tab import RawTab
 
 FRAMES = 24

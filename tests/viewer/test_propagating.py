@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from viewer_desk import Desk
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError, ProjectError
 from carts_core.evaluation.metrics import dice
 from carts_core.optimization import SurfaceSolver
@@ -22,6 +21,7 @@ from carts_core.project import (
     ReviewState,
     Source,
 )
+from carts_core.recording import Sequence
 from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 

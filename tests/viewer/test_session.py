@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.project import Key, Kind, Project, Provenance, Source
+from carts_core.recording import Sequence
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
 

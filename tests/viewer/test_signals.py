@@ -13,8 +13,8 @@ import pytest
 import viewer_victim
 from viewer_client import Client
 
-from carts_core.data import Sequence
 from carts_core.project import Project
+from carts_core.recording import Sequence
 from carts_viewer import opening
 from carts_viewer.app import ViewerApp
 from carts_viewer.serving import serve

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.camera import Camera
 from carts_core.errors import SettingsError
+from carts_core.model.camera import Camera
 from carts_core.project import IgnoreRegion, MaskCorrection
 from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, nothing, paint_over
 from carts_viewer.strokes import LONGEST_STROKE, Stroke, Target, corrected, ignored, read_stroke

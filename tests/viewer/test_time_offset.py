@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from viewer_desk import Desk
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.project import Key, Project, TimeOffset
+from carts_core.recording import Sequence
 from carts_viewer import intents
 from carts_viewer.running import OptimizerFactory
 

@@ -1,8 +1,8 @@
 """A controller at work without threads or a page, with the real optimizer."""
 
-from carts_core.data import Sequence
 from carts_core.optimization import DescentSolver, FreeParameters
 from carts_core.project import Project, ProjectState
+from carts_core.recording import Sequence
 from carts_core.settings import SolverName
 from carts_core.settings.stages import FirstOrder
 from carts_viewer import intents

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from ...losses import attention
+from ...imaging.haze import certainty, dehazed, transmission
+from ...model.scene import Scene
 from ...rendering import Outline, Renderer
-from ...scene import Scene
-from ..haze import certainty, dehazed, transmission
 from ..inputs import pixel_weights, smoothed, stacked_images, working_size
+from ..losses import attention
 from ..variables import APART, Variables
 from .base import Linearization
 

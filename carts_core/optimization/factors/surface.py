@@ -1,8 +1,8 @@
 """The surface factor: surface maps of a state against predicted ones, under one blur.
 
-What the network predicts (parts and normals, see `carts_core.surface`) the renderer knows exactly for every state, so
-no background, no shading and no network enter a step, and residuals have a Jacobian. A robust weight per pixel keeps
-what cannot be explained (an occluder, a false detection) from pulling.
+What the network predicts (parts and normals, see `carts_core.model.surface`) the renderer knows exactly for every
+state, so no background, no shading and no network enter a step, and residuals have a Jacobian. A robust weight per
+pixel keeps what cannot be explained (an occluder, a false detection) from pulling.
 """
 
 import math
@@ -14,15 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from ...imaging.window import Window
+from ...model.scene import Scene, SceneState
+from ...model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...rendering import JacobianBlock, Renderer, SurfaceRendering
-from ...scene import Scene, SceneState
 from ...settings import SurfaceSolver
-from ...surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...threads import one_thread, total
 from ..inputs import kernel_radius, smoothed
 from ..observation import Observation
 from ..variables import APART, Variables
-from ..window import Window
 from .base import Linearization
 
 _REDUCTIONS = (1, 2, 4, 8)

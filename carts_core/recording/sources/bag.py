@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ...data.image_sources import BAG_SUFFIXES, decode_message, open_bag
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
-from ..alignment import nearest
-from ..cameras import calibration_of, camera_from_info, side_of
-from ..found import FoundCamera, FoundRecording, Note
-from ..logs import ArmLog, arm_from_log, track
+from ..image_sources import BAG_SUFFIXES, decode_message, open_bag
+from ..importing.alignment import nearest
+from ..importing.cameras import calibration_of, camera_from_info, side_of
+from ..importing.found import FoundCamera, FoundRecording, Note
+from ..importing.logs import ArmLog, arm_from_log, track
 from .protocol import Source
 
 _ARM_TOPIC = re.compile(r"^(?P<prefix>/|.*/)(?P<arm>PSM\d?)/(?P<rest>.+)$", re.IGNORECASE)

@@ -15,12 +15,12 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.image_size import size_problem
 from ...files.reading import IMAGE, read_bytes
-from ...psm_kinematics import JOINT_NAMES
+from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
-from ..assembling import cameras_of
-from ..foreign_tables import read_array, read_foreign_table
-from ..found import FoundArm, FoundCamera, FoundRecording, Note
-from ..media import Images, common_ids, find_images, image_files
+from ..importing.assembling import cameras_of
+from ..importing.foreign_tables import read_array, read_foreign_table
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.media import Images, common_ids, find_images, image_files
 from .protocol import Source
 
 _TRUTH = "green_screen"

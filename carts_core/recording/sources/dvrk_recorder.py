@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ...data.image_sources import open_bag
-from ...data.video import SUFFIXES
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..alignment import nearest
-from ..cameras import calibration_of, side_of
-from ..foreign_tables import ForeignTable, read_foreign_table
-from ..found import FoundCamera, FoundRecording, Note
-from ..logs import ArmLog, Track, arm_from_log, track
-from ..media import find_images
+from ..image_sources import open_bag
+from ..importing.alignment import nearest
+from ..importing.cameras import calibration_of, side_of
+from ..importing.foreign_tables import ForeignTable, read_foreign_table
+from ..importing.found import FoundCamera, FoundRecording, Note
+from ..importing.logs import ArmLog, Track, arm_from_log, track
+from ..importing.media import find_images
+from ..video import SUFFIXES
 from .bag import read_arm_logs
 from .protocol import Source
 

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ...data.video import SUFFIXES
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
-from ..assembling import by_rows, cameras_of
-from ..cameras import side_of
-from ..columns import ColumnMeanings, arm_log, guess_clock, guess_columns, seconds
-from ..foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..found import FoundArm, FoundCamera, FoundRecording, Note
-from ..logs import arm_from_log
-from ..media import Images, common_ids, find_images, image_files
+from ..importing.assembling import by_rows, cameras_of
+from ..importing.cameras import side_of
+from ..importing.columns import ColumnMeanings, arm_log, guess_clock, guess_columns, seconds
+from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.logs import arm_from_log
+from ..importing.media import Images, common_ids, find_images, image_files
+from ..video import SUFFIXES
 from .protocol import Source
 
 _DEPTH = 2

@@ -11,13 +11,13 @@ from ...errors import SequenceError
 from ...extras import needs_extra
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..assembling import by_rows
-from ..cameras import calibration_of, side_of
-from ..columns import arm_log, guess_columns
-from ..foreign_tables import ForeignTable
-from ..found import FoundArm, FoundCamera, FoundRecording, Note
-from ..logs import arm_from_log
-from ..media import find_images
+from ..importing.assembling import by_rows
+from ..importing.cameras import calibration_of, side_of
+from ..importing.columns import arm_log, guess_columns
+from ..importing.foreign_tables import ForeignTable
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.logs import arm_from_log
+from ..importing.media import find_images
 from .protocol import Source
 
 _STATE = "observation.state"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...settings.importing import ImportOptions
-from ..found import FoundRecording
+from ..importing.found import FoundRecording
 
 
 @dataclass(frozen=True)

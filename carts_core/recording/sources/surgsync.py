@@ -15,11 +15,11 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..assembling import by_rows, cameras_of
-from ..foreign_tables import read_foreign_table
-from ..found import FoundArm, FoundCamera, FoundRecording, Note
-from ..logs import ArmLog, Track, arm_from_log, track
-from ..media import Images, common_ids, find_images, image_files
+from ..importing.assembling import by_rows, cameras_of
+from ..importing.foreign_tables import read_foreign_table
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.logs import ArmLog, Track, arm_from_log, track
+from ..importing.media import Images, common_ids, find_images, image_files
 from .protocol import Source
 
 _ARMS = ("PSM1", "PSM2", "PSM3")

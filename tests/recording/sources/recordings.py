@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from carts_core.export.dvrk import T_DVRK_OPENCV
-from carts_core.psm_kinematics import forward
+from carts_core.model.psm_kinematics import forward
 
 SIZE = (96, 72)
 START = 1_700_000_000_000_000_000

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from recordings import SIZE, T_CAMERA_BASE, BagKind, K, image, jaw_at, joints_at, write_bag
 
-from carts_core.cli import BAD_INPUT, main
-from carts_core.data import Sequence
+from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
-from carts_core.recording.importing import find, import_recording
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 from carts_core.rendering import Renderer
 from carts_core.settings.importing import ImportOptions
 

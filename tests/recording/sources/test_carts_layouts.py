@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recordings import SIZE, image, joints_at, write_images
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
-from carts_core.recording.importing import find, import_recording
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 
 FRAMES = 4
 

@@ -9,10 +9,10 @@ import pytest
 import yaml
 from recordings import SIZE, K, image, joints_at, write_images, write_video
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
-from carts_core.psm_kinematics import forward
-from carts_core.recording.importing import find, import_recording
+from carts_core.model.psm_kinematics import forward
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 
 FRAMES = 5
 

@@ -11,10 +11,10 @@ import pytest
 from recordings import SIZE, START, BagKind, image, joints_at, pose_of, write_bag, write_video
 
 from carts_core.cli import main
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
-from carts_core.psm_kinematics import forward
-from carts_core.recording.importing import find, import_recording
+from carts_core.model.psm_kinematics import forward
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 
 FRAMES = 6
 RATE = 12.5

@@ -13,10 +13,10 @@ from recordings import SIZE, START, K, image, joints_at, pose_of, write_images, 
 from scipy.io import savemat
 
 from carts_core.cli import main
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
-from carts_core.psm_kinematics import JOINT_NAMES, forward
-from carts_core.recording.importing import find, import_recording
+from carts_core.model.psm_kinematics import JOINT_NAMES, forward
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 from carts_core.settings.importing import ImportOptions
 
 FRAMES = 5

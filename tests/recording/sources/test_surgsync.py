@@ -10,11 +10,11 @@ import pyarrow.parquet
 import pytest
 from recordings import SIZE, T_CAMERA_BASE, K, image, jaw_at, joints_at, pose_of, write_images, write_video
 
-from carts_core.data import Sequence
 from carts_core.errors import CartsError
 from carts_core.export.dvrk import T_DVRK_OPENCV
-from carts_core.psm_kinematics import forward
-from carts_core.recording.importing import find, import_recording
+from carts_core.model.psm_kinematics import forward
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find, import_recording
 
 FRAMES = 25
 

@@ -1,0 +1,83 @@
+"""`carts bench`: measure all methods on frames that nothing was tuned on, and write the report."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..console import Terminal
+from ..errors import CartsError
+from ..stopping import when_stopped
+from ..wording import counted
+from .selection import Network, output_folder
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure accuracy and speed of all methods, and write a report; run it again to go on after a stop."""
+
+    output: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
+    quick: bool = False
+    """Few frames and steps: some minutes instead of hours."""
+    real: Path | None = None
+    """Sequence file with real frames and masks, to be measured too, also with their instruments in other rooms."""
+    rooms: Path | None = None
+    """Folder of photographs to put the real instruments before, besides made rooms."""
+    report_only: bool = False
+    """Measure nothing; write the report of what is there."""
+    frames: int | None = None
+    """Frames of each sequence to evaluate, if not as many as usual."""
+    seed: int | None = None
+    """Seed of the synthetic sequence, if not the usual one."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def run(self) -> None:
+        """Measure what is not known yet and write the report."""
+        from importlib.metadata import version
+
+        from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
+        from ..lab.benchmark.fingerprints import code_fingerprint
+        from ..lab.benchmark.sources import real_source, room_sources, synthetic_source
+        from ..lab.benchmark.stages import known_stages, measure_stages
+        from ..networks.extractor import FeatureExtractor
+
+        console = Terminal()
+        scope = QUICK if self.quick else FULL
+        if self.frames is not None:
+            scope = scope.with_frames(self.frames)
+        name = "quick" if self.quick else "full"
+        if self.rooms is not None and self.real is None:
+            raise CartsError("--rooms was given without --real. Say which real frames are to be put into these rooms.")
+        folder = output_folder(self.output, "bench", name)
+        seed = TEST_SEED if self.seed is None else self.seed
+        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        sources = [synthetic_source(scope, seed)]
+        if self.real is not None:
+            sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
+        runs = plan(scope, sources)
+        results = ResultsFile(folder / "measurements.jsonl")
+        benchmark = Benchmark(scope, sources, extractor, results, runs)
+        if results.unreadable:
+            console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
+        stages = folder / "stages.json"
+        if not self.report_only:
+            with when_stopped(f"{results.path} holds what was measured; the same command goes on from there"):
+                benchmark.run(console)
+                measure_stages(stages, extractor)
+        measurements = benchmark.measurements()
+        if not measurements:
+            raise CartsError(
+                f"{results.path} holds no measurement of these settings, weights and code. Run without --report-only."
+            )
+        facts = Facts(
+            scope=name,
+            planned=len(runs),
+            sources={source.name: source.description for source in sources},
+            weights=extractor.sha256,
+            code=code_fingerprint(),
+            version=version("carts"),
+        )
+        page = write_report(folder, measurements, facts, known_stages(stages, extractor))
+        console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")

@@ -1,0 +1,125 @@
+"""`carts calibrate`: base frames and cameras from many frames at once."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from ..console import Bar, Terminal
+from ..errors import SettingsError
+from ..settings import CALIBRATION, FreeParameters
+from ..settings.serialization import to_plain
+from ..stopping import when_stopped
+from .observing import Observing
+from .selection import Selection, SequencePath, output_folder
+from .solver_options import CalibrationOptions
+
+if TYPE_CHECKING:
+    from ..optimization import CalibrationOptimizer, CalibrationResult
+    from ..recording import Sequence
+
+_SPREAD = "spread:"
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find base frames and cameras that fit many frames at once; write a sequence file with them, and a report."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/calibration`."""
+    overwrite: bool = False
+    """Replace an earlier calibration there."""
+    frames: str = f"{_SPREAD}20"
+    """Positions of the frames to calibrate with: `spread:20` for 20, spread evenly over the sequence, or as in
+    `carts evaluate`: `all`, `0-9,15`, `::3`."""
+    camera: tuple[str, ...] = Selection.camera
+    """Cameras, by name; all take part at once."""
+    domain: str | None = None
+    """Domain, by name; the sequence's first one if none is named."""
+    joint_prior_deg: float = 0.1
+    """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
+    all that is written."""
+    free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
+
+    def run(self) -> None:
+        """Calibrate; on Ctrl-C or an error nothing is written."""
+        from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
+        from ..files import MARKER, published, write_text
+        from ..optimization import CalibrationOptimizer
+        from ..recording import Sequence
+        from .hints import print_hints
+
+        console = Terminal()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        cameras = Selection(camera=self.camera).camera_names(sequence.scene)
+        indices = frame_indices(self.frames, sequence)
+        output = output_folder(self.output, sequence.name, "calibration")
+        observer = self.network.observer(self.solving.chosen)
+        with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
+            frames = [sequence.frame(index, self.domain, cameras) for index in indices]
+            optimizer = CalibrationOptimizer(
+                sequence.scene,
+                frames,
+                observer.predictor,
+                settings=self.solving.chosen,
+                free=self.free,
+                joint_prior_deg=self.joint_prior_deg,
+                cameras=cameras,
+            )
+            result = _optimized(optimizer, console)
+            residuals = frame_residuals(sequence, frames, result)
+            write_calibration(folder, output.path, sequence, result, residuals)
+            write_text(folder / MARKER, json.dumps(self._summary(observer.weights, indices, cameras), indent=1))
+        for camera in cameras:
+            if (means := mean_dice(residuals, camera)) is not None:
+                console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
+        print_hints(console, self.network.caution)
+        console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
+        print_hints(console, remark(sequence.scene, result))
+
+    def _summary(self, weights: str, indices: list[int], cameras: list[str]) -> dict:
+        """How the folder was made."""
+        return {
+            "format": "calibration",
+            "sequence": str(self.sequence),
+            "weights": weights,
+            "observed": self.network.observe,
+            "frames": indices,
+            "cameras": cameras,
+            "domain": self.domain,
+            "joint_prior_deg": self.joint_prior_deg,
+            "free": asdict(self.free),
+            "solver": to_plain(self.solving.chosen),
+        }
+
+
+def frame_indices(text: str, sequence: "Sequence") -> list[int]:
+    """Positions that `--frames` means.
+
+    Raises:
+        SettingsError: the text is not readable, names no frame or leaves the sequence.
+    """
+    if not text.startswith(_SPREAD):
+        return Selection(frames=text).frame_indices(sequence)
+    count = text.removeprefix(_SPREAD)
+    if not (count.isdecimal() and int(count) >= 1):
+        raise SettingsError(f"--frames {text!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+    from ..recording import spread
+
+    return spread(len(sequence), int(count))
+
+
+def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":
+    with Bar(console=console, transient=True) as bar:
+        task = bar.add_task("calibrating", total=None)
+        for iterate in optimizer:
+            text = f"stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
+            bar.update(task, description=text, total=iterate.stages, completed=iterate.stage)
+    return optimizer.result()

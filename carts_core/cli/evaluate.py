@@ -1,0 +1,97 @@
+"""`carts evaluate`: optimize frames and compare them with the truth."""
+
+import json
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..console import Terminal, track
+from ..errors import SettingsError
+from ..stopping import when_stopped
+from ..wording import counted
+from .observing import Observing
+from .selection import Mode, Perturbation, Selection, SequencePath, check_writable
+from .solver_options import FreeInFrames, SolverOptions
+
+_WIDTH = 110
+"""Characters of the table's lines in a file or a pipe."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Optimize frames and compare masks and joints with the truth."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    json: Path | None = None
+    """Write the scores of all frames and their means to this file; folders on the way to it are made."""
+    mode: Mode = "frame"
+    """Optimize each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+    together: bool = False
+    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
+
+    def __post_init__(self) -> None:
+        if self.json is not None and self.json.is_dir():
+            raise SettingsError(f"--json {self.json} is a folder. Name a file.")
+        if self.json is not None:
+            check_writable(self.json.parent)
+        if self.mode == "sequence":
+            self.solving.check_surface("--mode sequence")
+
+    def run(self) -> None:
+        """Print a table of means, and write the JSON file if one is named."""
+        from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
+        from ..files import write_text
+        from ..optimization import Backgrounds
+        from ..recording import Sequence
+        from .hints import base_frame_hint, kept_start_hint, print_hints
+        from .score_table import score_table
+
+        console = Terminal()
+        if not console.is_terminal:
+            console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        frames = self.select.frame_indices(sequence)
+        cameras = self.select.camera_names(sequence.scene)
+        domains = self.select.domain_names(sequence)
+        observer = self.network.observer(self.solving.chosen)
+        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
+        found = run(
+            sequence,
+            observer.predictor,
+            frames=frames,
+            cameras=cameras,
+            domains=domains,
+            settings=self.solving.chosen,
+            free=self.solving.freed(self.free),
+            perturb_deg=self.start.perturb_deg,
+            seed=self.start.seed,
+            together=self.together,
+        )
+        total = len(frames) * len(cameras) * len(domains)
+        with when_stopped("nothing was written"):
+            scores = list(track(found, "optimizing", total=total, console=console))
+        console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
+        print_hints(console, self.network.caution)
+        for group in camera_groups(cameras, self.together):
+            where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
+            print_hints(
+                console,
+                kept_start_hint(where, [score.stopped for score in seen]),
+                base_frame_hint(where, [score.base_frame_gain for score in seen]),
+            )
+        required = self.solving.chosen.needs_background
+        for group in camera_groups(cameras, self.together):
+            for domain in domains:
+                print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
+        if self.json is not None:
+            write_text(self.json, json.dumps({"observed": self.network.observe, **to_json(scores)}, indent=1))
+            console.print(f"wrote {self.json}")

@@ -1,0 +1,68 @@
+"""`carts export`: write frames in the formats that other tools read."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..console import Bar, Terminal
+from ..errors import SettingsError
+from ..settings import FormatName, Parts
+from ..stopping import when_stopped
+from ..wording import counted
+from .selection import Selection, SequencePath
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")]
+    """Folder to make, or file for csv, npz, json and dvrk."""
+    format: FormatName
+    """What to write."""
+    kinematics: Path | None = None
+    """Export the frames of this table (what `carts optimize` wrote) instead of the measured kinematics."""
+    parts: Parts = "arms"
+    """Give every arm a category of its own, or every link."""
+    images: bool = True
+    """Write the images beside their labels."""
+    frame_rate: float | None = None
+    """Of a video [1/s]; by default that of the recording, or 25 where it has no times."""
+    overwrite: bool = False
+    """Replace an earlier export."""
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+
+    def run(self) -> None:
+        """Write the export; on Ctrl-C or an error nothing of it is left."""
+        from ..export import Dataset, Monitor, corrected_frames, export, measured_frames, read_kinematics_csv
+        from ..recording import Sequence
+
+        console = Terminal()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        indices = self.select.frame_indices(sequence)
+        if self.kinematics is None:
+            frames = measured_frames(sequence, indices)
+        else:
+            frames = corrected_frames(sequence, indices, read_kinematics_csv(self.kinematics, sequence.scene))
+        domains = self.select.domain_names(sequence)
+        if len(domains) > 1:
+            raise SettingsError(f"--domain: {len(domains)} domains were given; an export holds one. Name one.")
+        dataset = Dataset(
+            sequence,
+            tuple(frames),
+            sequence.scene.with_cameras(self.select.camera_names(sequence.scene)),
+            domains[0],
+            parts=self.parts,
+            images=self.images,
+            frame_rate=self.frame_rate,
+        )
+        with Bar(console=console) as bar:
+            task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
+            monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
+            with when_stopped(f"nothing was written to {self.output}"):
+                path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
+        console.print(f"wrote {path}")

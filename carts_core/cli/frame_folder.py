@@ -1,0 +1,183 @@
+"""A folder of masks and a table of kinematics, as `carts optimize` fills it."""
+
+import json
+from bisect import bisect_left
+from collections.abc import Iterator
+from collections.abc import Sequence as Several
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from ..errors import SettingsError
+from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv
+from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
+from ..fingerprints import fingerprint
+from ..model.scene import SceneState
+from ..recording import Sequence
+from ..rendering import Renderer
+from ..stopping import finished_first
+from .origins import Origin, changes
+from .result_records import Record, read_records, records_text, row_fingerprint
+from .selection import check_writable
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What was found for a frame."""
+
+    row: KinematicsRow
+    state: SceneState
+    origin: Origin
+    """What it was made from."""
+
+
+class FrameFolder:
+    """Masks, kinematics (`kinematics.csv`) and what they were made with (`settings.json`) and from (`results.json`).
+
+    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` where there are several cameras. No file is half written,
+    and no frame counts that was not written whole. No file is made or changed before the first frame is written.
+
+    Args:
+        sequence, cameras: whose frames these are.
+        folder: where to write.
+        settings: those that all frames share; what is in the folder counts if its settings are the same.
+        overwrite: start over, whatever is there.
+
+    Attributes:
+        rows: what is in the table.
+        checkpoint: file for what sequence mode has found before it is done.
+
+    Raises:
+        SettingsError: the folder holds results of other settings, or cannot be written to.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        cameras: tuple[str, ...],
+        folder: OutputPath,
+        settings: dict[str, Any],
+        overwrite: bool,
+    ) -> None:
+        check_writable(folder.path)
+        self.folder = folder
+        self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+        self._whole_scene, self._scene = sequence.scene, sequence.scene.with_cameras(cameras)
+        masks = folder / "masks"
+        self._masks = {camera: masks / camera if len(cameras) > 1 else masks for camera in cameras}
+        self._table, self._settings_file = folder / "kinematics.csv", folder / "settings.json"
+        self._records_file = folder / "results.json"
+        self.checkpoint = folder / "checkpoint.txt"
+        self._settings, self._overwrite = json.dumps(settings, indent=1), overwrite
+        self.rows: list[KinematicsRow] = []
+        self._records: dict[str, Record] = {}
+        self._check_settings()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Read what is there, and keep other processes from writing to it.
+
+        Raises:
+            OutputError: another process writes there.
+            SequenceError: the table cannot be read.
+            SettingsError: the folder has come to hold results of other settings.
+        """
+        with locked_folder(self.folder):
+            self._check_settings()
+            self._goes_on = holds_file(self._table) and not self._overwrite
+            if self._goes_on:
+                rows = read_kinematics_csv(self._table.path, self._whole_scene)
+                known = {row.frame_id: row for row in rows if row.frame_id in self._order}
+                self.rows = sorted(known.values(), key=lambda row: self._order[row.frame_id])
+                self._records = read_records(self._records_file)
+            yield
+
+    def fault(self, frame_id: str, origin: Origin) -> str | None:
+        """Why a frame in the table does not count, for people; None if it does.
+
+        Args:
+            frame_id: of a frame in `rows`.
+            origin: what it would be made from now; kinds of inputs that are not in it are not compared.
+        """
+        record = self._records.get(frame_id)
+        row = self._row(frame_id)
+        if record is None:
+            return "what they were made from is not known"
+        if record.row != row_fingerprint(self._scene, row):
+            return "their rows in the table were changed"
+        if changed := changes(record.origin, origin):
+            return changed
+        if any(self._mask_fingerprint(frame_id, camera) != record.masks.get(camera) for camera in self._masks):
+            return "their masks are missing or damaged"
+        return None
+
+    def others_dropped(self, chosen: Several[str]) -> int:
+        """How many frames besides the chosen ones are in the folder and go when the first result is written."""
+        if not self._overwrite or not holds_file(self._table):
+            return 0
+        return len(set(self._written_before()) - set(chosen))
+
+    def write(self, found: Several[FrameResult]) -> None:
+        """Write masks and rows of frames, in place of earlier ones; a signal waits until that is done."""
+        if not found:
+            return
+        with finished_first():
+            if not self._goes_on:
+                self._start_over()
+            for result in found:
+                frame_id, fingerprints = result.row.frame_id, {}
+                for camera, renderer in self._renderers.items():
+                    png = mask_png(renderer.segment(result.state.to("cpu"))[0] >= 0)
+                    write_bytes(self._masks[camera] / f"{frame_id}.png", png)
+                    fingerprints[camera] = fingerprint(png)
+                row = row_fingerprint(self._scene, result.row)
+                self._records[frame_id] = Record(result.origin, fingerprints, row, torch.get_num_threads())
+            new = {result.row.frame_id: result.row for result in found}
+            rows = {row.frame_id: row for row in self.rows} | new
+            self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
+            # A frame counts when all three tell of it: what a kill leaves between them is done again.
+            write_text(self._table, kinematics_csv(self._scene, self.rows))
+            known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
+            write_text(self._records_file, records_text(known))
+
+    def _start_over(self) -> None:
+        for frame_id in self._written_before():
+            for masks in self._masks.values():
+                remove_file(masks / f"{frame_id}.png")
+        remove_file(self._table)
+        remove_file(self._records_file)
+        write_text(self._settings_file, self._settings)
+        self._goes_on = True
+
+    def _written_before(self) -> list[str]:
+        """Frames of this sequence that the folder has results of, whatever their settings."""
+        if not holds_file(self._table):
+            return []
+        lines = self._table.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        ids = {line.partition(",")[0] for line in lines} | set(read_records(self._records_file))
+        return [frame_id for frame_id in self._order if frame_id in ids]
+
+    def _mask_fingerprint(self, frame_id: str, camera: str) -> str | None:
+        path = self._masks[camera] / f"{frame_id}.png"
+        return fingerprint(path.path.read_bytes()) if holds_file(path) else None
+
+    def _row(self, frame_id: str) -> KinematicsRow:
+        place = bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])
+        return self.rows[place]
+
+    @cached_property
+    def _renderers(self) -> dict[str, Renderer]:
+        return {camera: Renderer(self._scene, cameras=[camera]) for camera in self._masks}
+
+    def _check_settings(self) -> None:
+        file = self._settings_file
+        if self._overwrite or not holds_file(self._table):
+            return
+        if not holds_file(file) or file.path.read_text(encoding="utf-8", errors="replace") != self._settings:
+            raise SettingsError(
+                f"{self.folder} holds results of other settings (see {file}). "
+                "Add --overwrite to replace them, or name another folder with --output."
+            )

@@ -1,0 +1,58 @@
+"""`carts import`: any recording as a sequence file."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from ..settings.importing import ImportOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..recording.importing.found import FoundRecording
+
+_STYLES = {"found": "green", "guessed": "yellow", "missing": "magenta", "warning": "red"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """Write a sequence file for a recording, which stays where it is; docs/howto/import.md has the kinds."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """File or folder of the recording."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder to make for sequence.toml and its tables; by default `NAME_sequence` here."""
+    overwrite: bool = False
+    """Replace an earlier import."""
+    options: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
+
+    def run(self) -> None:
+        """Say what was found, and write the sequence file."""
+        from ..recording.importing.importer import import_recording
+
+        console = Console()
+        folder = self.output or Path(f"{self.source.absolute().stem}_sequence")
+        path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
+        print_report(console, recording)
+        console.print(f"wrote {path}. Look at it: carts view {path}", markup=False, soft_wrap=True)
+
+
+def print_report(console: Console, recording: "FoundRecording") -> None:
+    """Say what a recording holds, and what was guessed or is missing."""
+    frames, times = len(recording.frame_ids), recording.frame_times
+    span = "" if times is None or frames < 2 else f", {times[-1] - times[0]:.1f} s, {_rate(times):.1f} images/s"
+    console.print(f"{recording.name}: {recording.kind}, {frames} frames{span}", markup=False)
+    for arm in recording.arms:
+        if arm.times is not None and len(arm.times) > 1:
+            rows = f"{len(arm.times)} rows, {_rate(arm.times):.1f} rows/s"
+            console.print(f"{arm.name}: {rows}, {', '.join(arm.columns)}", markup=False)
+    for note in recording.notes:
+        console.print(f"[{_STYLES[note.kind]}]{note.kind}[/]: ", end="")
+        console.print(note.text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _rate(times: "np.ndarray") -> float:
+    return (len(times) - 1) / max(float(times[-1] - times[0]), 1e-9)

@@ -1,0 +1,261 @@
+"""What `carts optimize` does."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..console import Bar, Terminal, track
+from ..evaluation import Starts, camera_groups, start_positions
+from ..export import KinematicsRow, read_kinematics_csv
+from ..files import remove_file
+from ..fingerprints import fingerprint
+from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, StopReason, sequence_checkpoint
+from ..optimization.variables import Variables
+from ..recording import Frame, Sequence
+from ..settings.serialization import to_plain
+from ..stopping import when_stopped
+from ..wording import counted
+from .frame_folder import FrameFolder, FrameResult
+from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_hints
+from .optimize_options import OptimizeOptions
+from .origins import Origin, Origins
+from .selection import output_folder
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The frames of a domain, as cameras see them that work together."""
+
+    domain: str
+    cameras: tuple[str, ...]
+    output: FrameFolder
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.domain}, {', '.join(self.cameras)}"
+
+
+class Optimizing:
+    """Corrects frames as a command line asks for.
+
+    Args:
+        asked: the command line.
+    """
+
+    def __init__(self, asked: OptimizeOptions) -> None:
+        self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
+        self._free = asked.solving.freed(asked.free)
+        self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
+        self._frames = asked.select.frame_indices(self._sequence)
+        self._keyframes = self._read_keyframes()
+        self._looking: SequenceOptimizer | None = None
+        self._observer = asked.network.observer(self._solver)
+
+    def run(self) -> None:
+        """Optimize what is not there yet.
+
+        Raises:
+            CartsError: something cannot be done as asked for; whatever can be known of that is reported before
+                anything is written.
+        """
+        scene, select = self._sequence.scene, self._asked.select
+        groups = camera_groups(select.camera_names(scene), self._asked.together)
+        parts = [self._part(domain, group) for domain in select.domain_names(self._sequence) for group in groups]
+        with ExitStack() as held:
+            for part in parts:
+                held.enter_context(part.output.held())
+            for part in parts:
+                with when_stopped(lambda part=part: self._kept(part)):
+                    self._run(part)
+
+    def _part(self, domain: str, cameras: tuple[str, ...]) -> _Part:
+        asked, sequence = self._asked, self._sequence
+        scene = sequence.scene.with_cameras(cameras)
+        start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
+        # Made for its errors: no name of what is free or locked may be wrong.
+        Variables(scene, start, self._free, self._solver.length_scale)
+        folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
+        return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
+
+    def _run(self, part: _Part) -> None:
+        frames, output, together = self._frames, part.output, self._asked.mode == "sequence"
+        origins = self._origins(part)
+        common = origins.common
+        if together:
+            of_all = origins.of_all(frames)
+            now, common = dict.fromkeys(frames, of_all), {**common, "together": of_all["together"]}
+        else:
+            now = {index: origins.of(index) for index in frames}
+        todo = self._to_do(part, now)
+        self._tell_of_others(part, common)
+        if not together:
+            self._each_alone(todo, part, now)
+        elif todo:
+            # Every frame depends on all others, so one that is missing has all of them done again.
+            self._as_sequence(part, now, common)
+        else:
+            # A kill between the last result and the end leaves it.
+            remove_file(output.checkpoint)
+        if todo:
+            self._console.print(
+                f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
+            )
+
+    def _to_do(self, part: _Part, now: Mapping[int, Origin]) -> list[int]:
+        """Positions of the chosen frames that are not there as they would be made now; says why."""
+        output, ids = part.output, self._sequence.frame_ids
+        there = {row.frame_id for row in output.rows}
+        faults = {index: output.fault(ids[index], origin) for index, origin in now.items() if ids[index] in there}
+        reasons = Counter(fault for fault in faults.values() if fault)
+        total, kept = counted(len(now), "frame"), sum(fault is None for fault in faults.values())
+        if kept:
+            self._console.print(f"{output.folder}: {kept} of {total} already there")
+        for reason, count in reasons.items():
+            self._console.print(f"{output.folder}: {count} of {total} redone: {reason}")
+        return [index for index in now if index not in faults or faults[index]]
+
+    def _tell_of_others(self, part: _Part, common: Origin) -> None:
+        """Of frames in the folder that were not chosen."""
+        output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
+        if dropped := output.others_dropped(chosen):
+            note = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
+            self._console.print(f"{output.folder}: {note}")
+        others = [row.frame_id for row in output.rows if row.frame_id not in chosen]
+        reasons = Counter(fault for frame_id in others if (fault := output.fault(frame_id, common)))
+        for reason, count in reasons.items():
+            note = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
+            self._console.print(f"{output.folder}: {note}")
+
+    def _origins(self, part: _Part) -> Origins:
+        asked, sequence = self._asked, self._sequence
+        starts = Starts(sequence, part.domain, part.cameras, asked.start.perturb_deg, asked.start.seed)
+
+        def load(index: int) -> Frame:
+            frame = sequence.frame(index, part.domain, part.cameras)
+            return replace(frame, measured=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed))
+
+        backgrounds = Backgrounds.of(
+            sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
+        )
+        load = starts.frame if asked.mode == "sequence" else load
+        return Origins(sequence, part.cameras, self._observer, load, backgrounds.images)
+
+    def _kept(self, part: _Part) -> str:
+        """What there is of a part that was stopped."""
+        there = f"{part.output.folder} holds {counted(len(part.output.rows), 'frame')}"
+        if self._looking is not None:
+            done, total = self._looking.progress
+            there = f"{done} of {counted(total, 'frame')} are solved and kept in {part.output.checkpoint}"
+        return f"{there}; the same command goes on from there"
+
+    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, Origin]) -> None:
+        asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
+        if not todo:
+            return
+        backgrounds = Backgrounds.of(sequence, cameras, domain, required=self._solver.needs_background)
+        stopped, gains, assessed = [], [], {}
+        for index in track(todo, part.name, console=self._console, disable=not todo):
+            frame = sequence.frame(index, domain, cameras)
+            optimizer = FrameOptimizer(
+                sequence.scene,
+                frame,
+                backgrounds,
+                self._observer.predictor,
+                start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
+                settings=self._solver,
+                free=self._free,
+                cameras=cameras,
+                live=False,
+            )
+            for _ in optimizer:
+                pass
+            best = optimizer.best
+            assert best is not None and optimizer.stop_reason is not None
+            assessed[frame.frame_id] = optimizer.assessment
+            source = "measured" if optimizer.stop_reason is StopReason.FAILED else "optimized"
+            row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std())
+            part.output.write([FrameResult(row, best.state, origins[index])])
+            stopped.append(optimizer.stop_reason)
+            gains.append(optimizer.base_frame_gain())
+        print_hints(
+            self._console,
+            kept_start_hint(part.name, stopped),
+            base_frame_hint(part.name, gains),
+            *backgrounds.problems,
+            *verdict_hints(part.name, assessed),
+        )
+
+    def _as_sequence(self, part: _Part, origins: Mapping[int, Origin], common: Origin) -> None:
+        asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
+        backgrounds = Backgrounds.of(sequence, cameras, part.domain)
+        starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
+        made_with = fingerprint(json.dumps(self._settings()), json.dumps(dict(common)))
+        checkpoint = sequence_checkpoint(part.output.checkpoint, made_with)
+        optimizer = SequenceOptimizer(
+            sequence.scene,
+            starts.frame,
+            starts.times(frames),
+            self._observer.predictor,
+            settings=self._solver,
+            model=asked.solving.sequence,
+            free=self._free,
+            keyframes=self._keyframes,
+            backgrounds=backgrounds,
+            cameras=cameras,
+            checkpoint=checkpoint,
+        )
+        self._looking = optimizer
+        with Bar(console=self._console) as bar:
+            task = bar.add_task(part.name, total=len(frames))
+            for _ in optimizer:
+                bar.update(task, completed=optimizer.progress[0])
+        self._looking = None
+        found = []
+        for index, estimate in optimizer.estimates.items():
+            source = "edited" if estimate.start == "keyframe" else "optimized"
+            row = KinematicsRow(estimate.frame_id, source, estimate.joint_positions, estimate.joint_std)
+            found.append(FrameResult(row, estimate.state, origins[index]))
+        part.output.write(found)
+        checkpoint.remove()
+        if checkpoint.recalled:
+            self._console.print("went on from where an earlier run was stopped")
+        else:
+            self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
+
+    def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
+        """Position -> joint positions of the chosen frames that a person set."""
+        if self._asked.keyframes is None:
+            return {}
+        ids = self._sequence.frame_ids
+        rows = {
+            row.frame_id: row.joint_positions
+            for row in read_kinematics_csv(self._asked.keyframes, self._sequence.scene)
+            if row.source == "edited"
+        }
+        return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
+
+    def _settings(self) -> dict[str, Any]:
+        """What was asked for; what it is applied to has fingerprints (`Origins`)."""
+        asked = self._asked
+        settings = {
+            "sequence": str(asked.sequence.resolve()),
+            "perturb_deg": asked.start.perturb_deg,
+            "seed": asked.start.seed,
+            "free": asdict(self._free),
+            "solver": to_plain(self._solver),
+        }
+        if asked.network.observe != "network":
+            settings["observe"] = asked.network.observe
+        if asked.mode == "sequence":
+            from ..files.reading import TABLE, read_bytes
+
+            keyframes = asked.keyframes and hashlib.sha256(read_bytes(asked.keyframes, TABLE)).hexdigest()
+            settings |= {"mode": asked.mode, "model": to_plain(asked.solving.sequence), "keyframes": keyframes}
+        return settings

@@ -1,0 +1,62 @@
+"""What stands in `results.json` beside the results of `carts optimize`: of each frame, what it was made from and is."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ..errors import SettingsError
+from ..export import KinematicsRow
+from ..export.kinematics import position_values, std_values
+from ..files import OutputPath, holds_file
+from ..fingerprints import fingerprint
+from ..model.scene import Scene
+
+_FORMAT = "carts-results/1"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Of one frame."""
+
+    origin: Mapping[str, str]
+    """Kind of input -> its fingerprint."""
+    masks: Mapping[str, str]
+    """Camera -> fingerprint of the mask's file."""
+    row: str
+    """Fingerprint of the row in the table."""
+    threads: int
+    """How many threads torch had; results do not depend on it."""
+
+
+def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
+    """Of a row of the table, with the digits that it has there."""
+    values = np.concatenate([position_values(scene, row), std_values(scene, row)])
+    return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values])
+
+
+def records_text(records: Mapping[str, Record]) -> str:
+    """The file, one frame a line."""
+    lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in records.items()]
+    return f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
+
+
+def read_records(path: OutputPath) -> dict[str, Record]:
+    """Frame -> record. Nothing where the file is missing or damaged: then nothing there counts as known.
+
+    Raises:
+        SettingsError: a newer version of the program wrote the file.
+    """
+    if not holds_file(path):
+        return {}
+    try:
+        content = json.loads(path.path.read_bytes())
+        if content["format"] != _FORMAT:
+            raise SettingsError(
+                f"{path} has the format {content['format']!r}; this version knows {_FORMAT}. Use the version that "
+                "wrote it, or name another folder with --output."
+            )
+        return {str(frame_id): Record(**record) for frame_id, record in content["frames"].items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return {}

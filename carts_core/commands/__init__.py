@@ -1,1 +1,0 @@
-"""The subcommands of `carts`, one module each; what takes long to import is imported when they run."""

@@ -1,9 +1,0 @@
-"""Recordings: the sequence format and its loader."""
-
-from .background import MeanBackground as MeanBackground
-from .background import background_of_recording as background_of_recording
-from .background import spread as spread
-from .calibrated import calibrated_sequence_file as calibrated_sequence_file
-from .frame_reader import FrameReader as FrameReader
-from .sequence import Frame as Frame
-from .sequence import Sequence as Sequence

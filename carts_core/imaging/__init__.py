@@ -1,0 +1,1 @@
+"""Pixels, and nothing of robots."""

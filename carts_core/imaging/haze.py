@@ -1,0 +1,55 @@
+"""Smoke and haze taken off images before they are compared.
+
+Haze adds a grey that varies slowly over the image and takes contrast in the same measure. Tissue reflects little
+in at least one colour, so the darkest colour of the darkest pixel nearby tells how much has been added: the dark
+channel prior of He, Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from ..optimization.inputs import smoothed
+from ..optimization.losses import attention
+
+_REACH = 1 / 32
+"""How far away the darkest pixel may be, and deviation by which the haze is smoothed [image widths]."""
+
+_COARSER = 4
+"""How many times smaller than the images the haze is estimated [1]."""
+
+_AIRLIGHT = 0.75
+"""Value of haze that nothing shines through, in every colour [1]."""
+
+_LEAST = 0.25
+"""Least transmission that is assumed; noise grows by its inverse [1]."""
+
+
+def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 1 h w"]:
+    """Share of the light behind haze that comes through it, at each pixel; `_LEAST` to 1.
+
+    Args:
+        images: RGB in [0, 1].
+        share: of the estimated haze that is taken to be there [1]; 0 for none.
+    """
+    if share == 0:
+        return torch.ones_like(images[:, :1])
+    darkest = functional.interpolate(images.amin(1, keepdim=True), scale_factor=1 / _COARSER, mode="area")
+    reach = max(round(_REACH * darkest.shape[-1]), 1)
+    haze = smoothed(-attention(-darkest, reach), reach)
+    haze = functional.interpolate(haze, images.shape[-2:], mode="bilinear")
+    return (1.0 - share * haze / _AIRLIGHT).clamp(min=_LEAST)
+
+
+def dehazed(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Images, RGB in [0, 1], without the haze that lets that share of the light through."""
+    return ((images - _AIRLIGHT) / through + _AIRLIGHT).clamp(0.0, 1.0)
+
+
+def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
+    """Information of a pixel of a dehazed image, as a share of what it would have without haze [1].
+
+    Dehazing has noise grow by the inverse of the transmission, and information is the inverse of its square.
+    """
+    return through.square()

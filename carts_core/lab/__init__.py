@@ -1,0 +1,1 @@
+"""What makes networks and figures; nobody who uses the library imports it."""

@@ -1,0 +1,209 @@
+"""One run: a method on one frame, every iterate scored."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from ...evaluation import dice, joint_mae_deg, normalized_surface_distance
+from ...model.keypoints import keypoints
+from ...model.perturbation import perturb
+from ...model.scene import Arm, Scene, SceneState
+from ...networks.extractor import FeatureExtractor
+from ...optimization import Backgrounds, FrameOptimizer, FreeParameters, SolverSettings, SurfaceSolver
+from ...optimization.observability import Uncertainty
+from ...recording import Frame
+from ...rendering import Renderer
+from .machine import machine
+from .measurement import Measurement, Score
+from .methods import METHODS
+from .scope import Run
+
+TOLERANCE = 2.0
+"""Of the normalized surface distance [px]."""
+_SEED = 0
+"""Of the signs of errors made on purpose."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the estimates of one frame are compared with, in one camera.
+
+    Attributes:
+        camera: its name.
+        mask: the instruments' visible pixels.
+        joint_positions: arm -> true joint positions [rad, m]; empty where they are not known.
+        measured_joints: arm -> joints that count.
+        hidden: pixels that show an occluder; nothing is compared there.
+    """
+
+    camera: str
+    mask: Bool[np.ndarray, "h w"]
+    joint_positions: Mapping[str, np.ndarray]
+    measured_joints: Mapping[str, tuple[str, ...]]
+    hidden: Bool[np.ndarray, "h w"] | None = None
+
+    def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
+        """The score of a mask without kinematics."""
+        return Score(None, *self._overlap(mask), None, None, None, seconds)
+
+    def score(
+        self,
+        state: SceneState,
+        known: Uncertainty | None,
+        loss: float | None,
+        renderer: Renderer,
+        seconds: float,
+        *,
+        depth: bool = True,
+    ) -> Score:
+        """The score of an estimate.
+
+        Args:
+            state: the estimate.
+            known: what the images determine, where the optimizer says it.
+            loss: the optimizer's.
+            renderer: of the camera, at its size.
+            seconds: until the estimate was known [s].
+            depth: whether to look for the tips, too, which takes longer than all the rest.
+        """
+        state, scene = state.to("cpu"), renderer.scene
+        names = [arm.name for arm in scene.arms]
+        estimate = dict(zip(names, (v.double().numpy() for v in state.joint_positions), strict=True))
+        visible = visible_joints(known, self.measured_joints)
+        return Score(
+            loss,
+            *self._overlap(renderer.segment(state)[0] >= 0),
+            joint_mae_deg=joint_mae_deg(scene, estimate, self.joint_positions, self.measured_joints),
+            visible_joint_mae_deg=None
+            if visible is None
+            else joint_mae_deg(scene, estimate, self.joint_positions, visible),
+            tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
+            if depth
+            else None,
+            seconds=seconds,
+        )
+
+    def _overlap(self, mask: np.ndarray) -> tuple[float, float]:
+        truth = self.mask
+        if self.hidden is not None:
+            mask, truth = mask & ~self.hidden, truth & ~self.hidden
+        return dice(mask, truth), normalized_surface_distance(mask, truth, TOLERANCE)
+
+
+def visible_joints(
+    known: Uncertainty | None, measured_joints: Mapping[str, tuple[str, ...]]
+) -> Mapping[str, tuple[str, ...]] | None:
+    """Arm -> measured joints that the image determines; None for losses that do not say which.
+
+    This is the one place that reads it: what is returned here appears as "visible joints" in the whole report.
+    """
+    if known is None:
+        return None
+    return {
+        arm: tuple(
+            joint
+            for joint in joints
+            if f"{arm}/{joint}" in known.names and known.verdict(f"{arm}/{joint}") == "determined"
+        )
+        for arm, joints in measured_joints.items()
+    }
+
+
+def tip_depth_error_mm(
+    scene: Scene, estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
+) -> float | None:
+    """Mean absolute error [mm] of the jaw tips along the axis of the scene's camera; None without a truth."""
+    errors = []
+    for arm in scene.arms:
+        if arm.name in truth:
+            errors += (_tip_depths(scene, arm, estimate) - _tip_depths(scene, arm, truth)).tolist()
+    return float(1e3 * np.mean(np.abs(errors))) if errors else None
+
+
+def _tip_depths(scene: Scene, arm: Arm, joint_positions: Mapping[str, np.ndarray]) -> Float[np.ndarray, " tips"]:
+    links = arm.robot.forward_kinematics(torch.tensor(np.asarray(joint_positions[arm.name]), dtype=torch.float64))
+    T_camera_base = scene.cameras[0].T_camera_world @ arm.T_world_base
+    tips = [point for point in keypoints(arm) if point.name.endswith(" tip")]
+    points = (T_camera_base @ links[tip.link].numpy() @ np.append(tip.position, 1.0) for tip in tips)
+    return np.array([point[2] for point in points])
+
+
+def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """Joint positions that a run starts from; see `Run.error_deg`.
+
+    All methods and domains get the same error, and all frames that are corrected together.
+    """
+    error = run.error_deg
+    if error is None:
+        return frame.measured
+    origin = {**frame.measured, **(frame.truth or {})}
+    seed = (_SEED, round(1e3 * error)) if METHODS[run.method].together else (_SEED, frame.index)
+    return perturb(scene, origin, error, seed, joints)
+
+
+def optimize(
+    run: Run,
+    scene: Scene,
+    frame: Frame,
+    backgrounds: Backgrounds,
+    extractor: FeatureExtractor,
+    settings: SolverSettings,
+    free: FreeParameters,
+    truth: Truth,
+    renderer: Renderer,
+    ignore: dict[str, Bool[np.ndarray, "h w"]] | None = None,
+) -> Measurement:
+    """Run the optimizer on one frame, and score every iterate in one camera.
+
+    Args:
+        run: which.
+        scene: with the cameras that take part.
+        frame: its images and kinematics.
+        backgrounds: of these cameras.
+        extractor: the feature network.
+        settings: of the method.
+        free: what is unknown.
+        truth: what estimates are compared with.
+        renderer: draws the masks of the camera that is scored, at its size.
+        ignore: camera name -> pixels that show an occluder.
+    """
+    start = start_of(scene, frame, run, truth.measured_joints)
+    began = time.perf_counter()
+    optimizer = FrameOptimizer(
+        scene, frame, backgrounds, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False
+    )
+    seconds = time.perf_counter() - began
+    trace: list[Score] = []
+    best: list[int] = []
+    while True:
+        began = time.perf_counter()
+        iterate = optimizer.step()
+        seconds += time.perf_counter() - began
+        if iterate is None:
+            break
+        best.append(len(trace) if optimizer.best is iterate else best[-1])
+        known, first = iterate.uncertainty, not trace
+        loss = None if isinstance(settings, SurfaceSolver) else iterate.loss
+        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, depth=first))
+    assert optimizer.best is not None and optimizer.stop_reason is not None
+    end = optimizer.best
+    final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
+    return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine(extractor.device))
+
+
+def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:
+    """The network's own mask of one image, at the size that it was trained for."""
+    began = time.perf_counter()
+    small = cv2.resize(image, extractor.working_size, interpolation=cv2.INTER_AREA)
+    tensor = torch.from_numpy(small).to(extractor.device).permute(2, 0, 1)[None].float() / 255.0
+    with torch.no_grad():
+        probability = extractor.probability(tensor)[0, 0].cpu().numpy()
+    height, width = image.shape[:2]
+    mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
+    seconds = time.perf_counter() - began
+    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(extractor.device))

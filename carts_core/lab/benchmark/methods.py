@@ -1,0 +1,54 @@
+"""The compared methods: the rows of the paper's main table, and what the default solver does with more to go by."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ...settings import DescentSolver, Loss, SolverName, SolverSettings, SurfaceSolver, solver
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way from images and measured kinematics to a mask."""
+
+    label: str
+    """For people."""
+    settings: Callable[[int], SolverSettings] | None
+    """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
+    and looks at no kinematics."""
+    occluders_given: bool = False
+    """It is given the occluders' pixels."""
+    every_camera: bool = False
+    """All cameras enter one objective."""
+    poses: bool = False
+    """The poses of all cameras but the first are free, too."""
+    calibrated: bool = False
+    """Base frames are those of one calibration of the whole recording."""
+    together: bool = False
+    """Frames are corrected together, as a sequence."""
+
+
+def _ours(_: int) -> SolverSettings:
+    return SurfaceSolver()
+
+
+def _start(_: int) -> SolverSettings:
+    return solver(SolverName.NONE)
+
+
+METHODS = {
+    "unet": Method("U-Net alone", None),
+    "start": Method("CaRTS without optimization", _start),
+    "l1": Method("CaRTS L1 (paper's setting)", lambda _: DescentSolver.paper(50, Loss.L1)),
+    "paper": Method("CaRTS ACS (paper's setting)", DescentSolver.paper),
+    "acs": Method("CaRTS ACS, our schedule", lambda _: DescentSolver()),
+    "ours": Method("CaRTS, ours", _ours),
+    "ours_given": Method("ours, occluder given", _ours, occluders_given=True),
+    "ours_proposed": Method("ours, ignore mask proposed", lambda _: solver(SolverName.OCCLUDED)),
+    "stereo": Method("ours, all cameras", _ours, every_camera=True),
+    "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),
+    "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
+    "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
+    "sequence": Method("ours, sequence mode", _ours, together=True),
+}
+MAIN = ("unet", "start", "l1", "paper", "ours")
+"""Methods of the main table: each frame alone, in one camera."""

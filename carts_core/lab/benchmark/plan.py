@@ -1,0 +1,81 @@
+"""Every run of a benchmark, in the order in which it is done."""
+
+from collections.abc import Sequence as Items
+
+from ...settings import DOMAINS
+from .methods import MAIN, METHODS
+from .occlusion import OCCLUSION
+from .scope import REAL, ROOMS, SYNTHETIC, Run, Scope
+from .sources import Source
+
+_UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
+
+
+def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
+    """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
+
+    Frames on which not all methods are evaluated come after that, then frames that are corrected together, and other
+    rooms last.
+    """
+    rooms = [source for source in sources if source.name.startswith(ROOMS)]
+    sources = [source for source in sources if source not in rooms]
+    runs: list[Run] = []
+    for turn in range(max((len(source.frames) for source in sources), default=0)):
+        for source in sources:
+            if turn < len(source.frames):
+                runs += _runs_of_frame(scope, source, source.frames[turn])
+    for source in sources:
+        for frame in source.further:
+            runs += _runs_of_further_frame(scope, source, frame)
+    together = [name for name, method in METHODS.items() if method.together]
+    runs += [
+        Run(source.name, domain, frame, method, error)
+        for source in sources
+        for error in (None, *(scope.consecutive_errors_deg if source.name == SYNTHETIC else ()))
+        for domain in scope.consecutive_domains
+        for method in together
+        for frame in source.consecutive
+    ]
+    return runs + [run for source in rooms for run in _runs_in_rooms(source)]
+
+
+def _runs_in_rooms(source: Source) -> list[Run]:
+    return [
+        Run(source.name, room, frame, method)
+        for room in source.rooms
+        for method, frames in (("ours", source.frames), ("acs", source.frames), ("sequence", source.consecutive))
+        for frame in frames
+    ]
+
+
+def _runs_of_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
+    runs = [Run(source.name, domain, frame, method) for domain in DOMAINS for method in MAIN]
+    if source.name == SYNTHETIC:
+        domains, ours, papers, hard = (
+            scope.error_domains,
+            scope.errors_deg,
+            scope.paper_errors_deg,
+            scope.hard_errors_deg,
+        )
+    else:
+        domains, ours, papers, hard = ("regular",), scope.real_errors_deg, scope.real_errors_deg, ()
+    runs += [Run(source.name, domain, frame, "ours", error) for error in ours for domain in domains]
+    runs += [Run(source.name, "regular", frame, "paper", error) for error in papers]
+    for error in (None, *hard):
+        runs += [Run(source.name, OCCLUSION, frame, method, error) for method in _UNDER_OCCLUDERS]
+        if len(source.cameras) > 1:
+            runs += [Run(source.name, "regular", frame, method, error) for method in ("stereo", "stereo_posed")]
+    if source.name == REAL:
+        runs += [Run(source.name, "regular", frame, method) for method, entry in METHODS.items() if entry.calibrated]
+    return runs
+
+
+def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
+    if source.name == REAL:
+        # One calibration serves the whole recording, and scoring it costs next to nothing.
+        return [Run(source.name, "regular", frame, "calibrated")]
+    return [
+        Run(source.name, domain, frame, "ours", error)
+        for error in scope.further_errors_deg
+        for domain in scope.error_domains
+    ]

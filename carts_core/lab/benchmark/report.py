@@ -1,0 +1,198 @@
+"""The report: one page, the plots beside it, and the same numbers as JSON and CSV."""
+
+import csv
+import io
+import json
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+
+from ...files import OutputPath, csv_cell, write_text
+from . import paper
+from .accuracy_tables import error_tables, iteration_tables, main_tables
+from .figures import write_figures
+from .frame import TOLERANCE
+from .further_tables import calibration_table, camera_table, occlusion_table, room_table, sequence_table
+from .measurement import Measurement
+from .page import PAGE
+from .speed_tables import pair_table, speed_table, stage_table, worse_table
+from .statistics import Measurements
+from .tables import Cell, Table
+from .target import Target
+from .targets import targets
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the report says about its origin."""
+
+    scope: str
+    """`quick` or `full`."""
+    planned: int
+    """Number of runs of the plan, measured or not."""
+    sources: dict[str, str]
+    """Name -> description."""
+    weights: str
+    """SHA-256 of the network's weights."""
+    code: str
+    """SHA-256 of the measured code."""
+    version: str
+
+
+def write_report(folder: OutputPath, measurements: list[Measurement], facts: Facts, stages: dict[str, float]) -> Path:
+    """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
+
+    Raises:
+        CartsError: the folder cannot be written to.
+    """
+    data = Measurements(measurements)
+    compared = data.compared()
+    verdicts = targets(data)
+    sections: list[tuple[str, list[Table]]] = [
+        ("Main table", main_tables(data)),
+        ("Iterations", iteration_tables(data)),
+        ("Error at the start", error_tables(compared)),
+        ("Occlusion", _known(occlusion_table(data))),
+        ("Several cameras", _known(camera_table(data))),
+        ("Calibration", _known(calibration_table(data))),
+        ("Sequence mode", _known(sequence_table(data))),
+        ("Other rooms", _known(room_table(data))),
+        ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
+        ("Stages", [stage_table(stages)] if stages else []),
+    ]
+    figures = write_figures(compared, folder / "figures")
+    rows = [_row(measurement) for measurement in measurements]
+    document = {
+        "format": "carts-benchmark/1",
+        "facts": asdict(facts),
+        "measured": len(measurements),
+        "machines": _machines(measurements),
+        "targets": [asdict(target) for target in verdicts],
+        "tables": [asdict(table) for _, tables in sections for table in tables],
+        "stages_ms": stages,
+        "paper": {
+            "source": paper.SOURCE,
+            "dice": paper.DICE,
+            "dice_by_iterations": paper.DICE_BY_ITERATIONS,
+            "dice_by_error": paper.DICE_BY_ERROR,
+            "mae_by_error": paper.MAE_BY_ERROR,
+        },
+        "runs": rows,
+    }
+    write_text(folder / "results.json", json.dumps(document, indent=1))
+    write_text(folder / "results.csv", _csv(rows))
+    page = Template(PAGE).substitute(
+        facts=_facts(facts, measurements),
+        targets=_targets(verdicts),
+        contents="".join(f'<a href="#{_anchor(title)}">{escape(title)}</a> ' for title, _ in sections),
+        sections="".join(_section(title, tables) for title, tables in sections),
+        figures="".join(_figure(caption, path.relative_to(folder.path)) for caption, path in figures.items()),
+        tolerance=f"{TOLERANCE:g}",
+        source=escape(paper.SOURCE),
+    )
+    path = folder / "report.html"
+    write_text(path, page)
+    return path.path
+
+
+def _known(*tables: Table | None) -> list[Table]:
+    return [table for table in tables if table is not None]
+
+
+def _row(measurement: Measurement) -> dict[str, object]:
+    """One run, flat."""
+    start, final = measurement.start, measurement.final
+    bests = {steps: measurement.best_of(steps) for steps in (30, 50)}
+    return {
+        **asdict(measurement.run),
+        "dice_start": start and start.dice,
+        "dice": final.dice,
+        **{f"dice_best_of_{steps}": best and best.dice for steps, best in bests.items()},
+        "nsd_start": start and start.nsd,
+        "nsd": final.nsd,
+        "joint_mae_deg_start": start and start.joint_mae_deg,
+        "joint_mae_deg": final.joint_mae_deg,
+        "visible_joint_mae_deg": final.visible_joint_mae_deg,
+        "tip_depth_mm": final.tip_depth_mm,
+        "iterations": measurement.iterations,
+        "seconds": final.seconds,
+        "made_worse": measurement.made_worse,
+        "stopped": measurement.stopped,
+    }
+
+
+def _csv(rows: list[dict[str, object]]) -> str:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(
+            {name: csv_cell(cell) if isinstance(cell, str) else cell for name, cell in row.items()} for row in rows
+        )
+    return text.getvalue()
+
+
+def _machines(measurements: list[Measurement]) -> list[str]:
+    return sorted({measurement.machine for measurement in measurements})
+
+
+def _facts(facts: Facts, measurements: list[Measurement]) -> str:
+    machines = _machines(measurements)
+    lines = {
+        "runs": f"{len(measurements)} of {facts.planned} measured ({facts.scope})",
+        **{f"{name} frames": description for name, description in facts.sources.items()},
+        "machine": "; ".join(machines) or "-",
+        "carts": f"{facts.version}, measured code {facts.code[:12]}",
+        "weights": facts.weights[:12],
+    }
+    rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in lines.items())
+    warnings = []
+    if len(measurements) < facts.planned:
+        warnings.append("Not everything has been measured yet; run the same command again to go on.")
+    if len(machines) > 1:
+        warnings.append("Runs come from more than one machine or number of threads, so seconds do not compare.")
+    notes = "".join(f'<p class="warning">{escape(warning)}</p>' for warning in warnings)
+    return f'<table class="facts">{rows}</table>{notes}'
+
+
+def _targets(verdicts: list[Target]) -> str:
+    words = {True: ("met", "met"), False: ("missed", "missed"), None: ("open", "open")}
+    rows = "".join(
+        f"<tr><td>{escape(target.what)}<small>{escape(target.basis)}</small></td>"
+        f"<td>{escape(target.target)}</td><td>{escape(target.reached)}</td>"
+        f'<td class="{words[target.met][0]}">{words[target.met][1]}</td><td>{escape(target.reference)}</td></tr>'
+        for target in verdicts
+    )
+    header = "".join(f"<th>{name}</th>" for name in ("what", "target", "reached", "verdict", "reference"))
+    return f'<table class="targets"><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table>'
+
+
+def _section(title: str, tables: list[Table]) -> str:
+    body = "".join(map(_table, tables)) or "<p>Not measured.</p>"
+    return f'<section id="{_anchor(title)}"><h2>{escape(title)}</h2>{body}</section>'
+
+
+def _anchor(title: str) -> str:
+    return title.lower().replace(" ", "-")
+
+
+def _table(table: Table) -> str:
+    header = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
+    rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
+    return (
+        f"<h3>{escape(table.title)}</h3><p>{escape(table.caption)}</p>"
+        f'<div class="wide"><table><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table></div>'
+    )
+
+
+def _cell(cell: Cell) -> str:
+    note = f"<small>{escape(cell.note)}</small>" if cell.note else ""
+    return f"<td>{escape(cell.text)}{note}</td>"
+
+
+def _figure(caption: str, path: Path) -> str:
+    return (
+        f'<figure><img src="{path.as_posix()}" alt="{escape(caption)}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )

@@ -1,0 +1,172 @@
+"""Does the runs that are not known yet, one after the other."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from ...console import Bar, PlainColumn
+from ...model.scene import Scene
+from ...networks.extractor import FeatureExtractor
+from ...optimization import Backgrounds, FreeParameters
+from ...recording import Frame
+from ...rendering import Renderer
+from ...wording import counted
+from .fingerprints import code_fingerprint, run_fingerprint
+from .frame import Truth, optimize, segment
+from .measurement import Measurement
+from .methods import METHODS
+from .occlusion import OCCLUSION, occlude
+from .scope import Run, Scope
+from .sources import Recording, Source
+from .store import ResultsFile
+from .together import calibrated_scene, correct_together
+
+_OCCLUDERS_SEED = 20
+
+
+class Benchmark:
+    """The runs of a scope over some sources, and the file that holds their results.
+
+    Args:
+        scope: how much is measured.
+        sources: where frames come from.
+        extractor: the feature network.
+        results: the results file.
+        runs: what is measured, in order.
+    """
+
+    def __init__(
+        self,
+        scope: Scope,
+        sources: Iterable[Source],
+        extractor: FeatureExtractor,
+        results: ResultsFile,
+        runs: Iterable[Run],
+    ) -> None:
+        self.scope, self.extractor, self.results = scope, extractor, results
+        self.sources = {source.name: source for source in sources}
+        self.runs = {run: run_fingerprint(run, scope, extractor, self.sources[run.source].fingerprint) for run in runs}
+
+    def measurements(self) -> list[Measurement]:
+        """What is known of the runs."""
+        found = (self.results.find(run, fingerprint) for run, fingerprint in self.runs.items())
+        return [measurement for measurement in found if measurement is not None]
+
+    def run(self, console: Console) -> None:
+        """Measure what is not known yet; stopping at any moment keeps what was measured.
+
+        Raises:
+            CartsError: a sequence cannot be made or read, or the results cannot be written.
+        """
+        todo = {run: key for run, key in self.runs.items() if self.results.find(run, key) is None}
+        if not todo:
+            return
+        columns = (
+            PlainColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
+            bench = {name: _Bench(source, bar) for name, source in self.sources.items()}
+            task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
+            while todo:
+                run = next(iter(todo))
+                group = self._group(run)
+                error = "" if run.error_deg is None else f", {run.error_deg:g} deg off"
+                which = f"frame {run.frame}" if len(group) == 1 else counted(len(group), "frame")
+                description = f"{run.source}, {run.domain}, {which}: {run.method}{error}"
+                bar.update(task, description=description)
+                for measurement in bench[run.source].measure(group, self.scope, self.extractor):
+                    facts = {"weights": self.extractor.sha256, "code": code_fingerprint()}
+                    self.results.append(measurement, self.runs[measurement.run], **facts)
+                    bar.advance(task, todo.pop(measurement.run, None) is not None)
+                _log(console, f"{len(self.runs) - len(todo)} of {len(self.runs)}: {description}")
+            bar.update(task, description="measured")
+
+    def _group(self, run: Run) -> list[Run]:
+        """The runs that are measured at once with this one."""
+        if not METHODS[run.method].together:
+            return [run]
+        return [other for other in self.runs if replace(other, frame=run.frame) == run]
+
+
+def _log(console: Console, line: str) -> None:
+    """Tell a file or a pipe, which no bar can be drawn in, how things go."""
+    if not console.is_terminal:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+class _Bench:
+    """One source, opened when its first run comes."""
+
+    def __init__(self, source: Source, bar: Bar) -> None:
+        self._source, self._bar = source, bar
+        self._opened: tuple[Recording, Renderer] | None = None
+        self._calibrated: Scene | None = None
+
+    def measure(self, runs: list[Run], scope: Scope, extractor: FeatureExtractor) -> list[Measurement]:
+        """Measure a run, or all runs of one method that corrects frames together."""
+        if not METHODS[runs[0].method].together:
+            return [self._measure_alone(runs[0], scope, extractor)]
+        recording, renderer = self._open()
+        truths = {run.frame: self._truth(recording.frame(run.frame, cameras=[self._source.camera])) for run in runs}
+        return correct_together(runs, recording, extractor, truths, renderer)
+
+    def _measure_alone(self, run: Run, scope: Scope, extractor: FeatureExtractor) -> Measurement:
+        recording, renderer = self._open()
+        method, camera = METHODS[run.method], self._source.camera
+        cameras = self._source.cameras if method.every_camera else (camera,)
+        covered = run.domain == OCCLUSION
+        frame = recording.frame(run.frame, None if covered else run.domain, cameras)
+        truth = self._truth(frame)
+        if covered:
+            frame, truth = self._covered(frame, truth)
+        if method.settings is None:
+            return segment(run, frame.images[camera], extractor, truth)
+        settings = method.settings(scope.steps(run))
+        domain = "regular" if covered else run.domain
+        backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
+        ignore = {camera: truth.hidden} if method.occluders_given and truth.hidden is not None else None
+        known = self._calibration(scope, extractor) if method.calibrated else recording.scene
+        scene = known.with_cameras(cameras)
+        free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))
+        return optimize(run, scene, frame, backgrounds, extractor, settings, free, truth, renderer, ignore)
+
+    def _truth(self, frame: Frame) -> Truth:
+        recording, _ = self._open()
+        assert frame.masks is not None
+        camera = self._source.camera
+        return Truth(camera, frame.masks[camera], frame.truth or {}, recording.measured_joints)
+
+    def _covered(self, frame: Frame, truth: Truth) -> tuple[Frame, Truth]:
+        rng = np.random.default_rng((_OCCLUDERS_SEED, frame.index))
+        found = occlude(frame.images[truth.camera], truth.mask, rng)
+        return replace(frame, images={truth.camera: found.image}), replace(truth, hidden=found.hidden)
+
+    def _calibration(self, scope: Scope, extractor: FeatureExtractor) -> Scene:
+        if self._calibrated is None:
+            recording, _ = self._open()
+            description = f"calibrating with {counted(scope.calibration_frames, 'frame')}"
+            task = self._bar.add_task(description, total=None)
+            _log(self._bar.console, f"{self._source.name}: {description}")
+            self._calibrated = calibrated_scene(recording, self._source.camera, scope.calibration_frames, extractor)
+            self._bar.remove_task(task)
+        return self._calibrated
+
+    def _open(self) -> tuple[Recording, Renderer]:
+        if self._opened is None:
+            task = self._bar.add_task("opening", total=None)
+
+            def report(what: str, done: int, total: int) -> None:
+                self._bar.update(task, description=what, completed=done, total=total)
+                _log(self._bar.console, f"{self._source.name}: {what}, {done} of {total}")
+
+            recording = self._source.open(report)
+            self._bar.remove_task(task)
+            self._opened = recording, Renderer(recording.scene, cameras=[self._source.camera])
+        return self._opened

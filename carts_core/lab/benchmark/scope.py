@@ -1,0 +1,129 @@
+"""What a run is, and how much of everything a benchmark measures."""
+
+from dataclasses import dataclass, replace
+
+from ...errors import SettingsError
+from ...settings import DOMAINS
+
+SYNTHETIC = "synthetic"
+REAL = "real"
+ROOMS = "rooms"
+"""Real instruments in other rooms; a source of that name and the camera's."""
+PAPERS_STEPS = 50
+"""The paper's number of steps."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One method on one frame from one start."""
+
+    source: str
+    """`synthetic`, `real`, or `rooms` and a camera."""
+    domain: str
+    """One of the synthetic domains, `occlusion`, or a room."""
+    frame: int
+    """Position in the sequence."""
+    method: str
+    """A name in `methods.METHODS`."""
+    error_deg: float | None = None
+    """How far every joint is off at the start [deg, mm for prismatic ones], from the true joint positions where they
+    are known; None starts at the measured ones."""
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much is measured."""
+
+    frames: int
+    """Frames of each sequence, evenly spread, on which all methods are evaluated."""
+    sequence_frames: int
+    """Frames of the synthetic sequence that is made; all of them serve the estimate of the background."""
+    samples: int
+    """Paths per pixel of the synthetic sequence."""
+    paper_iterations: int
+    """Steps in the paper's setting from the measured joint positions, `PAPERS_STEPS` at most from others. Its schedule
+    does not depend on their number, so one run holds all shorter ones."""
+    error_domains: tuple[str, ...]
+    """Synthetic domains in which the start is put off on purpose."""
+    errors_deg: tuple[float, ...]
+    """Sizes of that error for the default solver [deg]."""
+    paper_errors_deg: tuple[float, ...]
+    """The same for the paper's setting, in the regular domain [deg]."""
+    further_errors_deg: tuple[float, ...]
+    """The same for the default solver on the frames of the synthetic sequence that are not among the evaluated ones, so
+    that its figures hang on more than these [deg]."""
+    real_errors_deg: tuple[float, ...]
+    """The same on real frames, both methods, in the regular domain, from the measured joint positions [deg]."""
+    hard_errors_deg: tuple[float, ...]
+    """The same on synthetic frames with occluders, and with all cameras at once [deg]."""
+    consecutive: int
+    """Frames of the beginning of each sequence that are corrected together, at most."""
+    consecutive_domains: tuple[str, ...]
+    """Domains in which they are."""
+    consecutive_errors_deg: tuple[float, ...]
+    """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
+    calibration_frames: int
+    """Frames of a real sequence that are calibrated with, evenly spread."""
+    room_frames: int
+    """Frames of a real sequence that are put into each of the other rooms, evenly spread."""
+    room_consecutive: int
+    """Frames, likewise, that are corrected together there."""
+    room_share: int
+    """Only every so many rooms are measured."""
+
+    def steps(self, run: Run) -> int:
+        """Steps in the paper's setting for a run."""
+        return self.paper_iterations if run.error_deg is None else min(self.paper_iterations, PAPERS_STEPS)
+
+    def with_frames(self, frames: int) -> "Scope":
+        """The same with another number of evaluated frames.
+
+        Raises:
+            SettingsError: it is less than one, or more than the synthetic sequence has.
+        """
+        if not 1 <= frames <= self.sequence_frames:
+            raise SettingsError(
+                f"--frames is {frames}; the synthetic sequence has {self.sequence_frames}. Give 1 to "
+                f"{self.sequence_frames}."
+            )
+        return replace(self, frames=frames)
+
+
+QUICK = Scope(
+    frames=2,
+    sequence_frames=3,
+    samples=4,
+    paper_iterations=PAPERS_STEPS,
+    error_domains=("regular",),
+    errors_deg=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
+    paper_errors_deg=(2.0,),
+    further_errors_deg=(),
+    real_errors_deg=(),
+    hard_errors_deg=(2.0,),
+    consecutive=6,
+    consecutive_domains=("regular",),
+    consecutive_errors_deg=(2.0,),
+    calibration_frames=8,
+    room_frames=1,
+    room_consecutive=0,
+    room_share=8,
+)
+FULL = Scope(
+    frames=8,
+    sequence_frames=24,
+    samples=8,
+    paper_iterations=100,
+    error_domains=DOMAINS,
+    errors_deg=QUICK.errors_deg,
+    paper_errors_deg=QUICK.errors_deg,
+    further_errors_deg=(1.0, 2.0, 3.0, 5.0),
+    real_errors_deg=(1.0, 2.0, 3.0),
+    hard_errors_deg=(2.0,),
+    consecutive=30,
+    consecutive_domains=DOMAINS,
+    consecutive_errors_deg=(1.0, 2.0, 3.0),
+    calibration_frames=20,
+    room_frames=2,
+    room_consecutive=8,
+    room_share=1,
+)

@@ -1,0 +1,217 @@
+"""Where the evaluated frames come from: a synthetic sequence that nothing was tuned on, and a real one if given."""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ...errors import SettingsError
+from ...files import holds_file, output_path
+from ...model.mesh_cache import cache_dir
+from ...model.scene import Scene
+from ...recording import Frame, MeanBackground, Sequence
+from ...recording.background import spread
+from ...settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
+from ...wording import counted
+from ..synthesis.layout import place_cameras
+from ..synthesis.synthesize import Progress, synthesize
+from .another_room import AnotherRoom
+from .backdrop import backdrop
+from .counterfactual import Counterfactual
+from .fingerprints import code_fingerprint
+from .rooms import made_rooms, photographs
+from .scope import REAL, ROOMS, SYNTHETIC, Scope
+
+TEST_SEED = 730_511
+"""Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
+_MOTION_SECONDS = 6.0
+_SYNTHESIS = ("lab/synthesis/*.py", "settings/synthesis.py")
+_ROOMS_CODE = ("lab/benchmark/another_room.py", "lab/benchmark/rooms.py")
+_ALTERING_CODE = (
+    "lab/benchmark/backdrop.py",
+    "lab/benchmark/counterfactual.py",
+    "lab/benchmark/real_surface.py",
+)
+
+
+class Recording(Protocol):
+    """What `Sequence` and `Counterfactual` have in common."""
+
+    scene: Scene
+    measured_joints: dict[str, tuple[str, ...]]
+    timestamps: Float[np.ndarray, " frames"] | None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
+        """One frame in a domain."""
+        ...
+
+    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """The mean background in a domain."""
+        ...
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known."""
+        ...
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames to evaluate. Nothing is rendered before `open` is called."""
+
+    name: str
+    """`synthetic`, `real`, or `rooms` and a camera."""
+    description: str
+    """For people: which frames these are."""
+    camera: str
+    """The camera that takes part, and in which is scored."""
+    frames: list[int]
+    """Positions of the frames on which all methods are evaluated."""
+    fingerprint: str
+    """Of images and kinematics."""
+    open: Callable[[Progress], Recording]
+    cameras: tuple[str, ...] = ()
+    """All cameras that see the regular domain."""
+    consecutive: list[int] = field(default_factory=list)
+    """Positions of frames that are corrected together."""
+    rooms: list[str] = field(default_factory=list)
+    """The rooms that these frames are put into, where that is what the source does."""
+
+    @property
+    def further(self) -> list[int]:
+        """Positions of the frames that are corrected together, but not evaluated by all methods."""
+        return [index for index in self.consecutive if index not in self.frames]
+
+
+def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
+    """A synthetic sequence; it is made when it is first opened, and kept in the cache.
+
+    Raises:
+        SettingsError: the seed is that of the shipped sequence.
+    """
+    if seed == SynthesisConfig().seed:
+        raise SettingsError(
+            f"--seed {seed} is the shipped sequence's, on which settings were chosen. Any other seed will do; "
+            f"the default is {TEST_SEED}."
+        )
+    frames = scope.sequence_frames
+    config = SynthesisConfig(
+        seed=seed,
+        name=f"fresh {seed}",
+        endoscope=EndoscopeConfig(stereo=True),
+        motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
+        render=RenderConfig(samples=scope.samples),
+    )
+    code = code_fingerprint(_SYNTHESIS)
+    fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
+    folder = output_path(cache_dir(), "benchmark", f"sequence_{seed}_{fingerprint[:8]}")
+
+    def open_(progress: Progress) -> Sequence:
+        file = folder / "sequence.toml"
+        if not holds_file(file):
+            synthesize(config, folder, progress)
+        return Sequence.open(file.path)
+
+    evaluated = spread(frames, scope.frames)
+    what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
+    taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
+    return Source(
+        SYNTHETIC,
+        f"{what}, {taken}",
+        "left",
+        evaluated,
+        fingerprint,
+        open_,
+        cameras=tuple(camera.name for camera in place_cameras(config.endoscope)),
+        consecutive=list(range(min(frames, scope.consecutive))),
+    )
+
+
+def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
+    """The frames of a real sequence that have a mask, in its first camera.
+
+    Raises:
+        SequenceError: the sequence is not usable.
+        SettingsError: no frame has a mask.
+    """
+    sequence = Sequence.open(path)
+    camera = sequence.scene.cameras[0]
+    masked = [index for index in range(len(sequence)) if camera.name in (sequence.frame(index).masks or {})]
+    if not masked:
+        raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
+    frames = [masked[place] for place in spread(len(masked), scope.frames)]
+    code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
+    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
+    consecutive = masked[: scope.consecutive]
+    calibrating = spread(len(sequence), scope.calibration_frames)
+    for index in sorted({*frames, *consecutive, *calibrating}):
+        frame = sequence.frame(index)
+        fingerprint.update(b"".join(image.tobytes() for image in frame.images.values()))
+        fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
+
+    def open_(progress: Progress) -> Counterfactual:
+        progress("backdrop of the real frames", 0, 1)
+        return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
+
+    taken = f"{len(frames)} of {counted(len(masked), 'frame')} with masks by all methods"
+    return Source(
+        REAL,
+        f"{sequence.name}, camera {camera.name}, {taken}",
+        camera.name,
+        frames,
+        fingerprint.hexdigest()[:32],
+        open_,
+        cameras=tuple(camera.name for camera in sequence.scene.cameras),
+        consecutive=consecutive,
+    )
+
+
+def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
+    """The frames of a real sequence that have a mask, put into other rooms: a source for each camera that has masks.
+
+    Args:
+        path: of the sequence.
+        folder: with photographs, which are rooms beside the made ones; None for no photographs.
+        scope: how much is measured.
+        seed: of light and noise.
+
+    Raises:
+        SequenceError: the sequence is not usable.
+        SettingsError: the folder holds no photograph.
+    """
+    sequence = Sequence.open(path)
+    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
+    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code_fingerprint(_ROOMS_CODE))).encode())
+    for photograph in sorted(folder.glob("*")) if folder else []:
+        fingerprint.update(photograph.name.encode() + photograph.read_bytes())
+    sources = []
+    for camera in (known.name for known in sequence.scene.cameras):
+        masked = [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]
+        if not masked:
+            continue
+        frames = [masked[place] for place in spread(len(masked), scope.room_frames + 2)[1:-1]]
+        together = [masked[place] for place in spread(len(masked), scope.room_consecutive)]
+        for index in sorted({*frames, *together}):
+            frame = sequence.frame(index, cameras=[camera])
+            fingerprint.update(frame.images[camera].tobytes())
+            fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
+        sources.append(
+            Source(
+                f"{ROOMS} {camera}",
+                f"{sequence.name}, camera {camera}, {counted(len(frames), 'frame')} in {counted(len(rooms), 'room')}",
+                camera,
+                frames,
+                fingerprint.hexdigest()[:32],
+                lambda _: AnotherRoom(sequence, rooms, seed),
+                consecutive=together,
+                rooms=[room.domain for room in rooms],
+            )
+        )
+    return sources

@@ -1,0 +1,243 @@
+"""Path-traced radiance (Mitsuba 3, `scalar_rgb`): a shading path that shares nothing with the optimizer's renderer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import rank_filter
+
+from ...errors import CartsError
+from ...model.camera import Camera
+from ...settings import RenderConfig
+from .tissue import Tissue
+
+LIGHTS_CAMERA = ((-0.0042, -0.0030, 0.0), (0.0042, -0.0030, 0.0))
+"""Ends of the two light guides beside the lens, in the camera's frame [m]."""
+INTENSITY = 0.0055
+"""Radiant intensity of each light [1/sr]; only ratios matter, since exposure is adjusted."""
+_TINT = (1.02, 1.0, 0.94)
+NEAR = 0.002
+"""Nothing nearer to the lens than this is seen [m]."""
+
+
+@cache
+def _mitsuba() -> ModuleType:
+    try:
+        mitsuba = import_module("mitsuba")
+    except ImportError as error:
+        raise CartsError(
+            "Synthetic images are path-traced with Mitsuba 3, which is not installed. "
+            "Install it with: pip install 'carts[synthesis]'"
+        ) from error
+    mitsuba.set_variant("scalar_rgb")
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    return mitsuba
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of an instrument at its place in the world."""
+
+    arm: int
+    """Index of the arm."""
+    link: int
+    """Index of the link among all links of all arms, for `Surface.link`."""
+    vertices: Float[np.ndarray, "v 3"]
+    """In the world [m]."""
+    normals: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    metal: bool
+    """Steel, or else the dark plastic of the shaft."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What each pixel's centre area sees, one ray per pixel."""
+
+    position: Float[np.ndarray, "h w 3"]
+    """Point in the world [m]."""
+    normal: Float[np.ndarray, "h w 3"]
+    """Unit normal in the world."""
+    link: Int[np.ndarray, "h w"]
+    """Link index of `Part.link`, -1 on tissue."""
+    depth: Float[np.ndarray, "h w"]
+    """Distance along the camera's z axis [m]."""
+
+
+class PathTracer:
+    """Renders instruments over one patch of tissue, with the light beside the first camera.
+
+    Raises:
+        CartsError: Mitsuba is not installed.
+    """
+
+    def __init__(self, tissue: Tissue, config: RenderConfig) -> None:
+        self._mi = _mitsuba()
+        self._config = config
+        self._tissue_mesh = vertices, normals, faces, uv = tissue.mesh()
+        material = {
+            "type": "principled",
+            "base_color": self._texture(tissue.albedo),
+            "roughness": self._texture(tissue.roughness[..., None]),
+            "specular": 0.5,
+            "clearcoat": 0.6,
+            "clearcoat_gloss": 0.92,
+        }
+        mesh = self._mesh("tissue", vertices, faces, material, uv=uv, normals=normals)
+        # In a group of its own, the tissue is sorted into the ray tracer's tree once, and not anew for every picture.
+        group = self._mi.load_dict({"type": "shapegroup", "mesh": mesh})
+        self._tissue: dict[str, Any] = {"tissue": group, "tissue_place": {"type": "instance", "group": group}}
+
+    def radiance(
+        self, parts: Sequence[Part], camera: Camera, T_light_world: np.ndarray, seed: int
+    ) -> Float[np.ndarray, "h w 3"]:
+        """Linear RGB radiance, in arbitrary units.
+
+        Args:
+            parts: the instruments.
+            camera: the camera.
+            T_light_world: frame that `LIGHTS_CAMERA` is given in: that of the camera beside which the light is.
+            seed: of the sampler.
+        """
+        T_world_light = np.linalg.inv(T_light_world)
+        scene = self._instruments(parts, lambda part: _METAL if part.metal else _PLASTIC)
+        scene |= self._tissue
+        integrator = {"type": "path", "max_depth": self._config.bounces, "rr_depth": 16}
+        samples = -(-self._config.samples // len(LIGHTS_CAMERA))
+        # One light at a time: choosing between them at random would be most of the picture's noise.
+        total = np.zeros((camera.height, camera.width, 3), np.float32)
+        for number, place in enumerate(LIGHTS_CAMERA):
+            light = {
+                "type": "point",
+                "position": list((T_world_light @ np.append(place, 1.0))[:3]),
+                "intensity": {"type": "rgb", "value": [INTENSITY * tint for tint in _TINT]},
+            }
+            total += self._render(scene | {"light": light}, integrator, camera, samples, 2 * seed + number)[..., :3]
+        return _without_specks(total)
+
+    def coverage(self, parts: Sequence[Part], camera: Camera, samples: int = 16) -> Float[np.ndarray, "h w"]:
+        """Part of each pixel that instruments cover in front of the tissue, in [0, 1].
+
+        The tissue and the space around it glow, the instruments are black: no side of a mesh can be missed.
+        """
+        scene = self._instruments(parts, lambda part: _BLACK)
+        glow = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+        vertices, _, faces, _ = self._tissue_mesh
+        scene["tissue"] = self._mesh("tissue", vertices, faces, _BLACK, emitter=glow)
+        scene["space"] = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
+        return 1.0 - self._render(scene, {"type": "path", "max_depth": 1}, camera, samples, 0)[..., 0]
+
+    def surface(self, parts: Sequence[Part], camera: Camera, seed: int) -> Surface:
+        """What each pixel sees."""
+        scene = self._instruments(parts, lambda part: _BLACK)
+        scene |= self._tissue
+        integrator = {"type": "aov", "aovs": "position:position,normal:sh_normal,shape:shape_index"}
+        layers = self._render(scene, integrator, camera, 1, seed)
+        position, normal = layers[..., :3].astype(np.float64), layers[..., 3:6]
+        # Mitsuba counts shapes from 1, in the scene's order: first the parts, then the tissue; 0 is nothing at all.
+        links = np.array([-1, *(part.link for part in parts), -1], dtype=np.int32)
+        shape = np.round(layers[..., 6]).astype(int)
+        T_camera_world = camera.T_camera_world
+        depth = position @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        return Surface(position, normal, links[shape], depth)
+
+    def _instruments(self, parts: Sequence[Part], material: Any) -> dict[str, Any]:
+        scene: dict[str, Any] = {"type": "scene"}
+        for number, part in enumerate(parts):
+            scene[f"a_part_{number:03d}"] = self._mesh(
+                f"part{number}", part.vertices, part.faces, material(part), normals=part.normals
+            )
+        return scene
+
+    def _texture(self, values: np.ndarray) -> dict[str, Any]:
+        return {"type": "bitmap", "bitmap": self._mi.Bitmap(np.ascontiguousarray(values, np.float32)), "raw": True}
+
+    def _mesh(
+        self,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        material: dict[str, Any],
+        *,
+        uv: np.ndarray | None = None,
+        normals: np.ndarray | None = None,
+        emitter: dict[str, Any] | None = None,
+    ) -> Any:
+        properties = self._mi.Properties()
+        properties["material"] = self._mi.load_dict(material)
+        if emitter is not None:
+            properties["glow"] = self._mi.load_dict(emitter)
+        mesh = self._mi.Mesh(
+            name,
+            len(vertices),
+            len(faces),
+            props=properties,
+            has_vertex_normals=normals is not None,
+            has_vertex_texcoords=uv is not None,
+        )
+        parameters = self._mi.traverse(mesh)
+        parameters["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
+        parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+        if normals is not None:
+            parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
+        if uv is not None:
+            parameters["vertex_texcoords"] = np.ascontiguousarray(uv, np.float32).ravel()
+        parameters.update()
+        return mesh
+
+    def _render(
+        self, scene: dict[str, Any], integrator: dict[str, Any], camera: Camera, samples: int, seed: int
+    ) -> np.ndarray:
+        fx, _, cx, cy = camera.intrinsics
+        # Mitsuba's camera has x to the left and y up where ours has x to the right and y down.
+        T_world_sensor = np.linalg.inv(camera.T_camera_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        scene = scene | {
+            "integrator": integrator,
+            "sensor": {
+                "type": "perspective",
+                "fov_axis": "x",
+                "fov": float(np.rad2deg(2.0 * np.arctan(camera.width / (2.0 * fx)))),
+                "principal_point_offset_x": float(0.5 - cx / camera.width),
+                "principal_point_offset_y": float(0.5 - cy / camera.height),
+                "near_clip": NEAR,
+                "far_clip": 10.0,
+                "to_world": self._mi.ScalarTransform4f(T_world_sensor),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "independent", "sample_count": samples},
+            },
+        }
+        return np.array(self._mi.render(self._mi.load_dict(scene), spp=samples, seed=seed))
+
+
+_METAL: dict[str, Any] = {
+    "type": "roughconductor",
+    "material": "Cr",
+    "alpha": 0.22,
+    "specular_reflectance": {"type": "rgb", "value": [0.92, 0.92, 0.90]},
+}
+_PLASTIC: dict[str, Any] = {
+    "type": "roughplastic",
+    "diffuse_reflectance": {"type": "rgb", "value": [0.022, 0.022, 0.024]},
+    "alpha": 0.22,
+}
+_BLACK: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+
+
+def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """The picture with its fireflies cut down: rare paths that bring so much light that one pixel glares.
+
+    Real glints are wider than a pixel, so no pixel needs to be far brighter than the third brightest of its nine.
+    """
+    limit = np.stack([rank_filter(image[..., channel], rank=-3, size=3) for channel in range(3)], axis=-1)
+    return np.minimum(image, 1.25 * limit)

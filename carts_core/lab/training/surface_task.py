@@ -1,0 +1,126 @@
+"""Learning to see surfaces: what `SurfaceNetwork` is trained on, what it minimises, how well it does."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from ...model.parts import PARTS
+from ...model.robot import Robot
+from ...model.surface import COVERAGE, NORMALS
+from ...networks.surface_network import SurfaceNetwork
+from ...settings import TrainingConfig
+from ..randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
+from .objective import dilated, weighted_mean
+from .task import Batch, byte_tensor, flips
+from .validation import dice
+
+_SMOOTH = 0.2
+
+
+class SurfaceTask:
+    """See `Task`. A batch is images, believed surface maps and true surface maps."""
+
+    columns: ClassVar[dict[str, str]] = {
+        "dice": "Dice of the arms",
+        "dice_believed": "Dice of what was believed",
+        "part_accuracy": "pixels with the right part",
+        "normal_error_deg": "error of normals [deg]",
+    }
+
+    def network(self, config: TrainingConfig) -> SurfaceNetwork:
+        """A network with random weights."""
+        return SurfaceNetwork(config.architecture)
+
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
+        """An endless source of samples."""
+        return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
+
+    def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:
+        """A sample mirrored; normals turn with it."""
+        observed, believed, surface = (
+            flips(part, horizontally, vertically) for part in (sample.observed, sample.believed, sample.surface)
+        )
+        turn = np.ones(surface.shape[2], np.int8)
+        turn[NORMALS.start] = -1 if horizontally else 1
+        turn[NORMALS.start + 1] = -1 if vertically else 1
+        return SurfaceSample(observed, believed * turn, surface * turn)
+
+    def tensors(self, sample: SurfaceSample) -> Batch:
+        """A sample as tensors of bytes."""
+        return byte_tensor(sample.observed), byte_tensor(sample.believed), byte_tensor(sample.surface)
+
+    def loss(self, config: TrainingConfig, network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss, and each term before weighting."""
+        images, believed, surface = _floats(batch)
+        predicted = network(images, believed)
+        coverage = surface[:, COVERAGE]
+        near = dilated((coverage.sum(1) > 0).float())
+        background = (1 - coverage.sum(1, keepdim=True)).clamp(min=0)
+        entropy = functional.cross_entropy(predicted.coverage, torch.cat([background, coverage], 1), reduction="none")
+        difference = functional.smooth_l1_loss(predicted.normals, surface[:, NORMALS], reduction="none", beta=_SMOOTH)
+        terms = {
+            "everywhere": entropy.mean(),
+            "near": weighted_mean(entropy, near),
+            "dice": _part_dice_loss(predicted.map()[:, COVERAGE], coverage),
+            "normals": weighted_mean(difference.sum(1), near),
+        }
+        weights = config.surface_objective
+        return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
+
+    @torch.no_grad()
+    def validate(self, network: SurfaceNetwork, batch: Batch) -> dict[str, float]:
+        """Figures of a folded network."""
+        images, believed, surface = _floats(batch)
+        seen = torch.cat([network(images[i : i + 8], believed[i : i + 8]).map() for i in range(0, len(images), 8)])
+        true, guess = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (surface, seen))
+        known = believed[:, COVERAGE].sum(1) > 0.5
+        ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
+        cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
+        return {
+            "dice": float(dice(guess, true).mean()),
+            "dice_believed": float(dice(known, true).mean()),
+            "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
+            "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
+        }
+
+    @torch.no_grad()
+    def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+        """Example predictions of a folded network."""
+        images, believed, surface = _floats(batch)
+        seen = network(images, believed).map()
+        rows = []
+        for image, wrong, found, true in zip(images, believed, seen, surface, strict=True):
+            rows.append(
+                [
+                    ("observed", image.permute(1, 2, 0).numpy()),
+                    ("believed", _colors(wrong[COVERAGE])),
+                    ("predicted parts", _colors(found[COVERAGE])),
+                    ("true parts", _colors(true[COVERAGE])),
+                    ("predicted normals", _colors(0.5 + 0.5 * found[NORMALS])),
+                    ("true normals", _colors(0.5 + 0.5 * true[NORMALS])),
+                ]
+            )
+        return rows
+
+
+def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    images, believed, surface = batch
+    images = (images.float() / 255).contiguous(memory_format=torch.channels_last)
+    return images, believed.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
+
+
+def _part_dice_loss(
+    predicted: Float[Tensor, "batch parts h w"], coverage: Float[Tensor, "batch parts h w"]
+) -> Float[Tensor, ""]:
+    assert predicted.shape[1] == len(PARTS)
+    overlap = (predicted * coverage).sum((2, 3))
+    return 1 - ((2 * overlap + 1) / (predicted.sum((2, 3)) + coverage.sum((2, 3)) + 1)).mean()
+
+
+def _colors(channels: Float[Tensor, "3 h w"]) -> np.ndarray:
+    return channels.clamp(0, 1).permute(1, 2, 0).cpu().numpy()

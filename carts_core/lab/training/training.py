@@ -1,0 +1,261 @@
+"""Training of the feature network: `train` runs, resumes and reports."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from ...errors import SettingsError
+from ...files import locked_folder, output_path
+from ...networks.network import UNet, channels_last
+from ...networks.weights import read_weights, save_weights
+from ...settings import Architecture, TrainingConfig
+from ...stopping import finished_first, when_stopped
+from ...wording import counted
+from .checkpoint import History, load_checkpoint, save_checkpoint
+from .growth import grow
+from .loader import training_batches, validation_set
+from .report import write_report
+from .task import Batch
+from .tasks import task_of
+
+_LOG_EVERY = 10
+_EXAMPLES = 6
+_MAY_CHANGE = ("steps", "minutes", "workers", "threads", "device", "validation_every", "checkpoint_every")
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Where a run stands; one per logged step."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps in all; an estimate in a run of limited time."""
+    loss: float
+    """Loss, averaged over the last steps."""
+    seconds_per_step: float
+    """Wall time per step [s]."""
+    validation: dict[str, float] | None
+    """The newest validation."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a finished run leaves behind."""
+
+    weights: Path
+    """Weights file, ready for `FeatureExtractor.load`."""
+    report: Path
+    """The training report."""
+    validation: dict[str, float]
+    """Figures of the saved weights."""
+    seconds: float
+    """Wall time spent in training steps, over all resumed parts [s]."""
+
+
+def train(
+    config: TrainingConfig, output: Path, progress: Callable[[TrainingProgress], None] | None = None
+) -> TrainingResult:
+    """Train a feature network, or go on with the run that `output` holds.
+
+    The run writes `checkpoint.safetensors` now and then, `features.safetensors` after every validation, and
+    `report/` at the end. After a kill the same call goes on from the last checkpoint.
+
+    Raises:
+        SettingsError: `output` holds a run with other settings.
+        WeightsError: its checkpoint, or the weights to start from, cannot be read.
+        RobotError: a robot cannot be loaded.
+        OutputError: `output` cannot be written to, or another process trains there.
+    """
+    torch.set_num_threads(config.threads)
+    with locked_folder(output):
+        run = _Run(_as_large_as_start(config), output)
+        try:
+            with when_stopped(run.kept):
+                return run.finish(progress or (lambda event: None))
+        except KeyboardInterrupt:
+            run.save()
+            raise
+
+
+class _Run:
+    """The state of one training run."""
+
+    def __init__(self, config: TrainingConfig, output: Path) -> None:
+        self.config, self.output, self.task = config, output, task_of(config.network)
+        torch.manual_seed(config.seed)
+        self.network = channels_last(_first_network(config).to(config.device))
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.modules = {"network": self.network, "average": self.average}
+        self.step, self.history = 0, History()
+        self._resume()
+        self._saved = self.step
+        self._clock = time.perf_counter()
+
+    def _resume(self) -> None:
+        checkpoint = load_checkpoint(self.output)
+        if checkpoint is None:
+            return
+        before, now = json.loads(checkpoint.config_json), json.loads(config_json(self.config))
+        changed = [name for name in now if name not in _MAY_CHANGE and before.get(name) != now[name]]
+        if changed:
+            details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
+            raise SettingsError(
+                f"{self.output} holds a run with other settings: {details}. Give the same settings to go on with it, "
+                "or another output folder to start anew."
+            )
+        checkpoint.restore(self.modules, self.optimizer)
+        self.step, self.history = checkpoint.step, checkpoint.history
+
+    def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
+        samples = validation_set(self.config)
+        validation = None
+        if self.step < self._planned():
+            batches = training_batches(self.config, self.step)
+            sums: dict[str, float] = {}
+            count, self._clock = 0, time.perf_counter()
+            last = False
+            while not last:
+                batch = next(batches)
+                with finished_first():
+                    terms = self._train_step(batch)
+                for name, value in terms.items():
+                    sums[name] = sums.get(name, 0.0) + value
+                count += 1
+                last = self.step == self._planned()
+                if last or self.step % self.config.validation_every == 0:
+                    validation = self._validate(samples)
+                if last or count == _LOG_EVERY:
+                    means = {name: value / count for name, value in sums.items()}
+                    self.history.losses.append({"step": self.step, **means})
+                    elapsed = time.perf_counter() - self._clock
+                    self.history.seconds += elapsed
+                    progress(TrainingProgress(self.step, self._planned(), means["loss"], elapsed / count, validation))
+                    sums, count, self._clock = {}, 0, time.perf_counter()
+                if last or self.step % self.config.checkpoint_every == 0:
+                    self._checkpoint()
+        if validation is None:
+            validation = self.task.validate(self._averaged().folded(), samples)
+            self._save(validation)
+        examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
+        folder = output_path(self.output, "report")
+        report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
+        return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
+
+    def save(self) -> None:
+        """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""
+        if self.step > self._saved:
+            self.history.seconds += time.perf_counter() - self._clock
+            self._checkpoint()
+
+    def kept(self) -> str:
+        """What there is of a run that is stopped, for people."""
+        if self.step == 0:
+            return "no step was made, nothing was kept"
+        steps = counted(self.step, "step")
+        return f"{self.output} holds {steps}; the same command goes on from there"
+
+    def _planned(self) -> int:
+        """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
+        if self.config.minutes is None or self.step == 0:
+            return self.config.steps
+        seconds = self.history.seconds + time.perf_counter() - self._clock
+        return min(self.config.steps, max(self.step, int(self.step * 60 * self.config.minutes / seconds)))
+
+    def _train_step(self, batch: Batch) -> dict[str, float]:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self._planned())
+        self.network.train()
+        on_device = tuple(part.to(self.config.device) for part in batch)
+        loss, terms = self.task.loss(self.config, self.network, on_device)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimizer.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+
+    def _averaged(self) -> UNet:
+        network = self.average.module
+        assert isinstance(network, UNet)
+        return network
+
+    def _validate(self, samples: Batch) -> dict[str, float]:
+        validation = self.task.validate(self._averaged().folded(), samples)
+        self.history.validations.append({"step": self.step, **validation})
+        self._save(validation)
+        return validation
+
+    def _save(self, validation: dict[str, float]) -> None:
+        training = {"step": self.step, "validation": validation, "config": json.loads(config_json(self.config))}
+        field = self.config.images.field_width
+        # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
+        working_size = (field, field * 3 // 4)
+        save_weights(self._averaged(), weights_file(self.config, self.output), training, working_size)
+
+    def _checkpoint(self) -> None:
+        save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
+        self._saved = self.step
+
+
+def _first_network(config: TrainingConfig) -> UNet:
+    fresh = task_of(config.network).network(config)
+    assert isinstance(fresh, UNet)
+    if config.start is None:
+        return fresh
+    network = read_weights(config.start).network
+    if network.kind != config.network:
+        raise SettingsError(
+            f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
+            "weights of that kind, or start from random weights."
+        )
+    if network.architecture == config.architecture:
+        return network
+    try:
+        if network.architecture.local_mean != config.architecture.local_mean:
+            raise SettingsError("local_mean differs.")
+        return grow(fresh, network)
+    except SettingsError as error:
+        raise SettingsError(
+            f"{config.start} holds a network of {network.architecture}, which does not grow into "
+            f"{config.architecture}: {error}"
+        ) from error
+
+
+def _as_large_as_start(config: TrainingConfig) -> TrainingConfig:
+    """The settings with the architecture of the weights to start from, if none was asked for."""
+    if config.start is None or config.architecture != Architecture():
+        return config
+    return replace(config, architecture=read_weights(config.start).network.architecture)
+
+
+def weights_file(config: TrainingConfig, output: Path) -> Path:
+    """Where a run leaves its weights."""
+    return output / f"{config.network}.safetensors"
+
+
+def schedule(step: int, warmup: int, steps: int) -> float:
+    """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
+    rise = min(1.0, (step + 1) / max(warmup, 1))
+    done = min(1.0, max(0.0, (step - warmup) / max(steps - warmup, 1)))
+    return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+def config_json(config: TrainingConfig) -> str:
+    """The settings as JSON; files by name, so that a run can move with its folder."""
+    settings = asdict(config)
+    settings["start"] = config.start.name if config.start else None
+    settings["robots"] = [path.name for path in config.robots]
+    folder = config.images.photographs
+    settings["images"]["photographs"] = folder.name if folder else None
+    return json.dumps(settings)

@@ -1,0 +1,156 @@
+"""A pinhole camera: where it is, how it projects, and how its images lose their distortion."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..errors import SettingsError
+from ..files.image_size import pixels_problem
+
+HALF_PIXEL = 0.5
+"""Our pixel centres are at +0.5, OpenCV's at 0: OpenCV's principal point is ours minus this [px]."""
+
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+"""How many coefficients OpenCV's distortion models have."""
+
+RIGID_TOLERANCE = 1e-3
+"""How far R^T R may be from the identity, in any element."""
+EXACT = 1e-9
+"""A rotation that is nearer to rigid than this is taken as it is; others are made rigid."""
+LAST_ROW_TOLERANCE = 1e-6
+"""How far the last row may be from 0, 0, 0, 1, as matrices in single precision are."""
+
+FARTHEST = 1e6
+"""Largest coordinate of a transform [m], of a focal length and of a principal point [px]."""
+
+
+def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
+    """`value` as a rigid transform in double precision; the noise of single precision and of rounding is taken out.
+
+    Args:
+        value: 4x4 numbers, translation in [m].
+        what: how errors call it, say "T_camera_world".
+
+    Raises:
+        SettingsError: not 4x4, not finite, or not a rotation with a translation.
+    """
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{what} is not a matrix of numbers. Give 4 rows of 4 numbers.") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise SettingsError(f"{what} has shape {matrix.shape}. Give 4 rows of 4 finite numbers.")
+    rotation = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not deviation <= RIGID_TOLERANCE:
+        raise SettingsError(
+            f"{what} is not rigid: R^T R is off the identity by {deviation:.2g}, allowed is {RIGID_TOLERANCE:g}. "
+            "Its upper left 3x3 block must be a rotation, written with at least 5 digits and without scale."
+        )
+    if np.linalg.det(rotation) < 0:
+        raise SettingsError(
+            f"{what} mirrors: the determinant of its rotation is -1, it must be +1. "
+            "Check the axes; the camera has x right, y down, z forward."
+        )
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
+        raise SettingsError(f"the last row of {what} is {matrix[3].tolist()}, it must be [0, 0, 0, 1].")
+    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+        raise SettingsError(f"the translation of {what} is {matrix[:3, 3].tolist()}. Give it in metres.")
+    matrix[3] = (0, 0, 0, 1)
+    if deviation > EXACT:
+        # The nearest rotation, by singular values.
+        left, _, right = np.linalg.svd(rotation)
+        matrix[:3, :3] = left @ right
+    return matrix
+
+
+# Identity is equality here: comparing arrays element by element would not give one truth value.
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """An OpenCV pinhole (x right, y down, z forward) whose images are, or have been, undistorted.
+
+    Raises:
+        SettingsError: a size, focal length, transform or the number of distortion coefficients is impossible.
+    """
+
+    name: str
+    width: int
+    """[px]"""
+    height: int
+    """[px]"""
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy [px] of the undistorted image, pixel centres at +0.5."""
+    T_camera_world: Float[np.ndarray, "4 4"]
+    """Extrinsics [m] (C of the paper)."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients k1 k2 p1 p2 [k3 ...] of the image as recorded; empty when it has none."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise SettingsError(f"the image size is {self.width} x {self.height}. Both must be at least 1 pixel.")
+        if (problem := pixels_problem(self.width, self.height)) is not None:
+            raise SettingsError(f"the image {problem}. Reduce the images.")
+        if len(self.intrinsics) != 4 or not np.isfinite(self.intrinsics).all():
+            raise SettingsError(f"the intrinsics are {self.intrinsics}. Give four finite numbers fx, fy, cx, cy [px].")
+        if min(self.intrinsics[:2]) <= 0:
+            raise SettingsError(
+                f"the focal lengths are fx = {self.intrinsics[0]:g}, fy = {self.intrinsics[1]:g}. "
+                "Both must be positive, in pixels."
+            )
+        if max(map(abs, self.intrinsics)) > FARTHEST or min(self.intrinsics[:2]) < 1 / FARTHEST:
+            raise SettingsError(f"the intrinsics are {self.intrinsics}. Give fx, fy, cx, cy [px] within {FARTHEST:g}.")
+        if len(self.distortion) not in DISTORTION_LENGTHS or not np.isfinite(self.distortion).all():
+            raise SettingsError(
+                f"there are {len(self.distortion)} distortion coefficients. Give 0, 4, 5, 8, 12 or 14 finite numbers, "
+                "in OpenCV's order k1 k2 p1 p2 k3 ..."
+            )
+        object.__setattr__(self, "T_camera_world", rigid_transform(self.T_camera_world, "T_camera_world"))
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """The intrinsic matrix [px], pixel centres at +0.5."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def undistort(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+        """`image` [height, width, ...] as a pinhole without distortion sees it; unchanged when there is none.
+
+        Args:
+            image: an image as recorded, `uint8` or floating point, or a `bool` mask (nearest neighbour then).
+            interpolation: one of OpenCV's flags.
+
+        Raises:
+            SettingsError: the image has another size than the camera.
+        """
+        if image.shape[:2] != (self.height, self.width):
+            raise SettingsError(
+                f"camera {self.name!r} is {self.width} x {self.height} but the image is "
+                f"{image.shape[1]} x {image.shape[0]}. Undistortion needs images of the camera's own size."
+            )
+        if not any(self.distortion):
+            return image
+        maps = _undistortion_maps(self.width, self.height, self.intrinsics, self.distortion)
+        if image.dtype == bool:
+            return cv2.remap(image.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
+        return cv2.remap(image, *maps, interpolation)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The camera of the same view at another number of pixels; its images count as undistorted."""
+        x, y = width / self.width, height / self.height
+        fx, fy, cx, cy = self.intrinsics
+        # With pixel centres at +0.5 the image spans [0, width], so the principal point scales like everything else.
+        return replace(self, width=width, height=height, intrinsics=(fx * x, fy * y, cx * x, cy * y), distortion=())
+
+
+@lru_cache(maxsize=8)
+def _undistortion_maps(
+    width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    return cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, (width, height), cv2.CV_32FC1)

@@ -1,0 +1,220 @@
+"""Robots from dVRK's own model tree (jhu-dvrk/dvrk_model): an arm with one of its instruments as a plain URDF.
+
+The tree is xacro for ROS; it is expanded without ROS. An endoscope sees the instrument from its shaft on, so only that
+is taken. The three joints that carry it are those of the dVRK's controller, which is what recordings are in: the tree's
+linkage of the Si arm is tilted by 9.3 degrees of pitch against it, since it was made for looking at.
+"""
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+from ..errors import RobotError
+from ..extras import needs_extra
+from ..files.reading import CALIBRATION, MESH, open_regular, read_text
+from ..recording.importing.yaml_files import parse_yaml
+from ..wording import counted
+from .mesh_files import mesh_path
+from .psm_kinematics import CLASSIC, SI, PsmGeometry
+
+PACKAGE = "dvrk_model"
+_PREFIX = "PSM1_"
+_FIRST_SEEN = "roll_link"
+"""This link and what hangs on it can be in view."""
+_CARRIED_BY = "insertion_link"
+_LFS = b"version https://git-lfs"
+_TABLE = Path("urdf/common/instruments/instruments.yaml")
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """An instrument that the tree names."""
+
+    number: str
+    """The last six digits of its model number, say `420093`."""
+    name: str
+    generation: str
+    """Of the arm: `Classic` or `Si`."""
+    tip: str
+    """Number of its tip, say `093`."""
+    has_tip: bool
+    """Whether the tree has the tip's shape; else it draws boxes of 5 mm."""
+
+
+def list_instruments(model: Path) -> dict[str, Instrument]:
+    """The instruments of a model tree, by number.
+
+    Args:
+        model: folder of the checkout, with `package.xml` and `urdf/`.
+
+    Raises:
+        RobotError: it is no such folder.
+    """
+    table = model / _TABLE
+    if not table.is_file():
+        raise RobotError(
+            f"{model} is not a checkout of dvrk_model: {_TABLE} is missing in it. Give the folder that holds "
+            "`urdf` and `meshes` (https://github.com/jhu-dvrk/dvrk_model)."
+        )
+    try:
+        entries = parse_yaml(read_text(table, CALIBRATION))["instruments"]
+        return {
+            str(number): Instrument(
+                str(number),
+                str(entry["name"]),
+                str(entry["housing"]),
+                str(entry["tip"]).zfill(3),
+                (table.parent / "tip" / f"tip_{str(entry['tip']).zfill(3)}.urdf.xacro").is_file(),
+            )
+            for number, entry in entries.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RobotError(f"{table} is not a table of instruments ({error!r}). Check out dvrk_model again.") from error
+
+
+def choose_instrument(model: Path, number: str) -> Instrument:
+    """The instrument of a number, given with or without the dots of a `tool_type`.
+
+    Raises:
+        RobotError: the tree does not name it, or has no shape of its tip.
+    """
+    instruments = list_instruments(model)
+    if number not in instruments:
+        raise RobotError(
+            f"instrument {number!r} is not in {model / _TABLE}. It names: {', '.join(sorted(instruments))}. "
+            "Numbers have six digits: 400... for the classic arm, 420... for Si."
+        )
+    chosen = instruments[number]
+    if not chosen.has_tip:
+        others = ", ".join(f"{key} ({other.name})" for key, other in instruments.items() if other.has_tip)
+        raise RobotError(
+            f"instrument {number} ({chosen.name}) has no shape in {model}: its tip is drawn as boxes of 5 mm, which no "
+            f"image shows. With a shape are: {others}."
+        )
+    return chosen
+
+
+def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
+    """The URDF of an arm with an instrument, for a file in `folder`.
+
+    Its root is the DH base of the arm, in the remote centre; joints are called as in the sequence format.
+
+    Args:
+        model: folder of the checkout.
+        number: of the instrument.
+        folder: where the URDF will lie; meshes are named from there, and stay where they are.
+
+    Raises:
+        RobotError: the tree or the instrument is not usable, a mesh is missing or was not fetched by Git LFS.
+    """
+    chosen = choose_instrument(model, number)
+    root = ElementTree.fromstring(_expanded(model, chosen))
+    root.set("name", f"psm_{chosen.generation.lower()}_{number}")
+    for element in root.iter():
+        for key in ("name", "link"):
+            if element.tag in ("link", "parent", "child") and key in element.attrib:
+                element.set(key, element.attrib[key].removeprefix(_PREFIX))
+    _keep_what_is_seen(root)
+    for position, element in enumerate(_carrier(CLASSIC if chosen.generation == "Classic" else SI)):
+        root.insert(position, element)
+    _relocate_meshes(root, model, folder)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _expanded(model: Path, chosen: Instrument) -> str:
+    needs_extra("xacrodoc", "import")
+    from xacrodoc import XacroDoc, packages  # noqa: PLC0415
+
+    arm = model / "urdf" / chosen.generation / "PSM1.urdf.xacro"
+    packages.update_package_cache({PACKAGE: str(model.resolve())})
+    options = {"instrument": chosen.number, "show_rcm": "false", "is_virtual": "true"}
+    try:
+        return XacroDoc.from_file(str(arm), subargs=options, resolve_packages=False).to_urdf_string()
+    except Exception as error:  # xacro raises whatever the macros' expressions raise
+        raise RobotError(
+            f"{arm} cannot be expanded for instrument {chosen.number} ({error}). Check out dvrk_model again, whole."
+        ) from error
+
+
+def _keep_what_is_seen(root: ElementTree.Element) -> None:
+    """Leave the links from the shaft on, their joints and shapes."""
+    joints = {_link(joint, "child"): joint for joint in root.findall("joint")}
+    if _FIRST_SEEN not in joints:
+        raise RobotError(
+            f"the model has no link {_FIRST_SEEN!r}, which the instrument begins with. Use dvrk_model 2.5."
+        )
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if not _is_below(name, joints):
+            root.remove(link)
+            if name in joints:
+                root.remove(joints[name])
+        for part in list(link):
+            # A box stands for a shape that the tree does not have.
+            if part.tag != "visual" or part.find("geometry/box") is not None:
+                link.remove(part)
+    for parent in joints[_FIRST_SEEN].iter("parent"):
+        parent.set("link", _CARRIED_BY)
+
+
+def _is_below(link: str, joints: Mapping[str, ElementTree.Element]) -> bool:
+    while link != _FIRST_SEEN:
+        if link not in joints:
+            return False
+        link = _link(joints[link], "parent")
+    return True
+
+
+def _carrier(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
+    """Links and joints from the remote centre to the instrument's base, as the controller has them."""
+    half_turn = repr(math.pi / 2)
+    places = (
+        ("yaw", "revolute", "0 0 0", f"0 -{half_turn} {half_turn}"),
+        ("pitch", "revolute", "0 0 0", f"0 -{half_turn} -{half_turn}"),
+        ("insertion", "prismatic", f"0 {geometry.remote_center} 0", f"{half_turn} 0 0"),
+    )
+    parent = "base_link"
+    yield ElementTree.Element("link", name=parent)
+    for (name, kind, xyz, rpy), (lower, upper) in zip(places, geometry.limits, strict=False):
+        joint = ElementTree.Element("joint", name=name, type=kind)
+        child = f"{name}_link"
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=child)
+        ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
+        ElementTree.SubElement(joint, "axis", xyz="0 0 1")
+        ElementTree.SubElement(joint, "limit", lower=str(lower), upper=str(upper), effort="1000", velocity="0.4")
+        yield joint
+        yield ElementTree.Element("link", name=child)
+        parent = child
+
+
+def _link(joint: ElementTree.Element, role: str) -> str:
+    element = joint.find(role)
+    return "" if element is None else element.get("link", "")
+
+
+def _relocate_meshes(root: ElementTree.Element, model: Path, folder: Path) -> None:
+    missing, pointers = [], []
+    for mesh in root.iter("mesh"):
+        path = mesh_path((model / "urdf").resolve(), mesh.get("filename", ""))
+        if not path.is_file():
+            missing.append(mesh.get("filename", "").removeprefix(f"package://{PACKAGE}/"))
+        elif _starts_with(path, _LFS):
+            pointers.append(str(path))
+        mesh.set("filename", Path(os.path.relpath(path, folder.resolve())).as_posix())
+    if pointers:
+        raise RobotError(
+            f"{counted(len(pointers), 'file')} in {model} hold Git LFS pointers and no meshes: {', '.join(pointers)}. "
+            f"Fetch them: git -C {model} lfs pull."
+        )
+    if missing:
+        raise RobotError(f"{model} lacks meshes of this instrument: {', '.join(missing)}. Check it out again, whole.")
+
+
+def _starts_with(path: Path, start: bytes) -> bool:
+    with open_regular(path, MESH) as stream:
+        return stream.read(len(start)) == start

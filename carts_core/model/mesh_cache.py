@@ -1,0 +1,67 @@
+"""Decimated link meshes on disk, so that a robot loads slowly only once."""
+
+import hashlib
+import os
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import OutputError
+from ..files import output_path, output_stream
+from ..files.reading import CACHED, MESH, open_regular, read_bytes
+from .meshes import LinkMesh
+
+_VERSION = 1
+
+
+def cache_dir() -> Path:
+    """Folder of the cache: `$CARTS_CACHE`, else `$XDG_CACHE_HOME/carts`, else `~/.cache/carts`."""
+    if configured := os.environ.get("CARTS_CACHE"):
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "carts"
+
+
+def fingerprint(files: Iterable[Path], *settings: object) -> str:
+    """Key that changes when a file's content, a setting or the cache's format changes."""
+    digest = hashlib.sha256(repr((_VERSION, settings)).encode())
+    for file in files:
+        digest.update(str(file.name).encode())
+        digest.update(read_bytes(file, MESH))
+    return digest.hexdigest()[:32]
+
+
+def read(key: str) -> tuple[LinkMesh, ...] | None:
+    """Meshes stored under `key`, or None when there are none (or the file is damaged)."""
+    try:
+        with (
+            open_regular(cache_dir() / f"{key}.npz", CACHED) as file,
+            np.load(file, allow_pickle=False) as stored,
+        ):
+            return tuple(
+                LinkMesh(
+                    int(stored[f"{i}_link"]),
+                    stored[f"{i}_vertices"],
+                    stored[f"{i}_normals"],
+                    stored[f"{i}_faces"],
+                    stored[f"{i}_color"],
+                )
+                for i in range(int(stored["count"]))
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None
+
+
+def write(key: str, meshes: tuple[LinkMesh, ...]) -> None:
+    """Store `meshes` under `key`; a cache that cannot be written is no error."""
+    arrays: dict[str, np.ndarray] = {"count": np.array(len(meshes))}
+    for i, mesh in enumerate(meshes):
+        for field in ("link", "vertices", "normals", "faces", "color"):
+            arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
+    try:
+        with output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+    except OutputError:
+        return

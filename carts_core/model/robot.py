@@ -1,0 +1,149 @@
+"""A robot: degrees of freedom, forward kinematics and the meshes of its links, from any URDF."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import yourdfpy
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import RobotError
+from ..files.reading import ROBOT, is_regular, read_text
+from . import mesh_cache
+from .kinematics import Kinematics, exact_right_angles
+from .mesh_files import mesh_path
+from .meshes import LinkMesh, build_link_meshes, load_visual
+from .urdf_check import parsed_urdf
+
+
+class Robot:
+    """An articulated robot as the scene sees it. Made by `Robot.load`.
+
+    Attributes:
+        name: the URDF's robot name.
+        urdf: path of the URDF.
+        base_link: link whose frame link transforms are given in.
+        joint_names: independent degrees of freedom; a mimic joint counts to the joint that it follows.
+        joint_types: "revolute" or "prismatic", per degree of freedom.
+        joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m], infinite where not given.
+        link_names: the links that carry a visual mesh.
+        meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
+    """
+
+    def __init__(
+        self, name: str, urdf: Path, kinematics: Kinematics, link_names: tuple[str, ...], meshes: tuple[LinkMesh, ...]
+    ) -> None:
+        self.name = name
+        self.urdf = urdf
+        self.base_link = kinematics.base_link
+        self.joint_names = kinematics.joint_names
+        self.joint_types = kinematics.joint_types
+        self.joint_limits = kinematics.joint_limits
+        self.link_names = link_names
+        self.meshes = meshes
+        self._kinematics = kinematics
+
+    def __repr__(self) -> str:
+        faces = sum(len(mesh.faces) for mesh in self.meshes)
+        return f"Robot({self.name!r}, {len(self.joint_names)} degrees of freedom, {faces} triangles)"
+
+    @staticmethod
+    def load(
+        urdf: Path | str,
+        *,
+        base_link: str | None = None,
+        max_faces: int = 12_000,
+        progress: Callable[[str], None] | None = None,
+    ) -> "Robot":
+        """Read a URDF and its visual meshes; decimated meshes come from the cache the second time.
+
+        Args:
+            urdf: path of the URDF; mesh paths are relative to it.
+            base_link: frame of the link transforms, the URDF's root by default.
+            max_faces: triangles of the whole robot after decimation.
+            progress: called with a line for people, now and then.
+
+        Raises:
+            RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.
+        """
+        # Resolved once, here: what is found beside the URDF stays found when the working directory changes.
+        urdf = Path(urdf).absolute()
+        report = progress or (lambda line: None)
+        try:
+            root = parsed_urdf(read_text(urdf, ROBOT), urdf)
+            exact_right_angles(root)
+            text = ElementTree.tostring(root, encoding="unicode")
+            model = yourdfpy.URDF.load(
+                io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
+            )
+            kinematics = Kinematics(model, text, base_link, urdf)
+        except FileNotFoundError as error:
+            raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
+        except RobotError:
+            raise
+        except Exception as error:  # the URDF parser raises many kinds
+            raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
+        link_names = tuple(link.name for link in model.robot.links if link.visuals)
+        meshes = _load_meshes(model, urdf, link_names, max_faces, report)
+        if not meshes:
+            raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
+        return Robot(model.robot.name, urdf, kinematics, link_names, meshes)
+
+    def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:
+        """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
+
+        Raises:
+            RobotError: wrong number of joint positions.
+        """
+        return self._kinematics(joint_positions, self.link_names)
+
+    def link_transform(
+        self, joint_positions: Float[Tensor, "*batch dofs"], link_name: str
+    ) -> Float[Tensor, "*batch 4 4"]:
+        """T_base_link [m] of any link of the URDF, with or without a mesh.
+
+        Raises:
+            RobotError: wrong number of joint positions.
+        """
+        return self._kinematics(joint_positions, (link_name,))[..., 0, :, :]
+
+    def joint_index(self, joint_name: str) -> int:
+        """Position of a joint in `joint_names`.
+
+        Raises:
+            RobotError: the robot has no such degree of freedom.
+        """
+        if joint_name not in self.joint_names:
+            raise RobotError(
+                f"robot {self.name} ({self.urdf}) has no joint {joint_name!r}. "
+                f"Its degrees of freedom are: {', '.join(self.joint_names)}."
+            )
+        return self.joint_names.index(joint_name)
+
+
+def _load_meshes(
+    model: yourdfpy.URDF, urdf: Path, link_names: tuple[str, ...], max_faces: int, report: Callable[[str], None]
+) -> tuple[LinkMesh, ...]:
+    mesh_files = [
+        mesh_path(urdf.parent, visual.geometry.mesh.filename)
+        for link in model.robot.links
+        for visual in link.visuals
+        if visual.geometry is not None and visual.geometry.mesh is not None
+    ]
+    key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], max_faces)
+    if (cached := mesh_cache.read(key)) is not None:
+        return cached
+    report(f"{model.robot.name}: preparing meshes (once)")
+    materials = {material.name: material for material in model.robot.materials}
+    links = {link.name: link for link in model.robot.links}
+    parts = [
+        (index, mesh, color)
+        for index, name in enumerate(link_names)
+        for visual in links[name].visuals
+        for mesh, color in load_visual(visual, urdf.parent, materials)
+    ]
+    meshes = build_link_meshes(parts, max_faces, report)
+    mesh_cache.write(key, meshes)
+    return meshes

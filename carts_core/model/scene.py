@@ -1,0 +1,151 @@
+"""What is in front of the lens: arms, cameras, one light, and the state that can be optimized."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from ..errors import RobotError
+from .camera import Camera
+from .robot import Robot
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A robot at its place in the world."""
+
+    name: str
+    robot: Robot
+    T_world_base: Float[np.ndarray, "4 4"]
+    """Base frame of the arm (F_B of the paper)."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """One white point light, fixed to the camera (L_d of the paper), and how surfaces answer to it."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, -0.02)
+    """In the camera's frame [m]; behind the lens by default."""
+    ambient: float = 0.25
+    """Share of a surface's colour that is seen without any light."""
+    diffuse: float = 0.75
+    """Share of a surface's colour that is seen where it faces the light."""
+    specular: float = 0.35
+    """Brightness of the highlight."""
+    shininess: float = 24.0
+    """Phong exponent of the highlight."""
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Every value of a scene that may be free: a point, or a batch of points, in parameter space.
+
+    Leaves are tensors that may carry gradients; `*batch` are hypotheses.
+    """
+
+    joint_positions: tuple[Float[Tensor, "*batch dofs"], ...]
+    """One per arm, in the scene's order [rad, m] (K of the paper)."""
+    T_world_base: Float[Tensor, "*batch arms 4 4"]
+    """Base frames (F_B of the paper)."""
+    T_camera_world: Float[Tensor, "*batch cameras 4 4"]
+    """Camera extrinsics (C of the paper)."""
+    intrinsics: Float[Tensor, "*batch cameras 4"]
+    """fx, fy, cx, cy of the full-size image [px]."""
+
+    def map(self, function) -> "SceneState":
+        """The state with `function` applied to every tensor."""
+        return SceneState(
+            tuple(function(value) for value in self.joint_positions),
+            function(self.T_world_base),
+            function(self.T_camera_world),
+            function(self.intrinsics),
+        )
+
+    def detached(self) -> "SceneState":
+        """A copy that shares neither memory nor gradients with this state."""
+        return self.map(lambda value: value.detach().clone())
+
+    def to(self, device: str | torch.device) -> "SceneState":
+        """The state on another device."""
+        return self.map(lambda value: value.to(device))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Arms, cameras and the light; what does not change while a frame is optimized."""
+
+    arms: tuple[Arm, ...]
+    cameras: tuple[Camera, ...]
+    light: Light = field(default_factory=Light)
+
+    def arm(self, name: str) -> Arm:
+        """The arm of that name.
+
+        Raises:
+            RobotError: there is none.
+        """
+        for arm in self.arms:
+            if arm.name == name:
+                return arm
+        raise RobotError(f"no arm is called {name!r}. The arms are: {', '.join(arm.name for arm in self.arms)}.")
+
+    def camera(self, name: str) -> Camera:
+        """The camera of that name.
+
+        Raises:
+            RobotError: there is none.
+        """
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        known = ", ".join(camera.name for camera in self.cameras)
+        raise RobotError(f"no camera is called {name!r}. The cameras are: {known}.")
+
+    def with_cameras(self, names: Sequence[str] | None) -> "Scene":
+        """The scene seen by these cameras only (all of them for None), in this order."""
+        return self if names is None else replace(self, cameras=tuple(self.camera(name) for name in names))
+
+    def with_arms(self, names: Sequence[str] | None) -> "Scene":
+        """The scene with these arms only (all of them for None), in the scene's order."""
+        if names is None:
+            return self
+        wanted = {self.arm(name).name for name in names}
+        return replace(self, arms=tuple(arm for arm in self.arms if arm.name in wanted))
+
+    def state(self, joint_positions: Mapping[str, ArrayLike], device: str | torch.device = "cpu") -> SceneState:
+        """The scene's state at the given joint positions, with the calibration as given.
+
+        Args:
+            joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
+            device: where the tensors live.
+
+        Raises:
+            RobotError: an arm has no joint positions, or the wrong number of them.
+        """
+        values = []
+        for arm in self.arms:
+            if arm.name not in joint_positions:
+                raise RobotError(f"no joint positions for arm {arm.name!r}; given are: {', '.join(joint_positions)}.")
+            value = torch.as_tensor(np.asarray(joint_positions[arm.name]), dtype=torch.float32, device=device)
+            if value.shape[-1] != len(arm.robot.joint_names):
+                raise RobotError(
+                    f"arm {arm.name!r} has {len(arm.robot.joint_names)} degrees of freedom "
+                    f"({', '.join(arm.robot.joint_names)}) but {value.shape[-1]} joint positions were given."
+                )
+            values.append(value)
+        batch = values[0].shape[:-1]
+
+        def constant(array: np.ndarray) -> Tensor:
+            tensor = torch.tensor(array, dtype=torch.float32, device=device)
+            return tensor.expand(*batch, *tensor.shape)
+
+        return SceneState(
+            tuple(values),
+            constant(np.stack([arm.T_world_base for arm in self.arms])),
+            constant(np.stack([camera.T_camera_world for camera in self.cameras])),
+            constant(np.array([camera.intrinsics for camera in self.cameras])),
+        )

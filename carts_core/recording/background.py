@@ -1,0 +1,146 @@
+"""The mean background BG_m of the paper, estimated from a recording when it is not given."""
+
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from ..errors import SequenceError
+from ..model.scene import Scene
+from ..rendering import Renderer
+
+FRAMES = 30
+"""How many frames, spread evenly over the recording, the estimate looks at."""
+
+MARGIN = 15 / 640
+"""How far round an arm's silhouette pixels are not trusted, as a share of the image's width."""
+
+_LARGEST_ERROR = 3
+"""Where measured arms are farther away than so many margins, there is none [1]."""
+
+_STAYS = 0.4
+"""Share of an arm's silhouette that is covered throughout a recording, from which it hardly moves [1]."""
+
+_COVERED = 256
+_ROWS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class MeanBackground:
+    """The mean background BG_m of a camera, and how far it is one."""
+
+    image: UInt8[np.ndarray, "height width 3"]
+    known: Bool[np.ndarray, "height width"]
+    """Where it certainly shows no arm, measured kinematics being off as they may be."""
+    problem: str | None = None
+    """Why it cannot say what is there without arms, for people; None where it can."""
+
+
+def spread(length: int, count: int = FRAMES) -> list[int]:
+    """At most `count` different frame numbers, evenly spread over `length`."""
+    return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
+
+
+def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Bool[np.ndarray, "height width"]:
+    """A silhouette with the margin that measured kinematics are off by, or several of them."""
+    radius = max(1, round(margins * MARGIN * silhouette.shape[1]))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate(silhouette.astype(np.uint8), disc).astype(bool)
+
+
+def background_of_recording(
+    scene: Scene,
+    camera: str,
+    measured: Items[Mapping[str, np.ndarray]],
+    image: Callable[[int], UInt8[np.ndarray, "height width 3"]],
+) -> MeanBackground:
+    """The mean background of a recording: see `estimate_background`.
+
+    A pixel of it is known where most of the views that it is the median of have the arms far away.
+
+    Args:
+        scene: with that camera and others.
+        camera: its name.
+        measured: arm -> joint positions, of each frame that is looked at.
+        image: of the frame at a place in `measured`.
+
+    Raises:
+        SequenceError: the whole image is covered in every view.
+    """
+    renderer = Renderer(scene, cameras=[camera])
+    arms = [renderer.segment(scene.state(positions))[0] >= 0 for positions in measured]
+    covers = [widen(silhouette) for silhouette in arms]
+    clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
+    used = len(arms) - np.sum(covers, axis=0)
+    estimate = estimate_background((image(place), cover) for place, cover in enumerate(covers))
+    always, usually = (used == 0).sum(), np.mean([cover.sum() for cover in covers])
+    problem = None
+    if always > _STAYS * usually:
+        problem = (
+            f"camera {camera!r}: what is behind the arms is not known, since they hardly move in {len(arms)} views; "
+            "what looks like an arm in the background cannot be distinguished from one. A `background` image in the "
+            "sequence file, taken without arms, helps."
+        )
+    return MeanBackground(estimate, 2 * clear > used, problem)
+
+
+def estimate_background(
+    views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Median of every pixel over the views in which it is not covered.
+
+    A pixel that is covered in every view is filled in from its surroundings.
+
+    Args:
+        views: images with what covers the background in each.
+
+    Raises:
+        SequenceError: the whole image is covered in every view.
+    """
+    images, covers = (np.stack(arrays) for arrays in zip(*views, strict=True))
+    seen = (~covers).sum(0)
+    if not seen.any():
+        raise SequenceError(
+            "the background cannot be estimated: the arms, as measured, cover every pixel of every frame. "
+            "Check T_camera_world and the units of the joints, or give a `background` image."
+        )
+    result = np.empty(images.shape[1:], np.uint8)
+    # Covered values are sorted behind all others, so the median of the rest is in the middle of the first `seen`.
+    for top in range(0, images.shape[1], _ROWS_AT_ONCE):
+        rows = slice(top, top + _ROWS_AT_ONCE)
+        values = np.where(covers[:, rows, :, None], np.uint16(_COVERED), images[:, rows])
+        values.sort(axis=0)
+        middle = np.maximum(seen[rows] - 1, 0)[None, :, :, None] / 2
+        low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]
+        high = np.take_along_axis(values, np.ceil(middle).astype(np.intp), 0)[0]
+        result[rows] = np.minimum((low + high + 1) // 2, 255).astype(np.uint8)
+    hole = seen == 0
+    # Next to what is always covered the arm itself may show, where it is off by more than the margin.
+    rim = widen(hole)
+    return fill(result, hole if rim.all() else rim)
+
+
+def fill(
+    image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """`image` with the pixels of `hole` blended in smoothly from around it (pull-push over a pyramid)."""
+    if not hole.any():
+        return image
+    weight = (~hole).astype(np.float32)
+    smooth = _pull_push(image.astype(np.float32) * weight[..., None], weight)
+    return np.where(hole[..., None], np.clip(np.rint(smooth), 0, 255).astype(np.uint8), image)
+
+
+def _pull_push(weighted: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Mean colours where `weight` is positive, those of the next coarser level where it is 0."""
+    height, width = weight.shape
+    mean = weighted / np.maximum(weight, 1e-6)[..., None]
+    if weight.all() or min(height, width) < 2:
+        return mean
+    coarse = _pull_push(cv2.pyrDown(weighted), cv2.pyrDown(weight))
+    coarse = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    trust = np.minimum(weight * 4.0, 1.0)[..., None]
+    return trust * mean + (1.0 - trust) * coarse

@@ -1,0 +1,230 @@
+"""What was logged of one arm becomes joint positions with times, and a base frame where the log knows it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ...errors import SequenceError
+from ...export.dvrk import T_DVRK_OPENCV
+from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, inverse
+from ...settings.importing import ImportOptions
+from ...wording import counted
+from .alignment import at_times, clock_offset, nearest
+from .dvrk_files import read_base_frames
+from .found import FoundArm, Note
+from .instrument import CANDIDATES, check_instrument, fit_base_frame
+
+_SAME_BASE = 1e-3
+"""[m], [rad] A base frame nearer to the identity than this was not set in the dVRK."""
+_CHECKED_ROWS = 5000
+_FEWEST_REACHABLE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Rows of numbers with times."""
+
+    times: Float[np.ndarray, " rows"]
+    """In the recording's seconds, increasing."""
+    values: Float[np.ndarray, "rows columns"]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmLog:
+    """What a recording has of one arm."""
+
+    name: str
+    joints: Track | None = None
+    """Six joint positions [rad], [m]."""
+    jaw: Track | None = None
+    """[rad]"""
+    poses: Track | None = None
+    """Tip in some frame: x y z [m], quaternion x y z w."""
+    local_poses: Track | None = None
+    """Tip in the arm's base frame."""
+    setup: Track | None = None
+    """Base of the arm in the camera's frame, from set-up joints."""
+    tool: str = ""
+    """The dVRK's `tool_type`."""
+    opencv_axes: bool = False
+    """Whether `poses` and `setup` are in a camera with OpenCV's axes instead of the dVRK's."""
+
+
+def track(rows: list[tuple[float, ...]]) -> Track | None:
+    """Rows of (time, values ...) in order of time; rows that are not finite or repeat a time are left out."""
+    table = np.array(rows, np.float64)
+    if table.ndim != 2 or not len(table):
+        return None
+    table = table[np.isfinite(table).all(1)]
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    table = table[np.concatenate([[True], np.diff(table[:, 0]) > 0])[: len(table)]]
+    return Track(table[:, 0], table[:, 1:]) if len(table) else None
+
+
+def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4 4"]:
+    """Matrices of x y z [m] and a quaternion x y z w; a quaternion of length 0 gives NaN."""
+    Ts = np.tile(np.eye(4), (len(values), 1, 1))
+    Ts[:, :3, 3] = values[:, :3]
+    good = np.linalg.norm(values[:, 3:7], axis=1) > 1e-6
+    Ts[~good] = np.nan
+    if good.any():
+        Ts[good, :3, :3] = Rotation.from_quat(values[good, 3:7]).as_matrix()
+    return Ts
+
+
+def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> FoundArm:
+    """Joint positions and base frame of an arm; notes say where they come from.
+
+    Raises:
+        SequenceError: the log has neither joints nor poses, or no joints reach most of its poses.
+    """
+    geometry = _geometry(log, options, note)
+    T_camera_base, base_from = _base_frame(log, options, geometry, note)
+    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, note)
+    columns, values = list(JOINT_NAMES), joints.values
+    fixed: tuple[str, ...] = ("jaw",)
+    if log.jaw is not None:
+        jaw = np.interp(joints.times, log.jaw.times, log.jaw.values[:, 0])
+        columns, values, fixed = [*columns, "jaw"], np.column_stack([values, jaw]), ()
+        if jaw.min() < -0.1:
+            note(
+                Note(
+                    "found", f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut."
+                )
+            )
+            values[:, -1] = np.maximum(values[:, -1], 0.0)
+    else:
+        note(Note("missing", f"{log.name}: no jaw angle; the jaw is drawn shut."))
+    return FoundArm(
+        log.name,
+        tuple(columns),
+        values,
+        joints.times,
+        options.robot.get(log.name, "builtin:psm_lnd"),
+        T_camera_base,
+        base_from,
+        fixed,
+    )
+
+
+def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> PsmGeometry:
+    """The instrument's lengths: as given, as the recording itself shows, or those of a Large Needle Driver."""
+    if log.tool:
+        note(Note("found", f"{log.name}: tool_type is {log.tool}."))
+    chosen = replace(CLASSIC, wrist_length=options.wrist_length) if options.wrist_length is not None else CLASSIC
+    poses = log.poses or log.local_poses
+    if log.joints is None or poses is None:
+        return chosen
+    offset = clock_offset(poses.times, log.joints.times)
+    measured = at_times(poses.times - offset, log.joints.times, log.joints.values)
+    rows = np.flatnonzero(np.isfinite(measured).all(1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _CHECKED_ROWS)).astype(int)] if len(rows) else rows
+    if len(rows) < 20:
+        return chosen
+    name = f"{1e3 * chosen.wrist_length:.1f} mm wrist"
+    check = check_instrument(transforms(poses.values[rows]), measured[rows], {**CANDIDATES, name: chosen})
+    best = check.fits[check.best]
+    if check.decides:
+        note(
+            Note(
+                "found",
+                f"{log.name}: joints and tip poses agree with a {check.best} (the base stands still to "
+                f"{1e3 * best.deviation:.4f} mm).",
+            )
+        )
+        chosen = {**CANDIDATES, name: chosen}[check.best]
+    elif (warning := check.warning(name)) is not None:
+        note(Note("warning", f"{log.name}: {warning}"))
+    if chosen.wrist_length != CLASSIC.wrist_length and log.name not in options.robot:
+        note(
+            Note(
+                "warning",
+                f"{log.name}: the shipped robot has a wrist of 9.1 mm and this instrument one of "
+                f"{1e3 * chosen.wrist_length:.1f} mm. Make its robot with carts robot, and give it with --robot "
+                f"{log.name} FILE.urdf.",
+            )
+        )
+    return chosen
+
+
+def _base_frame(
+    log: ArmLog, options: ImportOptions, geometry: PsmGeometry, note: Callable[[Note], None]
+) -> tuple[np.ndarray | None, str]:
+    """The arm's base in the camera, with OpenCV's axes, and where it comes from; None where nothing says it."""
+    if (path := options.base.get(log.name)) is not None:
+        frames = read_base_frames(path, options.axes)
+        chosen = [frame for frame in frames if frame.arm == log.name] or ([frames[0]] if len(frames) == 1 else [])
+        if not chosen:
+            known = ", ".join(frame.arm for frame in frames)
+            raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Name another file.")
+        note(Note("found", f"{log.name}: base frame from {path}."))
+        return chosen[0].T_camera_base, str(path)
+    T_axes = np.eye(4) if log.opencv_axes else T_DVRK_OPENCV
+    if log.poses is not None and (log.joints is not None or log.local_poses is not None):
+        T, what = _own_base_frame(log, geometry)
+        if T is not None and np.abs(T - np.eye(4)).max() > _SAME_BASE:
+            note(
+                Note(
+                    "found",
+                    f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.",
+                )
+            )
+            return T_axes @ T, what
+    if log.setup is not None:
+        T = transforms(log.setup.values[len(log.setup.values) // 2][None])[0]
+        note(Note("found", f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered."))
+        return T_axes @ T, "set-up joints (SUJ)"
+    return None, ""
+
+
+def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | None, str]:
+    assert log.poses is not None
+    if log.joints is not None:
+        offset = clock_offset(log.poses.times, log.joints.times)
+        joints = at_times(log.poses.times - offset, log.joints.times, log.joints.values)
+        if not np.isfinite(joints).all(1).any():
+            return None, ""
+        fit = fit_base_frame(transforms(log.poses.values), joints, geometry)
+        return fit.T_reference_base, "measured_cp and measured_js"
+    assert log.local_poses is not None
+    rows = nearest(log.poses.times, log.local_poses.times)
+    Ts = transforms(log.poses.values) @ np.linalg.inv(transforms(log.local_poses.values)[rows])
+    Ts = Ts[np.isfinite(Ts).all((1, 2))]
+    if not len(Ts):
+        return None, ""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(Ts[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
+    return T, "measured_cp and local/measured_cp"
+
+
+def _solved(
+    log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, note: Callable[[Note], None]
+) -> Track:
+    """Joint positions by inverse kinematics of the poses."""
+    source = log.local_poses or log.poses
+    if source is None:
+        raise SequenceError(
+            f"{log.name} has neither joint positions (measured_js) nor tip poses (measured_cp, local/measured_cp). "
+            "Record one of them, or leave the arm out (--arms)."
+        )
+    Ts = transforms(source.values)
+    if log.local_poses is None and T_camera_base is not None:
+        # measured_cp is in the camera's frame then, with the axes of the dVRK.
+        T_axes = np.eye(4) if log.opencv_axes else T_DVRK_OPENCV
+        Ts = np.linalg.inv(T_camera_base) @ T_axes @ Ts
+    found = inverse(Ts, geometry)
+    reached = found.reachable
+    for entry in found.unreachable:
+        note(Note("warning", f"{log.name}: poses that no joints reach, left out: {entry}."))
+    if reached.mean() < _FEWEST_REACHABLE:
+        raise SequenceError(
+            f"{log.name}: no joint positions reach {int((~reached).sum())} of {counted(len(Ts), 'pose')} "
+            f"({found.unreachable[0].reason}). The poses are probably not in the frame of the arm's base, or of "
+            f"another unit: name the base frame's file with --base {log.name} FILE, or record local/measured_cp."
+        )
+    note(Note("found", f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses."))
+    return Track(source.times[reached], found.joints[reached])

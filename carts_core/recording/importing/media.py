@@ -1,0 +1,98 @@
+"""Folders of images and videos: which frames they have, how these are called, and how large they are."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ...errors import SequenceError
+from ..images import read_image
+from ..video import SUFFIXES, Video
+from ..video_index import index_video
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_NUMBER = re.compile(r"^(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)$")
+
+
+@dataclass(frozen=True)
+class Images:
+    """The images of a camera."""
+
+    path: Path
+    """Folder or video."""
+    pattern: str
+    """Name of a frame's image in the folder; empty for a video."""
+    ids: tuple[str, ...]
+    """Of the frames; the numbers in the names, in their order."""
+    size: tuple[int, int]
+    """Width and height [px]."""
+    times: Float[np.ndarray, " frames"] | None = None
+    """Presentation times of a video [s]."""
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Images directly in a folder, in no order."""
+    try:
+        return [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    except OSError:
+        return []
+
+
+def find_images(path: Path, only: str = "") -> Images:
+    """The frames of a folder of images, or of a video.
+
+    Args:
+        path: folder or video file.
+        only: keep files whose name ends with this, where a folder holds several kinds.
+
+    Raises:
+        SequenceError: nothing is there, names do not number the frames, or the first image cannot be read.
+    """
+    if path.is_file() and path.suffix.lower() in SUFFIXES:
+        return _video(path)
+    files = [file for file in image_files(path) if file.name.endswith(only)]
+    if not files:
+        raise SequenceError(f"{path} has no images ({', '.join(IMAGE_SUFFIXES)}) and is no video. Name another place.")
+    pattern, ids = _numbered(files, path)
+    first = read_image(path / pattern.format(frame=ids[0]))
+    return Images(path, pattern, ids, (first.shape[1], first.shape[0]))
+
+
+def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
+    """Pattern and ids of files that differ in one number."""
+    kinds: dict[tuple[str, str], list[str]] = {}
+    for file in files:
+        match = _NUMBER.match(file.name.removesuffix(file.suffix))
+        if match is not None:
+            kinds.setdefault((match["before"], match["after"] + file.suffix), []).append(match["number"])
+    if len(kinds) != 1:
+        shown = ", ".join(sorted(file.name for file in files)[:3])
+        raise SequenceError(
+            f"the images in {folder} are not numbered in one way (say frame0001.png, frame0002.png): {shown} ... "
+            "Rename them, or put those of each camera into a folder of its own."
+        )
+    ((before, after), numbers) = next(iter(kinds.items()))
+    ids = tuple(sorted(numbers, key=lambda number: (int(number), number)))
+    return f"{_literal(before)}{{frame}}{_literal(after)}", ids
+
+
+def _literal(text: str) -> str:
+    return text.replace("{", "{{").replace("}", "}}")
+
+
+def _video(path: Path) -> Images:
+    index = index_video(path)
+    if not index.count:
+        raise SequenceError(f"video {path} has no frames. Copy it again.")
+    first = Video(path, (0,)).read(0)
+    ids = tuple(f"{number:06d}" for number in range(index.count))
+    return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps)
+
+
+def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
+    """Ids of the frames that every camera has, in the first one's order."""
+    shared = set.intersection(*(set(each.ids) for each in kinds))
+    return tuple(frame for frame in kinds[0].ids if frame in shared)

@@ -1,0 +1,247 @@
+"""A recording: frames with images, measured joint positions, and where known masks and truth."""
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from ..errors import SequenceError
+from ..model.camera import Camera
+from ..model.scene import Scene
+from ..wording import counted
+from .background import MeanBackground, background_of_recording, spread
+from .cache import ByteCache
+from .camera_input import CameraInput
+from .description import Description, read_description
+from .images import read_image, read_mask
+from .toml_table import closest
+
+CACHE_BYTES = 192 * 2**20
+"""Memory for decoded images and masks of one sequence."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a sequence in one domain. The arrays are the receiver's own copies."""
+
+    index: int
+    """0-based position in the sequence."""
+    frame_id: str
+    """The row's own name, say "001"."""
+    domain: str
+    images: dict[str, UInt8[np.ndarray, "height width 3"]]
+    """Camera -> RGB image, undistorted."""
+    measured: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm -> joint positions [rad, m] in the order of `Robot.joint_names`; unmeasured joints are at their default."""
+    truth: dict[str, Float[np.ndarray, " dofs"]] | None
+    """Arm -> true joint positions, None where the sequence has none."""
+    masks: dict[str, Bool[np.ndarray, "height width"]] | None
+    """Camera -> instrument mask, undistorted; None where no camera has a mask in this frame."""
+    timestamp: float | None
+    """[s]"""
+
+
+class Sequence:
+    """A recording that a sequence file describes. Made by `Sequence.open`; safe to use from several threads.
+
+    Attributes:
+        path: the sequence file.
+        name: its name for people.
+        scene: arms and cameras as calibrated, cameras without distortion.
+        domains: the variants of every image; the first is the default.
+        frame_ids: name of every frame.
+        timestamps: when each image was taken [frames] [s], or None.
+        matching: how joint positions are matched with frames by time, or None where each row of the table is a frame.
+        measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
+        measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
+        truth: arm -> true joint positions of all frames, or None; only the arms that have one.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self.path = description.path
+        self.name = description.name
+        self.scene: Scene = description.scene
+        self.domains = description.domains
+        self.frame_ids = description.frames.frame_ids
+        self.timestamps = description.frames.timestamps
+        self.matching = description.matching
+        self.measured_joints = {name: arm.measured_joints for name, arm in description.arms.items()}
+        self.measured = {name: description.at_frames(arm.measured) for name, arm in description.arms.items()}
+        self.truth = {
+            name: description.at_frames(arm.truth) for name, arm in description.arms.items() if arm.truth is not None
+        } or None
+        self._description = description
+        self._cameras = description.cameras
+        self._cache = ByteCache(CACHE_BYTES)
+        self._backgrounds: dict[tuple[str, str], MeanBackground] = {}
+        self._background_lock = threading.Lock()
+
+    @staticmethod
+    def open(path: Path | str, *, progress: Callable[[str], None] | None = None) -> "Sequence":
+        """Read a sequence file (`docs/reference/sequence_format.md`); images are decoded later, when asked for.
+
+        Args:
+            path: the TOML file.
+            progress: called with a line for people now and then.
+
+        Raises:
+            SequenceError: the file or something it points at is missing or wrong.
+            RobotError: a robot or one of its meshes is missing or wrong.
+        """
+        # Resolved once, here: images that are decoded later are found from any working directory.
+        return Sequence(read_description(Path(path).absolute(), progress))
+
+    def with_time_offset(self, time_offset: float) -> "Sequence":
+        """The same images with the joint positions of another time; the sequence file stays as it is.
+
+        Args:
+            time_offset: what to add to an image's time for the time in the kinematics tables [s].
+
+        Raises:
+            SequenceError: rows are not matched by time, or a frame has no row near enough.
+        """
+        if self.matching is None:
+            raise SequenceError(
+                f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
+                "Describe the images' times under [frames] (docs/reference/sequence_format.md)."
+            )
+        matching = replace(self.matching, time_offset=time_offset)
+        moved = Sequence(replace(self._description, matching=matching))
+        # Images and masks do not depend on it.
+        moved._cache = self._cache
+        return moved
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    def __repr__(self) -> str:
+        frames, cameras, domains = counted(len(self), "frame"), ", ".join(self._cameras), ", ".join(self.domains)
+        return f"Sequence({self.name!r}, {frames}, cameras {cameras}, domains {domains})"
+
+    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
+        """One frame with the images of some cameras (all by default), in a domain (the first by default).
+
+        Raises:
+            SequenceError: there is no such frame, domain or camera, or an image is missing, damaged or of a wrong size.
+        """
+        if not 0 <= index < len(self):
+            raise SequenceError(f"{self.path} has no frame number {index}; its frames are 0 to {len(self) - 1}.")
+        domain = self._domain(domain)
+        names = tuple(self._cameras) if cameras is None else tuple(cameras)
+        masks = {name: mask for name in names if (mask := self._mask(name, domain, index)) is not None}
+        return Frame(
+            index=index,
+            frame_id=self.frame_ids[index],
+            domain=domain,
+            images={name: self._image(name, domain, index).copy() for name in names},
+            measured={arm: positions[index].copy() for arm, positions in self.measured.items()},
+            truth=None if self.truth is None else {arm: rows[index].copy() for arm, rows in self.truth.items()},
+            masks=masks or None,
+            timestamp=None if self.timestamps is None else float(self.timestamps[index]),
+        )
+
+    def recorded_camera(self, name: str) -> Camera:
+        """A camera as its images were recorded, with their distortion; `scene` has it without.
+
+        Raises:
+            SequenceError: there is no such camera.
+        """
+        return self._camera(name).camera
+
+    def has_masks(self, camera: str, domain: str | None = None) -> bool:
+        """Whether the sequence file gives masks for a camera (in a domain).
+
+        Raises:
+            SequenceError: there is no such domain or camera.
+        """
+        return self._domain(domain) in self._camera(camera).masks
+
+    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
+        """The mean background BG_m: what the camera sees where no arm is, RGB, undistorted.
+
+        It is the image that the sequence file names, else the median over the recording of what the arms, as measured,
+        do not cover. The first call may take seconds.
+
+        Raises:
+            SequenceError: there is no such domain or camera, or an image is not usable.
+        """
+        return self.mean_background(camera, domain).image.copy()
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The same with where it is known, and whether it tells what is there without arms; errors as `background`."""
+        domain = self._domain(domain)
+        entry = self._camera(camera)
+        with self._background_lock:
+            if (camera, domain) not in self._backgrounds:
+                self._backgrounds[camera, domain] = self._make_background(entry, domain)
+            return self._backgrounds[camera, domain]
+
+    def _make_background(self, entry: CameraInput, domain: str) -> MeanBackground:
+        camera = entry.camera
+        if domain in entry.background:
+            path = entry.background[domain]
+            image = read_image(path)
+            self._check_size(image, camera.name, f"background {path}")
+            return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
+        indices = spread(len(self))
+        measured = [{arm: rows[index] for arm, rows in self.measured.items()} for index in indices]
+        try:
+            return background_of_recording(
+                self.scene, camera.name, measured, lambda place: self._image(camera.name, domain, indices[place])
+            )
+        except SequenceError as error:
+            raise SequenceError(f"{self.path}: camera {camera.name!r}: {error}") from error
+
+    def _image(self, camera: str, domain: str, index: int) -> np.ndarray:
+        entry = self._camera(camera)
+
+        def decode() -> np.ndarray:
+            source = entry.images[domain]
+            image = source.read(index)
+            self._check_size(image, camera, f"image {source.name(index)}")
+            return entry.camera.undistort(image)
+
+        return self._cache.get(("image", camera, domain, index), decode)
+
+    def _mask(self, camera: str, domain: str, index: int) -> np.ndarray | None:
+        entry = self._camera(camera)
+        path = entry.masks[domain][index] if domain in entry.masks else None
+        if path is None:
+            return None
+
+        def decode() -> np.ndarray:
+            mask = read_mask(path)
+            self._check_size(mask, camera, f"mask {path}")
+            return entry.camera.undistort(mask)
+
+        return self._cache.get(("mask", str(path)), decode).copy()
+
+    def _check_size(self, image: np.ndarray, camera: str, what: str) -> None:
+        height, width = image.shape[:2]
+        wanted = self._camera(camera).camera
+        if (width, height) != (wanted.width, wanted.height):
+            raise SequenceError(
+                f"{what} is {width} x {height} pixels, but camera {camera!r} is {wanted.width} x {wanted.height} "
+                f"({self.path}). Correct `size` and K there, or export the file in the camera's size."
+            )
+
+    def _domain(self, domain: str | None) -> str:
+        if domain is None:
+            return self.domains[0]
+        if domain not in self.domains:
+            raise SequenceError(
+                f"{self.path} has no domain {domain!r}.{closest(domain, self.domains)} "
+                f"Its domains are: {', '.join(self.domains)}."
+            )
+        return domain
+
+    def _camera(self, camera: str) -> CameraInput:
+        if camera not in self._cameras:
+            raise SequenceError(
+                f"{self.path} has no camera {camera!r}.{closest(camera, self._cameras)} "
+                f"Its cameras are: {', '.join(self._cameras)}."
+            )
+        return self._cameras[camera]
