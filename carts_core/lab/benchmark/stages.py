@@ -4,7 +4,6 @@ import json
 
 import torch
 
-from ...bench import milliseconds, optimizer_figures, render_figures
 from ...files import OutputPath, write_text
 from ...model.scene import Scene
 from ...networks.extractor import FeatureExtractor
@@ -15,6 +14,7 @@ from ...settings import SurfaceSolver
 from ...settings.stages import Observe
 from .fingerprints import code_fingerprint
 from .machine import machine
+from .timing import milliseconds, optimizer_figures, render_figures
 
 _RUNS = 10
 
