@@ -43,7 +43,7 @@ class FrameFolder:
     Args:
         sequence, cameras: whose frames these are.
         folder: where to write.
-        settings: those that all frames share; what is in the folder counts if its settings are the same.
+        settings: what was asked for; a folder whose own are of another `sequence` is not written to.
         overwrite: start over, whatever is there.
 
     Attributes:
@@ -51,7 +51,7 @@ class FrameFolder:
         checkpoint: file for what sequence mode has found before it is done.
 
     Raises:
-        SettingsError: the folder holds results of other settings, or cannot be written to.
+        SettingsError: the folder holds results of another sequence, or cannot be written to.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class FrameFolder:
         self._table, self._settings_file = folder / "kinematics.csv", folder / "settings.json"
         self._records_file = folder / "results.json"
         self.checkpoint = folder / "checkpoint.txt"
-        self._settings, self._overwrite = json.dumps(settings, indent=1), overwrite
+        self._settings, self._overwrite = settings, overwrite
         self.rows: list[KinematicsRow] = []
         self._records: dict[str, Record] = {}
         self._check_settings()
@@ -83,7 +83,7 @@ class FrameFolder:
         Raises:
             OutputError: another process writes there.
             SequenceError: the table cannot be read.
-            SettingsError: the folder has come to hold results of other settings.
+            SettingsError: the folder has come to hold results of another sequence.
         """
         with locked_folder(self.folder):
             self._check_settings()
@@ -127,6 +127,8 @@ class FrameFolder:
         with finished_first():
             if not self._goes_on:
                 self._start_over()
+            if self._settings_written() != self._settings:
+                write_text(self._settings_file, json.dumps(self._settings, indent=1))
             for result in found:
                 frame_id, fingerprints = result.row.frame_id, {}
                 for camera, renderer in self._renderers.items():
@@ -149,7 +151,6 @@ class FrameFolder:
                 remove_file(masks / f"{frame_id}.png")
         remove_file(self._table)
         remove_file(self._records_file)
-        write_text(self._settings_file, self._settings)
         self._goes_on = True
 
     def _written_before(self) -> list[str]:
@@ -173,11 +174,20 @@ class FrameFolder:
         return {camera: Renderer(self._scene, cameras=[camera]) for camera in self._masks}
 
     def _check_settings(self) -> None:
-        file = self._settings_file
         if self._overwrite or not holds_file(self._table):
             return
-        if not holds_file(file) or file.path.read_text(encoding="utf-8", errors="replace") != self._settings:
+        if self._settings_written().get("sequence") != self._settings["sequence"]:
             raise SettingsError(
-                f"{self.folder} holds results of other settings (see {file}). "
-                "Add --overwrite to replace them, or name another folder with --output."
+                f"{self.folder} holds results of another sequence, or of one that is not known (see "
+                f"{self._settings_file}). Add --overwrite to replace them, or name another folder with --output."
             )
+
+    def _settings_written(self) -> dict[str, Any]:
+        """What the newest results in the folder were asked for with; nothing where that is missing or damaged."""
+        if not holds_file(self._settings_file):
+            return {}
+        try:
+            settings = json.loads(self._settings_file.path.read_bytes())
+        except (ValueError, RecursionError):
+            return {}
+        return settings if isinstance(settings, dict) else {}

@@ -21,7 +21,7 @@ class OptimizeOptions:
     output: Path | None = None
     """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras if they look together."""
     overwrite: bool = False
-    """Start over, although the folder holds results of other settings."""
+    """Start over: everything that the folder holds is made again."""
     mode: Mode = "frame"
     """Correct each frame alone, or all together, each knowing what the others found (docs: sequences)."""
     together: bool = False

@@ -145,7 +145,8 @@ class Optimizing:
             sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
         )
         load = starts.frame if asked.mode == "sequence" else load
-        return Origins(sequence, part.cameras, self._observer, load, backgrounds.images)
+        settings = json.dumps(self._settings())
+        return Origins(sequence, part.cameras, self._observer, load, backgrounds.images, settings)
 
     def _kept(self, part: _Part) -> str:
         """What there is of a part that was stopped."""

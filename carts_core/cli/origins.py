@@ -15,6 +15,7 @@ Origin = Mapping[str, str]
 _CHANGED = {
     "code": "another version of the program made them",
     "weights": "the weights changed",
+    "settings": "the settings changed",
     "robot": "the robot changed",
     "calibration": "the calibration changed",
     "joints": "the measured joint positions changed",
@@ -48,6 +49,7 @@ class Origins:
         observer: who says what images show.
         load: the frame at a position, its `measured` where the optimization starts.
         backgrounds: camera name -> mean background that frames are compared with, where there is one.
+        settings: what was asked for, as JSON.
     """
 
     def __init__(
@@ -57,12 +59,14 @@ class Origins:
         observer: Observer,
         load: Callable[[int], Frame],
         backgrounds: Mapping[str, np.ndarray],
+        settings: str,
     ) -> None:
         self._sequence, self._load, self._masked = sequence, load, observer.masked
         recorded = [sequence.recorded_camera(name) for name in cameras]
         self._common = {
             "code": code_fingerprint(_CODE),
             "weights": fingerprint(observer.weights, str(observer.predictor.device)),
+            "settings": fingerprint(settings),
             "robot": fingerprint(*(robot_fingerprint(arm.robot) for arm in sequence.scene.arms)),
             "calibration": calibration_fingerprint(sequence.scene, recorded),
             "background": fingerprint([(name, backgrounds[name]) for name in sorted(backgrounds)]),

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
 from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
@@ -17,6 +16,7 @@ from ..settings import Architecture
 from ..wording import shortened
 from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
+from .tensor_bytes import tensor_bytes
 
 VERSION = "1"
 WORKING_SIZE = (320, 240)
@@ -60,7 +60,8 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
         "working_size": json.dumps(working_size),
         "training": json.dumps(training),
     }
-    write_bytes(path, save({name: value.contiguous() for name, value in network.state_dict().items()}, metadata))
+    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
+    write_bytes(path, tensor_bytes(tensors, metadata))
 
 
 def read_weights(path: Path) -> Weights:

@@ -1,5 +1,6 @@
 """Results count only as long as what they were made from is the same, and they themselves are whole."""
 
+import csv
 import json
 import re
 import shutil
@@ -118,6 +119,48 @@ def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(
     change(tmp_path)
     assert told in optimize()
     assert "3 of 3 frames already there" in optimize()
+
+
+def time_offset_changed(folder: Path) -> None:
+    replaced(folder / "sequence.toml", "time_offset = 0.0", "time_offset = 0.25")
+
+
+def test_another_time_offset_has_all_frames_redone(optimize: Outcome, sequence: Path, tmp_path: Path) -> None:
+    text = sequence.read_text().replace('frame_id = "{frame:03d}"\n', "")
+    frames = '[frames]\ntable = "frames.csv"\nframe_id = "{frame:03d}"\ntime_offset = 0.0\nmax_gap = 0.5\n'
+    sequence.write_text(text.replace("[[arms]]", f"{frames}[[arms]]", 1))
+    (tmp_path / "frames.csv").write_text("frame,timestamp\n1,0.0\n2,0.5\n3,1.0\n")
+    for name in ("kinematics.csv", "truth.csv"):
+        with (tmp_path / name).open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        columns = [column for column in rows[0] if column != "frame"]
+        # Rows for a while after the last image, whose joints move on.
+        last, moved = rows[-1], {column: float(rows[-1][column]) + 0.01 for column in columns}
+        table = [{**row, "time": 0.5 * number} for number, row in enumerate(rows)] + [{**last, **moved, "time": 1.5}]
+        with (tmp_path / name).open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(table)
+    optimize()
+    assert "3 of 3 frames already there" in optimize()
+    time_offset_changed(tmp_path)
+    assert "3 of 3 frames redone: the measured joint positions changed" in optimize()
+    assert "3 of 3 frames already there" in optimize()
+
+
+def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
+    optimize: Outcome, tmp_path: Path
+) -> None:
+    optimize()
+    folder = tmp_path / "out" / "regular" / "left"
+    before = (folder / "masks" / "003.png").read_bytes()
+    told = optimize("--perturb-deg", "2", "--frames", "0-1")
+    assert "2 of 2 frames redone: the settings changed" in told
+    assert "1 frame not chosen now would have to be redone: the settings changed" in told
+    assert (folder / "masks" / "003.png").read_bytes() == before
+    assert json.loads((folder / "settings.json").read_text())["perturb_deg"] == 2
+    told = optimize("--perturb-deg", "2")
+    assert "2 of 3 frames already there" in told and "1 of 3 frames redone: the settings changed" in told
 
 
 def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path) -> None:

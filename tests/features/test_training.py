@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -184,6 +185,33 @@ def test_worker_processes_deliver_batches():
     images, classes = next(training_batches(small_config(workers=1), first_step=0))
     assert images.shape == (2, 2, 3, 48, 64) and images.dtype == torch.uint8
     assert classes.shape == (2, 2, 48, 64)
+
+
+@pytest.mark.parametrize(("workers", "reuse"), [(0, 1), (0, 3), (2, 3)])
+def test_the_stream_of_batches_goes_on_where_a_run_was_stopped(workers: int, reuse: int):
+    config = small_config(workers=workers, reuse=reuse)
+    whole = list(islice(training_batches(config, first_step=0), 9))
+    later = list(islice(training_batches(config, first_step=5), 4))
+    assert all(
+        torch.equal(a, b)
+        for left, right in zip(whole[5:], later, strict=True)
+        for a, b in zip(left, right, strict=True)
+    )
+
+
+def test_a_run_in_parts_ends_with_the_bytes_of_one_in_one_go(tmp_path: Path):
+    whole = train(small_config(steps=12), tmp_path / "whole")
+    config = small_config(steps=12)
+
+    def stop(progress: TrainingProgress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "parts", stop)
+    stopped = load_checkpoint(tmp_path / "parts")
+    assert stopped is not None and stopped.step == 10
+    parts = train(config, tmp_path / "parts")
+    assert parts.weights.read_bytes() == whole.weights.read_bytes()
 
 
 def test_the_validation_set_is_always_the_same_and_not_the_training_stream():

@@ -23,7 +23,10 @@ from .variants import Variant, random_variant
 
 SUPERSAMPLING = 2
 _VARIANTS = 12
-_VARIANT_LIFE = 40
+_VARIANT_LIFE = 80
+"""How many images are made before another place of the pool is renewed."""
+_OBSERVATIONS, _SCENES = 0, 1
+"""Streams of random numbers."""
 _TRIES = 12
 _FAR = 100.0
 """How far behind the camera an arm is that is not there [m]."""
@@ -56,7 +59,7 @@ class Observation:
 
 
 class Observer:
-    """Makes observed images without end; each depends on the seed and the images before it only.
+    """Makes observed images without end; each depends on the seed and its number only.
 
     Args:
         robots: the robots that arms are made of.
@@ -65,16 +68,21 @@ class Observer:
     """
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
-        self.rng = np.random.default_rng(seed)
+        self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
+        self._next = 0
+        self.rng = np.random.default_rng(self._seed)
         self.settings = settings
         self._robots = robots
         self._photographs = Photographs(settings.photographs) if settings.photographs else None
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
-    def __call__(self) -> Observation:
-        """The next observation."""
+    def __call__(self, number: int | None = None) -> Observation:
+        """The observation of a number, counted from 0; by default the next one."""
+        number = self._next if number is None else number
+        self._next = number + 1
+        self.rng = np.random.default_rng((*self._seed, _OBSERVATIONS, number))
         rng, settings = self.rng, self.settings
-        variant = self._variant(1 + int(rng.random() < settings.two_arms))
+        variant = self._variant(1 + int(rng.random() < settings.two_arms), number)
         size = settings.width, settings.height
         intrinsics, claimed, view = self._visible_placements(variant)
         placements = claimed
@@ -90,14 +98,17 @@ class Observer:
             image, variant, placements, claimed, intrinsics, view, fine, coverage, background, camera_seed
         )
 
-    def _variant(self, arms: int) -> Variant:
-        """A scene from a small pool, replaced after some use: building one costs as much as several images."""
-        key = arms, int(self.rng.integers(_VARIANTS))
-        variant, uses = self._variants.get(key, (None, 0))
-        if variant is None or uses >= _VARIANT_LIFE:
-            settings = self.settings
-            variant, uses = random_variant(self.rng, self._robots, arms, settings.width, settings.height), 0
-        self._variants[key] = variant, uses + 1
+    def _variant(self, arms: int, number: int) -> Variant:
+        """A scene from a small pool, replaced now and then: building one costs as much as several images."""
+        place, settings = int(self.rng.integers(_VARIANTS)), self.settings
+        # One place of the pool is renewed at a time.
+        life = number // _VARIANT_LIFE + place
+        generation = life // _VARIANTS
+        variant, made = self._variants.get((arms, place), (None, -1))
+        if variant is None or made != generation:
+            rng = np.random.default_rng((*self._seed, _SCENES, arms, place, generation))
+            variant = random_variant(rng, self._robots, arms, settings.width, settings.height)
+        self._variants[arms, place] = variant, generation
         return variant
 
     def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:

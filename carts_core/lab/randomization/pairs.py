@@ -40,7 +40,7 @@ class TrainingPair:
 
 
 class PairGenerator:
-    """Makes training pairs without end; every pair depends on the generator's seed and the pairs before it only.
+    """Makes training pairs without end; every pair depends on the generator's seed and its number only.
 
     Args:
         robots: the robots that arms are made of.
@@ -50,11 +50,12 @@ class PairGenerator:
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
-        self._settings, self._rng = settings, self._observer.rng
+        self._settings = settings
 
-    def __call__(self) -> TrainingPair:
-        """The next pair."""
-        rng, settings, seen = self._rng, self._settings, self._observer()
+    def __call__(self, number: int | None = None) -> TrainingPair:
+        """The pair of a number, counted from 0; by default the next one."""
+        seen = self._observer(number)
+        rng, settings = self._observer.rng, self._settings
         rendered = seen.placements
         if rng.random() >= settings.same_kinematics:
             scale = float(rng.uniform(0.3, 2.0))
@@ -72,7 +73,7 @@ class PairGenerator:
 
     def _mean_background(self, background: np.ndarray, camera_seed: int) -> np.ndarray:
         """BG_m: the scene without arms through the same camera, without its noise; sometimes another scene."""
-        rng, appearance = self._rng, self._settings.appearance
+        rng, appearance = self._observer.rng, self._settings.appearance
         if rng.random() < self._settings.same_background:
             image = photograph(np.random.default_rng(camera_seed), background, appearance)
         else:
@@ -94,8 +95,9 @@ class PairGenerator:
         with torch.no_grad():
             rendering = variant.renderer(state)
         layers = np.dstack([rendering.image[0].permute(1, 2, 0).numpy(), rendering.silhouette[0].numpy()])
-        if self._rng.random() < _BLURRED:  # as the optimizer does, to have a gradient that reaches further
-            layers = cv2.GaussianBlur(layers, (0, 0), self._rng.uniform(*_BLUR))
+        rng = self._observer.rng
+        if rng.random() < _BLURRED:  # as the optimizer does, to have a gradient that reaches further
+            layers = cv2.GaussianBlur(layers, (0, 0), rng.uniform(*_BLUR))
         image, silhouette, mean = (
             torch.from_numpy(np.ascontiguousarray(part)) for part in (layers[..., :3], layers[..., 3], background)
         )

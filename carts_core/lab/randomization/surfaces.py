@@ -38,7 +38,7 @@ class SurfaceSample:
 
 
 class SurfaceGenerator:
-    """Makes samples without end; every one depends on the seed and the samples before it only.
+    """Makes samples without end; every one depends on the seed and its number only.
 
     Args:
         robots: the robots that arms are made of.
@@ -49,9 +49,9 @@ class SurfaceGenerator:
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
 
-    def __call__(self) -> SurfaceSample:
-        """The next sample."""
-        seen, rng = self._observer(), self._observer.rng
+    def __call__(self, number: int | None = None) -> SurfaceSample:
+        """The sample of a number, counted from 0; by default the next one."""
+        seen, rng = self._observer(number), self._observer.rng
         size = self._observer.settings.width, self._observer.settings.height
         # Small errors are frequent, so that the network learns to be exact.
         scale = _LARGEST_ERROR * float(rng.random()) ** 1.5

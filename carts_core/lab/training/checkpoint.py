@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from ...errors import WeightsError
 from ...files import output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json
+from ...networks.tensor_bytes import tensor_bytes
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 
@@ -50,7 +50,7 @@ def save_checkpoint(
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{key}": value for key, value in state.items()}
     metadata = {"step": str(step), "config": config_json, "history": json.dumps(asdict(history))}
-    content = save({name: value.detach().clone().contiguous() for name, value in tensors.items()}, metadata)
+    content = tensor_bytes({name: value.detach().clone().contiguous() for name, value in tensors.items()}, metadata)
     write_bytes(output_path(folder, CHECKPOINT_FILE), content)
 
 

@@ -1,14 +1,14 @@
 """Training batches, made in worker processes while the network trains."""
 
 import os
-from collections import deque
 from collections.abc import Iterator
+from itertools import count
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
 from .task import Batch
@@ -16,47 +16,70 @@ from .tasks import task_of
 
 VALIDATION_STREAM = 1
 _TRAINING_STREAM = 0
+_CHOICES = 1
 _NICENESS = 1
 _MEMORY = 300
 
 
-class _Samples(IterableDataset):
-    """An endless stream of samples; each worker and each start of training has its own."""
+class _Samples(Dataset):
+    """The samples of a run by number, so that a run that goes on has those that it would have had.
 
-    def __init__(self, config: TrainingConfig, first_step: int) -> None:
-        self._config = config
-        self._first_step = first_step
+    With one worker, or none, `reuse` has every so manieth sample made, and the others chosen of the newest `_MEMORY`
+    made ones. With several, batches are dealt to them in turn, and each chooses of its own.
+    """
 
-    def __iter__(self) -> Iterator[Batch]:
-        info = get_worker_info()
-        worker = 0
-        if info is not None:
-            worker = info.id
-            # One thread per process: the processes themselves fill the cores. Training itself goes first.
-            torch.set_num_threads(1)
-            cv2.setNumThreads(1)
-            os.nice(_NICENESS)
-        task = task_of(self._config.network)
-        seed = (self._config.seed, _TRAINING_STREAM, self._first_step, worker)
-        generator = task.generator(self._config, seed)
-        rng = np.random.default_rng((*seed, 1))
-        recent: deque[Any] = deque(maxlen=_MEMORY)
-        while True:
-            recent.append(generator())
-            yield task.tensors(recent[-1])
-            for _ in range(self._config.reuse - 1):
-                sample = recent[rng.integers(len(recent))]
-                yield task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
+    def __init__(self, config: TrainingConfig) -> None:
+        self._config, self._lanes = config, max(config.workers, 1)
+        self._generators: dict[int, Any] = {}
+        self._made: dict[tuple[int, int], Any] = {}
+        self._alone = False
+
+    def __getitem__(self, number: int) -> Batch:
+        self._share_processor()
+        config, task = self._config, task_of(self._config.network)
+        batch, place = divmod(number, config.batch_size)
+        lane, position = batch % self._lanes, batch // self._lanes * config.batch_size + place
+        newest, repeats = divmod(position, config.reuse)
+        if not repeats:
+            return task.tensors(self._sample(lane, newest, newest))
+        rng = np.random.default_rng((config.seed, _TRAINING_STREAM, lane, _CHOICES, position))
+        chosen = newest - int(rng.integers(min(newest + 1, _MEMORY)))
+        sample = self._sample(lane, chosen, newest)
+        return task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
+
+    def _sample(self, lane: int, number: int, newest: int) -> Any:
+        """A made sample; one from before a run was stopped is made again."""
+        key = lane, number
+        if key not in self._made:
+            if lane not in self._generators:
+                stream = (self._config.seed, _TRAINING_STREAM, lane)
+                self._generators[lane] = task_of(self._config.network).generator(self._config, stream)
+            sample = self._generators[lane](number)
+            if self._config.reuse == 1:
+                return sample
+            self._made[key] = sample
+            self._made.pop((lane, newest - _MEMORY), None)
+        return self._made[key]
+
+    def _share_processor(self) -> None:
+        if self._alone or get_worker_info() is None:
+            return
+        # One thread per process: the processes themselves fill the cores. Training itself goes first.
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        os.nice(_NICENESS)
+        self._alone = True
 
 
 def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Batch]:
     """Endless batches of the task's tensors.
 
-    The stream depends on the seed, the number of workers and the step that it starts at.
+    A batch depends on the seed, the number of workers and its own number, wherever the stream starts.
     """
     loader = DataLoader(
-        _Samples(config, first_step),
+        _Samples(config),
         batch_size=config.batch_size,
+        sampler=count(first_step * config.batch_size),
         num_workers=config.workers,
         prefetch_factor=2 if config.workers else None,
         # A forked child hangs in OpenMP as soon as the parent has used threads.
@@ -69,5 +92,5 @@ def validation_set(config: TrainingConfig) -> Batch:
     """The same samples every time, from random numbers that training never sees."""
     task = task_of(config.network)
     generator = task.generator(config, (config.seed, VALIDATION_STREAM))
-    samples = [task.tensors(generator()) for _ in range(config.validation_samples)]
+    samples = [task.tensors(generator(number)) for number in range(config.validation_samples)]
     return tuple(torch.stack(part) for part in zip(*samples, strict=True))

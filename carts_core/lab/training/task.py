@@ -23,8 +23,8 @@ class Task(Protocol):
         """A network with random weights."""
         ...
 
-    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[], Any]:
-        """An endless source of samples; every stream of a seed is another one."""
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[int], Any]:
+        """Makes the sample of a number, counted from 0; every stream of a seed has others."""
         ...
 
     def flipped(self, sample: Any, horizontally: bool, vertically: bool) -> Any:
