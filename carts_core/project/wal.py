@@ -6,18 +6,23 @@ Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
 """
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import UInt32
+from jaxtyping import UInt8, UInt32
 
 HEADER = 32
 """Bytes before the first frame."""
 FRAME_HEADER = 24
 """Bytes before each frame's page."""
 _BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC = 0x377F0683, 0x377F0682
+_COVERED = 8
+"""Bytes of a frame's header that its checksum covers, besides its page."""
+_WORD = 0xFFFFFFFF
+_FRAMES_AT_ONCE = 256
 _Sum = tuple[int, int]
 
 
@@ -46,14 +51,12 @@ def played_back(database: bytes, log: bytes) -> Playback:
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
     running = struct.unpack_from(">2I", log, 24)
     known = magic in (_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC)
-    if not known or page_size not in (1 << n for n in range(9, 17)) or _checksum(order, log[:24], (0, 0)) != running:
+    if not known or page_size not in (1 << n for n in range(9, 17)) or _header_sum(order, log) != running:
         return Playback(result, damaged=True)
     unfinished: list[tuple[int, int]] = []
-    for start in range(HEADER, len(log) - FRAME_HEADER - page_size + 1, FRAME_HEADER + page_size):
+    for start, running in _running_sums(order, log, HEADER, page_size, running):
         number, pages, *rest = struct.unpack_from(">6I", log, start)
         begin = start + FRAME_HEADER
-        running = _checksum(order, log[start : start + 8], running)
-        running = _checksum(order, log[begin : begin + page_size], running)
         if rest != [*salts, *running] or number == 0:
             return Playback(result, damaged=True)
         unfinished.append((number, begin))
@@ -92,39 +95,63 @@ def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
     magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
     running: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
-    commits = 0
-    for start in range(0, len(log) - FRAME_HEADER - page_size + 1, FRAME_HEADER + page_size):
-        before = running
+    commits, before = 0, running
+    for start, running in _running_sums(order, log, 0, page_size, running):
         _, pages, *rest = struct.unpack_from(">6I", log, start)
-        begin = start + FRAME_HEADER
-        running = _checksum(order, log[begin : begin + page_size], _checksum(order, log[start : start + 8], running))
         if rest != [*salts, *running]:
             return None
         commits += bool(pages)
         if commits > mark.frames:
             return Mark(mark.start + start, before, 1)
+        before = running
     return None
 
 
-def _checksum(order: Literal["<", ">"], data: bytes, start: _Sum) -> _Sum:
-    """The running checksum of the format, continued by a multiple of 8 bytes.
+def _running_sums(
+    order: Literal["<", ">"], log: bytes, start: int, page_size: int, running: _Sum
+) -> Iterator[tuple[int, _Sum]]:
+    """Where each whole frame begins, and the checksum of the log up to its end.
 
-    Each pair of words (x, y) takes the sums (s, t) to s' = s + x + t and t' = t + y + s', modulo 2^32. This is linear,
-    so a whole page is two sums of products.
+    Args:
+        order: byte order of the words.
+        log: content of the log.
+        start: where the first frame begins.
+        page_size: what each frame holds [bytes].
+        running: the checksum before it.
     """
-    words = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(order)).astype(np.uint32)
-    added = np.stack((words[::2], words[::2] + words[1::2]), axis=-1)
-    powers = _powers(len(added))
-    whole = (powers[-1] * np.array(start, np.uint32)).sum(axis=-1, dtype=np.uint32)
-    whole = whole + (powers[-2::-1] * added[:, None, :]).sum(axis=(0, 2), dtype=np.uint32)
-    return int(whole[0]), int(whole[1])
+    size = FRAME_HEADER + page_size
+    weights, ((a, b), (c, d)) = _weights((_COVERED + page_size) // 4)
+    while count := min((len(log) - start) // size, _FRAMES_AT_ONCE):
+        frames = np.frombuffer(log, np.uint8, count * size, start).reshape(count, size)
+        covered = np.concatenate((frames[:, :_COVERED], frames[:, FRAME_HEADER:]), axis=1)
+        for x, y in (_words(order, covered) @ weights).tolist():
+            s, t = running
+            running = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
+            yield start, running
+            start += size
+
+
+def _header_sum(order: Literal["<", ">"], log: bytes) -> _Sum:
+    words = _words(order, np.frombuffer(log, np.uint8, HEADER - 8))
+    first, second = (words @ _weights(len(words))[0]).tolist()
+    return first, second
+
+
+def _words(order: Literal["<", ">"], data: UInt8[np.ndarray, "*rows bytes"]) -> UInt32[np.ndarray, "*rows words"]:
+    return data.view(np.dtype(np.uint32).newbyteorder(order)).astype(np.uint32, copy=False)
 
 
 @lru_cache(maxsize=8)
-def _powers(pairs: int) -> UInt32[np.ndarray, "pairs+1 2 2"]:
-    """Powers 0 to `pairs` of the matrix that takes one pair's sums to the next."""
-    powers, (a, b, c, d) = [], (1, 0, 0, 1)
-    for _ in range(pairs + 1):
-        powers.append(((a, b), (c, d)))
-        a, b, c, d = (value & 0xFFFFFFFF for value in (a + c, b + d, a + 2 * c, b + 2 * d))
-    return np.array(powers, np.uint32)
+def _weights(words: int) -> tuple[UInt32[np.ndarray, "words 2"], tuple[_Sum, _Sum]]:
+    """What each word adds to the two sums of a checksum, and the matrix that takes the sums before the words along.
+
+    Each pair of words (x, y) takes the sums (s, t) to s' = s + x + t and t' = t + y + s', modulo 2^32. This is linear,
+    so that any number of words are two sums of products.
+    """
+    columns, (a, b, c, d) = [], (1, 0, 0, 1)
+    for _ in range(words // 2):
+        # The last pair comes first: nothing follows it.
+        columns.append((((a + b) & _WORD, (c + d) & _WORD), (b, d)))
+        a, b, c, d = (value & _WORD for value in (a + b, a + 2 * b, c + d, c + 2 * d))
+    weights = [word for pair in reversed(columns) for word in pair]
+    return np.array(weights, np.uint32).reshape(-1, 2), ((a, b), (c, d))
