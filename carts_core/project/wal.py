@@ -49,12 +49,12 @@ def played_back(database: bytes, log: bytes) -> Playback:
         return Playback(result, damaged=False)
     magic, _, page_size, _, *salts = struct.unpack_from(">6I", log)
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
-    running = struct.unpack_from(">2I", log, 24)
+    first = struct.unpack_from(">2I", log, 24)
     known = magic in (_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC)
-    if not known or page_size not in (1 << n for n in range(9, 17)) or _header_sum(order, log) != running:
+    if not known or page_size not in (1 << n for n in range(9, 17)) or _header_sum(order, log) != first:
         return Playback(result, damaged=True)
     unfinished: list[tuple[int, int]] = []
-    for start, running in _running_sums(order, log, HEADER, page_size, running):
+    for start, running in _running_sums(order, log, HEADER, page_size, first):
         number, pages, *rest = struct.unpack_from(">6I", log, start)
         begin = start + FRAME_HEADER
         if rest != [*salts, *running] or number == 0:
@@ -94,9 +94,9 @@ def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
         return None
     magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
-    running: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
-    commits, before = 0, running
-    for start, running in _running_sums(order, log, 0, page_size, running):
+    before: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
+    commits = 0
+    for start, running in _running_sums(order, log, 0, page_size, before):
         _, pages, *rest = struct.unpack_from(">6I", log, start)
         if rest != [*salts, *running]:
             return None

@@ -4,6 +4,7 @@ Reads requests from standard input, a JSON object a line: `arguments` of the com
 `seconds` after which it gets `signal`. Answers each with a line: the exit status, negative if a signal ended it.
 """
 
+import faulthandler
 import json
 import os
 import sys
@@ -23,6 +24,8 @@ def run(arguments: list[str], log: Path) -> int:
     with log.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    # A crash says where.
+    faulthandler.enable(2)
     try:
         main(arguments)
     except SystemExit as end:
