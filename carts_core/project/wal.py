@@ -23,6 +23,7 @@ _COVERED = 8
 """Bytes of a frame's header that its checksum covers, besides its page."""
 _WORD = 0xFFFFFFFF
 _FRAMES_AT_ONCE = 256
+_PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
 _Sum = tuple[int, int]
 
 
@@ -51,7 +52,7 @@ def played_back(database: bytes, log: bytes) -> Playback:
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
     first = struct.unpack_from(">2I", log, 24)
     known = magic in (_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC)
-    if not known or page_size not in (1 << n for n in range(9, 17)) or _header_sum(order, log) != first:
+    if not known or page_size not in _PAGE_SIZES or _header_sum(order, log) != first:
         return Playback(result, damaged=True)
     unfinished: list[tuple[int, int]] = []
     for start, running in _running_sums(order, log, HEADER, page_size, first):
@@ -93,6 +94,9 @@ def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
     if len(header) < HEADER:
         return None
     magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
+    if page_size not in _PAGE_SIZES:
+        # Somebody has written over it.
+        return None
     order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
     before: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
     commits = 0
