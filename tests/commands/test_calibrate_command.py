@@ -92,7 +92,7 @@ def test_an_earlier_calibration_is_replaced_only_on_request(
         (["--frames", "spread:0"], "names no frame"),
         (["--frames", "7"], "frame 7 is outside"),
         (["--no-base-frames", "--no-extrinsics"], "nothing of the calibration is free"),
-        (["--solver", "adam"], "needs gauss_newton"),
+        (["--settings", "prior_deg=0"], "prior_deg is 0"),
         (["--camera", "third"], "no camera is called 'third'"),
         (["--domain", "fog"], "no domain 'fog'"),
     ],
