@@ -36,11 +36,11 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 
 
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
-    """A line for each reason why results are not to be believed, or only in part.
+    """A line for each reason why results are not to be relied on, or only in part.
 
     Args:
         where: as below.
-        assessed: id of each frame -> how far its result is to be believed.
+        assessed: id of each frame -> how far its result can be relied on.
     """
     frames: dict[tuple[str, str, str], list[str]] = {}
     for frame_id, found in assessed.items():

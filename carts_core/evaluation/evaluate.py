@@ -144,7 +144,7 @@ def frame_score(
         start: arm name -> joint positions before [rad, m].
         state, joint_positions, joint_std: after.
         iterations, seconds, stopped, base_frame_gain: as in the score.
-        assessment: how far the estimate is to be believed, where it is assessed.
+        assessment: how far the estimate can be relied on, where it is assessed.
     """
     mask = (frame.masks or {}).get(camera)
     truth = frame.truth or {}

@@ -146,7 +146,7 @@ class FrameOptimizer:
         self._fit = Fit(self._problem, torch.zeros_like(self._variables.lower), budget)
         self._points = self._judged(run_stages(self.settings.stages, self._fit))
         self.assessment: Assessment | None = None
-        """At the end, how far the result is to be believed; None before, and for solvers other than `SurfaceSolver`.
+        """At the end, how far the result can be relied on; None before, and for solvers other than `SurfaceSolver`.
         What failed keeps its start, unless the image speaks against that even more."""
 
     @property

@@ -1,4 +1,4 @@
-"""Whether a fit is to be believed, as far as its images tell; nothing here knows how it was made."""
+"""Whether a fit can be relied on, as far as its images tell; nothing here knows how it was made."""
 
 import math
 from collections.abc import Callable
@@ -92,7 +92,7 @@ def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1
 
 
 class Verdict(Enum):
-    """How far a fit is to be believed."""
+    """How far a fit can be relied on."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"

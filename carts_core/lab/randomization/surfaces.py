@@ -1,4 +1,4 @@
-"""Training samples of the surface network: an image, where arms are believed to be, and where they are."""
+"""Training samples of the surface network: an image, where arms are expected, and where they are."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ SURFACE_UNIT = 127
 """What 1 is in a surface map of a sample."""
 
 _LARGEST_ERROR = 3.0
-"""Scale of the largest error of the believed kinematics; 1 is about 3 degrees and 3 mm."""
+"""Scale of the largest error of the given kinematics; 1 is about 3 degrees and 3 mm."""
 
 _UNKNOWN = 0.08
-"""Share of samples in which nothing is believed."""
+"""Share of samples in which nothing is given."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SurfaceSample:
 
     observed: Int[np.ndarray, "h w 3"]
     """RGB uint8."""
-    believed: Int[np.ndarray, "h w 6"]
+    given: Int[np.ndarray, "h w 6"]
     """Surface map of wrong kinematics, times `SURFACE_UNIT`, int8."""
     surface: Int[np.ndarray, "h w 6"]
     """Surface map of what the image shows, times `SURFACE_UNIT`, int8."""
@@ -55,11 +55,11 @@ class SurfaceGenerator:
         size = self._observer.settings.width, self._observer.settings.height
         # Small errors are frequent, so that the network learns to be exact.
         scale = _LARGEST_ERROR * float(rng.random()) ** 1.5
-        believed = [
+        given = [
             perturbed(rng, geometry, placement, scale)
             for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)
         ]
-        wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, believed, seen.intrinsics, *size), size)
+        wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, given, seen.intrinsics, *size), size)
         if rng.random() < _UNKNOWN:
             wrong = np.zeros_like(wrong)
         return SurfaceSample(to_uint8(seen.image), wrong, _surface(seen.variant.geometries, seen.fine, size))

@@ -23,11 +23,11 @@ _SMOOTH = 0.2
 
 
 class SurfaceTask:
-    """See `Task`. A batch is images, believed surface maps and true surface maps."""
+    """See `Task`. A batch is images, given surface maps and true surface maps."""
 
     columns: ClassVar[dict[str, str]] = {
         "dice": "Dice of the arms",
-        "dice_believed": "Dice of what was believed",
+        "dice_given": "Dice of the given kinematics",
         "part_accuracy": "pixels with the right part",
         "normal_error_deg": "error of normals [deg]",
     }
@@ -42,22 +42,22 @@ class SurfaceTask:
 
     def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:
         """A sample mirrored; normals turn with it."""
-        observed, believed, surface = (
-            flips(part, horizontally, vertically) for part in (sample.observed, sample.believed, sample.surface)
+        observed, given, surface = (
+            flips(part, horizontally, vertically) for part in (sample.observed, sample.given, sample.surface)
         )
         turn = np.ones(surface.shape[2], np.int8)
         turn[NORMALS.start] = -1 if horizontally else 1
         turn[NORMALS.start + 1] = -1 if vertically else 1
-        return SurfaceSample(observed, believed * turn, surface * turn)
+        return SurfaceSample(observed, given * turn, surface * turn)
 
     def tensors(self, sample: SurfaceSample) -> Batch:
         """A sample as tensors of bytes."""
-        return byte_tensor(sample.observed), byte_tensor(sample.believed), byte_tensor(sample.surface)
+        return byte_tensor(sample.observed), byte_tensor(sample.given), byte_tensor(sample.surface)
 
     def loss(self, config: TrainingConfig, network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
-        images, believed, surface = _floats(batch)
-        predicted = network(images, believed)
+        images, given, surface = _floats(batch)
+        predicted = network(images, given)
         coverage = surface[:, COVERAGE]
         near = dilated((coverage.sum(1) > 0).float())
         background = (1 - coverage.sum(1, keepdim=True)).clamp(min=0)
@@ -75,15 +75,15 @@ class SurfaceTask:
     @torch.no_grad()
     def validate(self, network: SurfaceNetwork, batch: Batch) -> dict[str, float]:
         """Figures of a folded network."""
-        images, believed, surface = _floats(batch)
-        seen = torch.cat([network(images[i : i + 8], believed[i : i + 8]).map() for i in range(0, len(images), 8)])
+        images, given, surface = _floats(batch)
+        seen = torch.cat([network(images[i : i + 8], given[i : i + 8]).map() for i in range(0, len(images), 8)])
         true, guess = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (surface, seen))
-        known = believed[:, COVERAGE].sum(1) > 0.5
+        known = given[:, COVERAGE].sum(1) > 0.5
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
         cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
         return {
             "dice": float(dice(guess, true).mean()),
-            "dice_believed": float(dice(known, true).mean()),
+            "dice_given": float(dice(known, true).mean()),
             "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
             "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
         }
@@ -91,14 +91,14 @@ class SurfaceTask:
     @torch.no_grad()
     def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
         """Example predictions of a folded network."""
-        images, believed, surface = _floats(batch)
-        seen = network(images, believed).map()
+        images, given, surface = _floats(batch)
+        seen = network(images, given).map()
         rows = []
-        for image, wrong, found, true in zip(images, believed, seen, surface, strict=True):
+        for image, wrong, found, true in zip(images, given, seen, surface, strict=True):
             rows.append(
                 [
                     ("observed", image.permute(1, 2, 0).numpy()),
-                    ("believed", _colors(wrong[COVERAGE])),
+                    ("given", _colors(wrong[COVERAGE])),
                     ("predicted parts", _colors(found[COVERAGE])),
                     ("true parts", _colors(true[COVERAGE])),
                     ("predicted normals", _colors(0.5 + 0.5 * found[NORMALS])),
@@ -109,9 +109,9 @@ class SurfaceTask:
 
 
 def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    images, believed, surface = batch
+    images, given, surface = batch
     images = (images.float() / 255).contiguous(memory_format=torch.channels_last)
-    return images, believed.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
+    return images, given.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
 
 
 def _part_dice_loss(
