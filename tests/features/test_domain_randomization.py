@@ -211,7 +211,7 @@ def test_arms_may_be_claimed_that_are_not_there(shipped_psm: Robot):
     generator = SurfaceGenerator([shipped_psm], settings, 5)
     samples = [generator() for _ in range(30)]
     assert all((sample.surface == 0).all() for sample in samples)
-    claimed = [bool((sample.believed > 0).any()) for sample in samples]
+    claimed = [bool((sample.given > 0).any()) for sample in samples]
     assert 0.7 < np.mean(claimed) < 1
 
 

@@ -36,12 +36,12 @@ def trained() -> SurfaceNetwork:
     ],
 )
 def test_a_grown_network_says_the_same_and_can_learn_everywhere(trained: SurfaceNetwork, larger: Architecture):
-    images, believed = torch.rand(2, 3, 32, 48), torch.rand(2, 6, 32, 48)
+    images, given = torch.rand(2, 3, 32, 48), torch.rand(2, 6, 32, 48)
     grown = grow(SurfaceNetwork(larger), trained).eval()
-    torch.testing.assert_close(grown(images, believed).map(), trained(images, believed).map(), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(grown(images, given).map(), trained(images, given).map(), atol=1e-5, rtol=1e-4)
     optimizer = torch.optim.SGD(grown.parameters(), 1e-3)
     for _ in range(2):  # weights from new to old channels start at zero and move first
-        grown(images, believed).map().square().sum().backward()
+        grown(images, given).map().square().sum().backward()
         optimizer.step()
     assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in grown.parameters())
 

@@ -72,7 +72,7 @@ def _seen(scene: Scene, image: np.ndarray, backgrounds: Backgrounds | None) -> t
     return found, seen.numpy()
 
 
-def test_without_a_background_the_network_is_believed_in_all_that_it_sees(scene: Scene) -> None:
+def test_without_a_background_all_that_the_network_sees_counts(scene: Scene) -> None:
     found, seen = _seen(scene, _with_arm(_room()), None)
     assert found.explained is None and seen[BAR].all() and seen[ARM].all()
 
