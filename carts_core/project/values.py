@@ -127,10 +127,11 @@ class CorrectedTransform(JsonValue):
 
     def __post_init__(self) -> None:
         try:
-            matrix = rigid_transform(self.transform, "the corrected transform")
+            rigid_transform(self.transform, "the corrected transform")
         except SettingsError as error:
             raise ProjectError(str(error)) from error
-        _set(self, "transform", tuple(tuple(row) for row in matrix.tolist()))
+        # Kept to the last bit: what is saved is what was shown.
+        _set(self, "transform", tuple(tuple(float(value) for value in row) for row in self.transform))
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
