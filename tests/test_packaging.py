@@ -119,8 +119,8 @@ def test_the_installed_wheel_opens_its_own_sample_and_weights(environment: Path,
     program = """
 from pathlib import Path
 import carts_core, carts_viewer
-from carts_core.data import Sequence
-from carts_core.features import FeatureExtractor
+from carts_core.recording import Sequence
+from carts_core.networks import FeatureExtractor
 from carts_core.resources import sample_sequence, shipped_robot, shipped_weights, static_dir
 
 sequence = Sequence.open(sample_sequence())

@@ -21,7 +21,7 @@ from carts_core.recording.images import read_image, read_mask
 _REPEATED = """
 import sys
 from pathlib import Path
-from carts_core.data import Sequence
+from carts_core.recording import Sequence
 from carts_core.export import Dataset, export, measured_frames
 sequence = Sequence.open(sys.argv[1])
 dataset = Dataset(sequence, tuple(measured_frames(sequence, range(len(sequence)))), sequence.scene, "regular")

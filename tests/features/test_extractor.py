@@ -124,9 +124,7 @@ def test_a_surface_network_takes_the_place_of_the_shipped_one(tmp_path: Path, sm
     save_weights(network, tmp_path / "surface.safetensors", {}, (320, 240))
     extractor = FeatureExtractor.load(tmp_path / "surface.safetensors")
     images, given = torch.rand(1, 3, 32, 48), torch.rand(1, 6, 32, 48)
-    torch.testing.assert_close(
-        extractor.surface(images, given), network(images, given).map(), atol=1e-5, rtol=1e-4
-    )
+    torch.testing.assert_close(extractor.surface(images, given), network(images, given).map(), atol=1e-5, rtol=1e-4)
     assert extractor.sha256 != FeatureExtractor.load().sha256
 
 

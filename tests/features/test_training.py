@@ -68,7 +68,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_training import small_config
-from carts_core.features.training import train
+from carts_core.lab.training.training import train
 train(small_config(steps=100_000), Path(sys.argv[1]))
 """
 
