@@ -17,7 +17,7 @@ from carts_core.errors import SettingsError
 
 SCORE_KEYS = {
     *("frame", "camera", "domain", "dice_before", "dice_after", "joint_mae_deg_before", "joint_mae_deg_after"),
-    *("iterations", "seconds", "stopped", "joint_std_deg", "base_frame_gain"),
+    *("iterations", "seconds", "stopped", "joint_std_deg", "base_frame_gain", "verdict", "reason"),
 }
 
 
