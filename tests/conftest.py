@@ -17,6 +17,8 @@ from carts_core.process import tune_process
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
 
+pytest_plugins = ["small_network"]
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

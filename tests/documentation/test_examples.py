@@ -9,7 +9,7 @@ import cv2
 import pytest
 from pycocotools.coco import COCO
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 

@@ -48,7 +48,7 @@ def test_a_sequence_by_a_relative_path_has_its_images_after_the_working_director
 
 @pytest.mark.usefixtures("cold_cache")
 def test_the_described_real_frames_open_by_a_relative_path(shared_dir: Path, monkeypatch: MonkeyPatch):
-    monkeypatch.chdir(Path(__file__).parents[1])
+    monkeypatch.chdir(Path(__file__).parents[2])
     sequence = Sequence.open("tests/sequences/dvrk_stereo.toml")
     assert len(sequence) == 30 and len(sequence.scene.arms[0].robot.meshes) > 5
 

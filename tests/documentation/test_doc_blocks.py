@@ -59,7 +59,7 @@ def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]
         for block in TO_RUN[page]
     ]
     finished = subprocess.run(
-        [sys.executable, str(ROOT / "tests" / "run_doc_blocks.py")],
+        [sys.executable, str(ROOT / "tests" / "documentation" / "run_doc_blocks.py")],
         input=json.dumps(todo),
         cwd=desk,
         env=environment,
@@ -99,7 +99,7 @@ def test_a_block_that_fails_fails_the_test(reader: tuple[Path, dict[str, str]]) 
     desk, environment = reader
     for language, content in (("console", ["carts render missing.toml"]), ("python", "1 / 0")):
         finished = subprocess.run(
-            [sys.executable, str(ROOT / "tests" / "run_doc_blocks.py")],
+            [sys.executable, str(ROOT / "tests" / "documentation" / "run_doc_blocks.py")],
             input=json.dumps([["page:1", language, content]]),
             cwd=desk,
             env=environment,

@@ -1,4 +1,4 @@
-"""Run blocks of one page of the documentation one after the other, as a reader would; see tests/test_doc_blocks.py.
+"""Run blocks of one page of the documentation one after the other, as a reader would; see test_doc_blocks.py.
 
 Reads a JSON list of [place, language, text or commands] from the standard input. All blocks share one process, which
 saves starting torch anew for each, and Python blocks go on where the one before ended.
