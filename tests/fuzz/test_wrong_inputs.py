@@ -1,6 +1,7 @@
 """Inputs changed at random: read or refused with a message, in bounded time and memory, and always finite."""
 
 import pytest
+
 from fuzz.campaign import GOOD, run
 from fuzz.kinds import KINDS
 
