@@ -11,10 +11,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("carts_core", "carts_viewer")
 LONGEST_MODULE = 300
 LONGEST_FUNCTION = 60
-TOO_LONG = frozenset(
-    {"carts_core/optimization/sequence.py", "carts_core/project/project.py", "evaluate", "read_weights"}
-)
-"""Modules, and functions, that are still longer; this list only ever gets shorter."""
+SHORT = (*PACKAGES, "tools", "docs", ".ci", "examples")
+"""Folders in which modules and functions keep to these lengths."""
 
 
 def _sources() -> dict[str, Path]:
@@ -95,12 +93,15 @@ def test_modules_that_only_share_a_third_one_are_no_circle() -> None:
 
 
 def test_no_module_and_no_function_is_too_long() -> None:
-    found = {
-        what
-        for path in _sources().values()
-        for what in too_long(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
-    }
-    assert found - TOO_LONG == set()
+    paths = [path for folder in SHORT for path in (ROOT / folder).rglob("*.py") if "_build" not in path.parts]
+    assert len(paths) > 300
+    found = [
+        f"{name}: {what}"
+        for path in paths
+        for name in [path.relative_to(ROOT).as_posix()]
+        for what in too_long(name, path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
 
 
 def test_a_long_module_and_a_long_function_are_found() -> None:

@@ -84,25 +84,37 @@ def evaluate(
                 for _ in optimizer:
                     pass
                 seconds = (time.perf_counter() - began) / len(group)
-                best = optimizer.best
-                assert best is not None and optimizer.stop_reason is not None
-                gain, assessed = optimizer.base_frame_gain(), optimizer.assessment
                 for camera, renderer in renderers.items():
-                    yield frame_score(
-                        sequence,
-                        frame,
-                        camera,
-                        renderer,
-                        start,
-                        best.state,
-                        best.joint_positions(),
-                        best.joint_std(),
-                        len(optimizer.history) - 1,
-                        seconds,
-                        optimizer.stop_reason,
-                        gain,
-                        assessed,
-                    )
+                    yield _optimized_score(sequence, frame, camera, renderer, start, optimizer, seconds)
+
+
+def _optimized_score(
+    sequence: Sequence,
+    frame: Frame,
+    camera: str,
+    renderer: Renderer,
+    start: dict[str, np.ndarray],
+    optimizer: FrameOptimizer,
+    seconds: float,
+) -> FrameScore:
+    """The score of a frame at the best iterate of an optimizer that has ended."""
+    best = optimizer.best
+    assert best is not None and optimizer.stop_reason is not None
+    return frame_score(
+        sequence,
+        frame,
+        camera,
+        renderer,
+        start,
+        best.state,
+        best.joint_positions(),
+        best.joint_std(),
+        len(optimizer.history) - 1,
+        seconds,
+        optimizer.stop_reason,
+        optimizer.base_frame_gain(),
+        optimizer.assessment,
+    )
 
 
 def camera_groups(cameras: Names[str], together: bool) -> list[tuple[str, ...]]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +71,20 @@ def read_weights(path: Path) -> Weights:
         WeightsError: the file is missing, is not safetensors, was not written by `carts train`, or its tensors do not
             fit the architecture it names.
     """
+    metadata, shapes = _header(path)
+    make_network = _NETWORKS[metadata["format"]]
+    architecture, working_size, training = _described(path, metadata)
+    network = _filled(path, make_network, architecture, shapes)
+    if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
+        raise WeightsError(
+            f"weights file {path} gives the working size {working_size}; allowed are two positive multiples of "
+            f"{architecture.stride}. {_REMEDY}"
+        )
+    return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
+
+
+def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
+    """Metadata of a supported version, and the shape of every tensor."""
     try:
         check_regular(path, WEIGHTS)
         with safe_open(path, framework="pt") as file:
@@ -85,6 +99,11 @@ def read_weights(path: Path) -> Weights:
             f"weights file {path} says format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed "
             f"is {' or '.join(map(repr, _NETWORKS))}, version {VERSION!r}. {_REMEDY}"
         )
+    return metadata, shapes
+
+
+def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Architecture, tuple[int, ...], dict]:
+    """Architecture, working size [px] and the training settings."""
     try:
         architecture = Architecture.from_json(metadata["architecture"])
         working_size = tuple(int(n) for n in parse_json(metadata["working_size"]))
@@ -97,7 +116,16 @@ def read_weights(path: Path) -> Weights:
             "widths, encoder_convolutions and decoder_convolutions, a working size and the training settings. "
             f"{_REMEDY}"
         ) from error
-    make_network = _NETWORKS[metadata["format"]]
+    return architecture, working_size, training
+
+
+def _filled(
+    path: Path,
+    make_network: Callable[[Architecture], UNet],
+    architecture: Architecture,
+    shapes: Mapping[str, tuple[int, ...]],
+) -> UNet:
+    """The network with the tensors of the file."""
     # Without memory for its values: what does not fit the file is never allocated.
     with torch.device("meta"):
         wanted = {name: tuple(value.shape) for name, value in make_network(architecture).state_dict().items()}
@@ -119,12 +147,7 @@ def read_weights(path: Path) -> Weights:
         raise WeightsError(f"weights file {path} holds tensors of an unknown type. {_REMEDY}")
     if not all(bool(value.isfinite().all()) for value in state.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite. {_REMEDY}")
-    if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
-        raise WeightsError(
-            f"weights file {path} gives the working size {working_size}; allowed are two positive multiples of "
-            f"{architecture.stride}. {_REMEDY}"
-        )
-    return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
+    return network
 
 
 def _unreadable(path: Path, error: Exception) -> WeightsError:

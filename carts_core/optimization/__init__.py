@@ -23,9 +23,9 @@ from .predictor import ImagePredictor as ImagePredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
 from .resumable import sequence_checkpoint as sequence_checkpoint
-from .sequence import FrameEstimate as FrameEstimate
-from .sequence import Origin as Origin
 from .sequence import SequenceOptimizer as SequenceOptimizer
+from .sequence_estimate import FrameEstimate as FrameEstimate
+from .sequence_estimate import Origin as Origin
 from .verdict import Assessment as Assessment
 from .verdict import Evidence as Evidence
 from .verdict import Verdict as Verdict

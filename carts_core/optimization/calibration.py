@@ -13,13 +13,12 @@ from ..errors import SettingsError
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
-from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver
+from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver, surface_solver
 from ..settings.stages import Descend
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
 from .fit import Fit, Point, StopReason
 from .frame import Progress
 from .predictor import SurfacePredictor, predictor_of
-from .sequence import surface_solver
 from .stages import run_stages
 from .variables import Variables
 

@@ -1,5 +1,6 @@
 """The annotation project: one SQLite file that keeps every correction, with undo and redo across restarts."""
 
+from .changes import Change as Change
 from .database import DamagedProject as DamagedProject
 from .identity import SequenceIdentity as SequenceIdentity
 from .keys import Edits as Edits
@@ -8,7 +9,6 @@ from .keys import Kind as Kind
 from .layers import IgnoreRegion as IgnoreRegion
 from .layers import MaskCorrection as MaskCorrection
 from .place import default_path as default_path
-from .project import Change as Change
 from .project import Project as Project
 from .queries import between_kept as between_kept
 from .queries import frames_in as frames_in

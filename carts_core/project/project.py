@@ -1,18 +1,17 @@
 """An open project: edits that are on disk before the call returns, undo and redo, one writer at a time."""
 
 import json
-import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from ..errors import ProjectError
 from ..wording import counted
 from . import database, journal, opening
+from .changes import Action, Change, Listener, Listeners
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
 from .place import default_path
@@ -25,22 +24,6 @@ if TYPE_CHECKING:
 
 LONGEST_NAME = 200
 """Characters of a step's name."""
-
-
-Action = Literal["apply", "undo", "redo", "figures", "export"]
-
-
-@dataclass(frozen=True)
-class Change:
-    """What has just been saved. The new state is that of the project."""
-
-    action: Action
-    step: Step | None
-    """The step that was done or, for "undo", taken back; the furthest one when several were passed."""
-    keys: frozenset[Key[Any]]
-    """What may have another value now."""
-    frames: tuple[int, ...]
-    """Indices of the frames that it is about, in order; values of the whole project aside."""
 
 
 class Project:
@@ -65,7 +48,7 @@ class Project:
         self._path = path.parent.resolve() / path.name
         self.read_only_reason = "It was opened read-only." if read_only else None
         self._edit = threading.RLock()
-        self._listeners: list[Callable[[Change], None]] = []
+        self._listeners = Listeners()
         self._store: Store | None = None
         self._incident: str | None = None
         """Of a store that was closed."""
@@ -229,19 +212,13 @@ class Project:
             self._writer().commit(journal.add_export(record))
             self._saved(replace(self.state, exports=(*self.state.exports, record)), "export")
 
-    def listen(self, listener: Callable[[Change], None]) -> Callable[[], None]:
+    def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener` after each save, in order, on the thread that saves; it should hand on and return.
 
         Returns:
             A function that ends this.
         """
-        self._listeners.append(listener)
-
-        def forget() -> None:
-            with suppress(ValueError):
-                self._listeners.remove(listener)
-
-        return forget
+        return self._listeners.add(listener)
 
     def close(self) -> None:
         """Let others write. The state can still be read.
@@ -291,12 +268,7 @@ class Project:
         self.state = state
         touched = {*frames, *(key.frame for key in keys if key.frame != WHOLE_PROJECT)}
         change = Change(action, step, frozenset(keys), tuple(sorted(touched)))
-        for listener in tuple(self._listeners):
-            try:
-                listener(change)
-            except Exception:
-                # The edit is saved, so it must not look as if it were not.
-                logging.getLogger(__name__).exception("a listener of project %s failed", self.path)
+        self._listeners.notify(change, self.path)
         return change
 
 

@@ -19,6 +19,7 @@ from .optimization import SolverName as SolverName
 from .optimization import SolverSettings as SolverSettings
 from .optimization import SurfaceSolver as SurfaceSolver
 from .optimization import solver as solver
+from .optimization import surface_solver as surface_solver
 from .sequence import Direction as Direction
 from .sequence import SequenceSettings as SequenceSettings
 from .stages import AlignEdges as AlignEdges

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from ..errors import SettingsError
 from . import presets
 from .checks import require
 from .stages import FirstOrder, Stage
@@ -170,6 +171,24 @@ class DescentSolver:
 
 SolverSettings = SurfaceSolver | DescentSolver
 """How one frame is optimized."""
+
+
+def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
+    """The settings, or the default ones.
+
+    Args:
+        settings: of any solver.
+        what: needs the surface solver, as messages name it.
+
+    Raises:
+        SettingsError: they are those of another solver.
+    """
+    if settings is None or isinstance(settings, SurfaceSolver):
+        return settings or SurfaceSolver()
+    raise SettingsError(
+        f"{what} was given a solver for the loss {settings.loss.value!r}; it needs the solver `surface`. "
+        "Leave it at its default, or optimize each frame alone."
+    )
 
 
 class SolverName(StrEnum):

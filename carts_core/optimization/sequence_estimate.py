@@ -1,0 +1,89 @@
+"""What sequence mode says of a frame, and what it keeps of one that was visited."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..model.scene import Scene, SceneState
+from .error_model import Gaussian
+from .measurement import Measurement
+from .observability import Uncertainty
+from .variables import Variables
+
+
+class Origin(StrEnum):
+    """Where a frame's values come from."""
+
+    WARM = "warm"
+    """An optimization from the neighbour's correction."""
+    COLD = "cold"
+    """An optimization from the measured values."""
+    KEYFRAME = "keyframe"
+    """A person."""
+    CARRIED = "carried"
+    """The other frames alone: the image contradicts them and is left out."""
+
+
+@dataclass(frozen=True)
+class FrameEstimate:
+    """One frame of a sequence, in the light of the others that were seen."""
+
+    index: int
+    frame_id: str
+    state: SceneState
+    joint_positions: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> [rad, m]."""
+    joint_std: dict[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> standard deviation [rad, m]; 0 at a keyframe, NaN where a joint is not free."""
+    uncertainty: Uncertainty
+    """Of every unknown, with what was expected of it before any image."""
+    loss: float
+    """Of the surface factor, when the frame was last solved; high where the image does not fit."""
+    start: Origin
+    iterations: int
+    """Steps of the optimization, over all visits."""
+    seconds: float
+    """Time spent on the frame, reading included, over all visits [s]."""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What is kept of a frame that was solved."""
+
+    frame_id: str
+    variables: Variables
+    measurement: Measurement
+    start: Origin
+    seconds: float
+
+    def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
+        """The frame with a correction.
+
+        Args:
+            scene: of the sequence.
+            index: of the frame in its sequence.
+            correction: of the measured values, with its covariance [rad].
+            prior: what was expected of it before any image [rad].
+        """
+        variables = self.variables
+        offsets = torch.from_numpy(correction.mean).to(variables.lower)
+        state = variables.state(variables.clamp(offsets)).detached()
+        scales = variables.scales.cpu().double().numpy()
+        std, expected = (np.sqrt(known.covariance.diagonal().clip(min=0.0)) * scales for known in (correction, prior))
+        uncertainty = Uncertainty(tuple(variables.names), tuple(std.tolist()), tuple(expected.tolist()))
+        joints = [values.cpu().double().numpy().copy() for values in state.joint_positions]
+        return FrameEstimate(
+            index=index,
+            frame_id=self.frame_id,
+            state=state,
+            joint_positions={arm.name: values for arm, values in zip(scene.arms, joints, strict=True)},
+            joint_std={arm.name: uncertainty.joint_std(arm.name, arm.robot.joint_names) for arm in scene.arms},
+            uncertainty=uncertainty,
+            loss=self.measurement.loss,
+            start=self.start,
+            iterations=self.measurement.iterations,
+            seconds=self.seconds,
+        )
