@@ -139,7 +139,7 @@ def run_one(job: Job, variant: Variant, shared: Shared, sequence: Sequence, extr
     with ExitStack() as stack:
         stack.enter_context(patch("carts_core.optimization.frame.FrameProblem", shared_problem(shared, variant)))
         for name, value in variant.constants.items():
-            stack.enter_context(patch(f"carts_core.optimization.{name}", value))
+            stack.enter_context(patch(f"carts_core.{name}", value))
         began = shared.clock()
         optimizer = FrameOptimizer(
             scene, frame, backgrounds, extractor, start=start, settings=variant.change(AS_IS), live=False

@@ -23,9 +23,9 @@ AS_IS = SurfaceSolver()
 """What variants are compared with."""
 
 _PARTS = {
-    "images": ("haze.", "frame_images.", "counterfactual."),
-    "surface": ("factors.surface.",),
-    "edges": ("haze.", "factors.edges.", "edge_alignment."),
+    "images": ("imaging.haze.", "optimization.frame_images.", "optimization.counterfactual."),
+    "surface": ("optimization.factors.surface.",),
+    "edges": ("imaging.haze.", "optimization.factors.edges.", "optimization.edge_alignment."),
 }
 """Which modules' constants what is shared depends on."""
 
@@ -38,7 +38,7 @@ class Variant:
     change: Callable[[SurfaceSolver], SurfaceSolver] = lambda solver: solver
     """Of the settings."""
     constants: Mapping[str, Any] = field(default_factory=dict)
-    """Names below `carts_core.optimization` -> values."""
+    """Names below `carts_core` -> values."""
 
     def constants_of(self, part: str) -> str:
         """Those that a part of the computation depends on, as a key."""
@@ -105,9 +105,9 @@ VARIANTS = (
     Variant("RandomRestart.candidates 32", _at(_RESTART, candidates=32)),
     Variant("RandomRestart.spread 1", _at(_RESTART, spread=1.0)),
     Variant("RandomRestart.if_loss 0.03", _at(_RESTART, if_loss=0.03)),
-    Variant("arms are never lost", constants={"stages.arm_is_lost": lambda *_: False}),
-    Variant("_SUPPORT 0", constants={"search._SUPPORT": 0.0}),
-    Variant("_LEFT 0", constants={"search._LEFT": 0.0}),
+    Variant("arms are never lost", constants={"optimization.stages.arm_is_lost": lambda *_: False}),
+    Variant("_SUPPORT 0", constants={"optimization.search._SUPPORT": 0.0}),
+    Variant("_LEFT 0", constants={"optimization.search._LEFT": 0.0}),
     Variant("no ShaftSearch", _without(_SHAFTS)),
     Variant("no AlignEdges between", _without(_EDGES[0])),
     Variant("no AlignEdges at the end", _without(_EDGES[1])),
@@ -119,8 +119,8 @@ VARIANTS = (
     Variant("no weight for haze", _every(Observe, haze=False)),
     Variant("no weight for haze but at the end", _at(_OBSERVE[2], haze=False)),
     Variant("weight for haze at first, too", _every(Observe, haze=True)),
-    Variant("transmission squared", constants={"frame_images.certainty": lambda through: through}),
-    Variant("no weight for haze at edges", constants={"factors.edges.certainty": _clear}),
+    Variant("transmission squared", constants={"optimization.frame_images.certainty": lambda through: through}),
+    Variant("no weight for haze at edges", constants={"optimization.factors.edges.certainty": _clear}),
     Variant("dehaze 0", _settings(dehaze=0.0)),
     Variant("dehaze 1", _settings(dehaze=1.0)),
     Variant("parts_weight 0", _settings(parts_weight=0.0)),
@@ -130,17 +130,17 @@ VARIANTS = (
     Variant("noise 2.66", _settings(noise=2.66)),
     Variant("noise 1", _settings(noise=1.0)),
     Variant("prior_deg 3.75", _settings(prior_deg=3.75)),
-    Variant("_SHARE 1", constants={"factors.edges._SHARE": (1.0, 1.0, 1.0)}),
-    Variant("_LIKELY off", constants={"factors.edges._LIKELY": math.inf}),
-    Variant("_BLUR 0", constants={"factors.edges._BLUR": 0.0}),
-    Variant("_NEAR off", constants={"factors.edges._NEAR": 500}),
-    Variant("_RENDERED_ANEW off", constants={"factors.edges._RENDERED_ANEW": math.inf}),
-    Variant("_ROBUST of edges off", constants={"factors.edges._ROBUST": math.inf}),
-    Variant("longest step of edges off", constants={"edge_alignment._LONGEST_STEP": math.inf}),
-    Variant("_STILL 0", constants={"edge_alignment._STILL": 0.0}),
-    Variant("longest step of descents off", constants={"solvers.levenberg_marquardt._LONGEST_STEP": math.inf}),
-    Variant("damping off", constants={"solvers.levenberg_marquardt._FIRST_DAMPING": 1e-4}),
-    Variant("_LEAST transmission 0.1", constants={"haze._LEAST": 0.1}),
-    Variant("haze at full size", constants={"haze._COARSER": 1}),
-    Variant("coarsest comparison 4", constants={"factors.surface._REDUCTIONS": (1, 2, 4)}),
+    Variant("_SHARE 1", constants={"optimization.factors.edges._SHARE": (1.0, 1.0, 1.0)}),
+    Variant("_LIKELY off", constants={"optimization.factors.edges._LIKELY": math.inf}),
+    Variant("_BLUR 0", constants={"optimization.factors.edges._BLUR": 0.0}),
+    Variant("_NEAR off", constants={"optimization.factors.edges._NEAR": 500}),
+    Variant("_RENDERED_ANEW off", constants={"optimization.factors.edges._RENDERED_ANEW": math.inf}),
+    Variant("_ROBUST of edges off", constants={"optimization.factors.edges._ROBUST": math.inf}),
+    Variant("longest step of edges off", constants={"optimization.edge_alignment._LONGEST_STEP": math.inf}),
+    Variant("_STILL 0", constants={"optimization.edge_alignment._STILL": 0.0}),
+    Variant("longest step of descents off", constants={"optimization.solvers.levenberg_marquardt._LONGEST_STEP": math.inf}),
+    Variant("damping off", constants={"optimization.solvers.levenberg_marquardt._FIRST_DAMPING": 1e-4}),
+    Variant("_LEAST transmission 0.1", constants={"imaging.haze._LEAST": 0.1}),
+    Variant("haze at full size", constants={"imaging.haze._COARSER": 1}),
+    Variant("coarsest comparison 4", constants={"optimization.factors.surface._REDUCTIONS": (1, 2, 4)}),
 )
