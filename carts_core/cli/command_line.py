@@ -16,6 +16,7 @@ from .bench import Bench
 from .calibrate import Calibrate
 from .evaluate import Evaluate
 from .export import Export
+from .hand_eye import HandEye
 from .import_ import Import
 from .optimize import Optimize
 from .render import Render
@@ -36,6 +37,7 @@ BAD_INPUT = 2
 Command = (
     Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[HandEye, tyro.conf.subcommand("hand-eye")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]

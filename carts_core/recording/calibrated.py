@@ -14,7 +14,7 @@ from ..model.scene import Scene
 _BUILTIN = "builtin:"
 
 
-def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Scene) -> str:
+def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate") -> str:
     """The text of a sequence file like the one at `path`, for another folder and with another calibration.
 
     What differs between the scenes is written as numbers; everything else, comments included, stays. Paths, which are
@@ -25,6 +25,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         folder: where the new one will lie.
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
+        command: the `carts` command that found them, for the heading.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
@@ -57,7 +58,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         if old.intrinsics != new.intrinsics:
             table["K"] = dict(zip(("fx", "fy", "cx", "cy"), new.intrinsics, strict=True))
             table["pixel_center"] = HALF_PIXEL
-    heading = "# A calibration that carts calibrate found is filled in. Other comments are those of the original file."
+    heading = f"# A calibration that carts {command} found is filled in. Other comments are those of the original file."
     return f"{heading}\n{tomlkit.dumps(document)}"
 
 

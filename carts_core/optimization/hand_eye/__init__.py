@@ -1,0 +1,9 @@
+"""Hand-eye calibration from points that a person has found in a few images, without any initial pose."""
+
+from .files import read_points as read_points
+from .files import result_json as result_json
+from .points import ImagePoint as ImagePoint
+from .result import HandEyeResult as HandEyeResult
+from .result import PoseDeviation as PoseDeviation
+from .settings import HandEyeSettings as HandEyeSettings
+from .solve import solve_hand_eye as solve_hand_eye

@@ -1,0 +1,208 @@
+"""Base frames from clicked points: found from nothing, with an uncertainty that is true."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clicked_points import clicked
+from scipy.spatial.transform import Rotation
+
+from carts_core.cli import main
+from carts_core.errors import RobotError, SettingsError
+from carts_core.model.camera import Camera
+from carts_core.model.landmarks import link_transforms
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Arm, Scene
+from carts_core.optimization.hand_eye import HandEyeSettings, ImagePoint, solve_hand_eye
+from carts_core.recording import Sequence
+
+FRAMES = 6
+FOCAL = 700.0
+
+
+def joints(seed: int = 3) -> np.ndarray:
+    """A working instrument: the arm sweeps some 30 degrees and some 6 cm in depth [frames, dofs]."""
+    random = np.random.default_rng(seed)
+    low = np.array([-0.25, -0.25, 0.13, -1.5, -0.6, -0.6, 0.0])
+    high = np.array([0.25, 0.25, 0.19, 1.5, 0.6, 0.6, 0.3])
+    return random.uniform(low, high, (FRAMES, 7))
+
+
+@pytest.fixture
+def scene(shipped_psm: Robot) -> Scene:
+    """Two arms before a stereo endoscope."""
+    bases = []
+    for side in (-1.0, 1.0):
+        towards = np.array([0.6 * side, 0.25, 0.76])
+        turn = Rotation.align_vectors([towards / np.linalg.norm(towards)], [[0.0, 0.0, -1.0]])[0]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = turn.as_matrix(), [-0.08 * side, -0.03, 0.0]
+        bases.append(T)
+    arms = tuple(Arm(f"PSM{number}", shipped_psm, T) for number, T in enumerate(bases, start=1))
+    right = np.eye(4)
+    right[:3, :3], right[0, 3] = Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix(), -0.005
+    views = (("left", np.eye(4)), ("right", right))
+    return Scene(arms, tuple(Camera(name, 640, 480, (FOCAL, FOCAL, 325.0, 236.0), T) for name, T in views))
+
+
+def unknown(scene: Scene, *, cameras: bool = False) -> Scene:
+    """The scene with base frames, and on request camera poses, that mean nothing."""
+    views = tuple(replace(camera, T_camera_world=np.eye(4)) for camera in scene.cameras)
+    arms = tuple(replace(arm, T_world_base=np.eye(4)) for arm in scene.arms)
+    return replace(scene, arms=arms, cameras=views if cameras else scene.cameras)
+
+
+def offset(found: Scene, truth: Scene, arm: str, camera: str, points: np.ndarray) -> tuple[float, float, float]:
+    """Turn [deg], sideways and depth [mm] between two calibrations, at points of the arm's base frame."""
+    Ts = [scene.camera(camera).T_camera_world @ scene.arm(arm).T_world_base for scene in (found, truth)]
+    turn = Rotation.from_matrix(Ts[0][:3, :3] @ Ts[1][:3, :3].T).magnitude()
+    places = [T[:3, :3] @ points.mean(0) + T[:3, 3] for T in Ts]
+    shift = 1e3 * (places[0] - places[1])
+    return float(np.degrees(turn)), float(np.linalg.norm(shift[:2])), float(abs(shift[2]))
+
+
+def tips(scene: Scene, measured: dict[str, np.ndarray], arm: str) -> np.ndarray:
+    return link_transforms(scene.arm(arm), measured[arm])[:, 2, :3, 3]
+
+
+@pytest.fixture
+def measured(scene: Scene) -> dict[str, np.ndarray]:
+    return {arm.name: joints(3 + number) for number, arm in enumerate(scene.arms)}
+
+
+def test_exact_points_give_the_exact_base_frames_from_nothing(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    points = clicked(scene, measured, range(3), ["left"], noise=0.0)
+    result = solve_hand_eye(unknown(scene), measured, points)
+    for arm in scene.arms:
+        assert np.abs(result.scene.arm(arm.name).T_world_base - arm.T_world_base).max() < 1e-6
+    assert result.error < 1e-3 and not result.contradicting and not result.missing
+
+
+def test_the_deviations_are_those_that_noise_causes(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    one, scores = scene.with_arms(["PSM1"]), []
+    for seed in range(12):
+        points = clicked(one, measured, range(4), ["left"], noise=2.0, seed=seed)
+        result = solve_hand_eye(unknown(one), measured, points)
+        said = result.deviations["PSM1", "left"]
+        turn, sideways, depth = offset(result.scene, one, "PSM1", "left", tips(one, measured, "PSM1")[:4])
+        assert turn < 4.0 * said.rotation_deg and sideways < 4.0 * said.sideways_mm and depth < 4.0 * said.depth_mm
+        scores.append([turn / said.rotation_deg, sideways / said.sideways_mm, depth / said.depth_mm])
+    # Neither boastful nor useless: errors have the size that is said of them.
+    size = np.sqrt((np.array(scores) ** 2).mean(0))
+    assert (size > 0.4).all() and (size < 2.0).all(), size
+
+
+@pytest.mark.parametrize("wrong", [(0, (60.0, -40.0)), (5, (0.0, 90.0))])
+def test_a_wrong_point_hardly_counts_and_is_named(
+    scene: Scene, measured: dict[str, np.ndarray], wrong: tuple[int, tuple[float, float]]
+) -> None:
+    one, (row, by) = scene.with_arms(["PSM1"]), wrong
+    points = clicked(one, measured, range(4), ["left"], noise=1.0)
+    moved = (points[row].pixel[0] + by[0], points[row].pixel[1] + by[1])
+    spoilt = [*points[:row], replace(points[row], pixel=moved), *points[row + 1 :]]
+    result = solve_hand_eye(unknown(one), measured, spoilt)
+    assert result.contradicting == (row,)
+    assert offset(result.scene, one, "PSM1", "left", tips(one, measured, "PSM1"))[1] < 1.5
+    assert result.error < 4.0
+
+
+def test_a_camera_whose_pose_is_not_known_is_found_too(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    points = clicked(scene, measured, range(3), ["left", "right"], noise=0.0)
+    result = solve_hand_eye(
+        unknown(scene, cameras=True), measured, points, HandEyeSettings(free_cameras=("left", "right"))
+    )
+    T_right_left = scene.cameras[1].T_camera_world
+    assert np.abs(result.scene.cameras[1].T_camera_world - T_right_left).max() < 1e-6
+    # The first camera is what the others are measured against.
+    assert np.array_equal(result.scene.cameras[0].T_camera_world, np.eye(4))
+
+
+def test_points_of_both_cameras_of_a_known_pair_count_together(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    alone = solve_hand_eye(unknown(scene), measured, clicked(scene, measured, range(3), ["left"]))
+    both = solve_hand_eye(unknown(scene), measured, clicked(scene, measured, range(3), ["left", "right"]))
+    for arm in scene.arms:
+        assert both.deviations[arm.name, "left"].depth_mm < alone.deviations[arm.name, "left"].depth_mm
+
+
+def test_the_focal_length_is_found_on_request_with_a_deviation_that_is_true(
+    scene: Scene, measured: dict[str, np.ndarray]
+) -> None:
+    one = scene.with_arms(["PSM1"])
+    views = tuple(replace(view, intrinsics=(1.4 * FOCAL, 1.4 * FOCAL, 325.0, 236.0)) for view in one.cameras)
+    start = replace(unknown(one), cameras=views)
+    points = clicked(one, measured, range(FRAMES), ["left"], noise=0.3)
+    settings = HandEyeSettings(pixel_error=0.5, focal_length=True)
+    result = solve_hand_eye(start, measured, points, settings)
+    share = result.scene.camera("left").intrinsics[0] / FOCAL - 1.0
+    assert abs(share) < 3.0 * result.focal_deviation["left"] < 0.4
+    assert result.scene.camera("right").intrinsics == views[1].intrinsics
+
+
+def test_what_is_missing_is_counted(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    points = clicked(scene, measured, range(2), ["left"], noise=0.0)
+    first = [point for point in points if point.arm == "PSM1"]
+    with pytest.raises(SettingsError, match=r"PSM1 needs 1 more point in left.*Edges of the shaft do not count"):
+        solve_hand_eye(unknown(scene), measured, [point for point in first if point.landmark != "shaft edge"][:3])
+    with pytest.raises(SettingsError, match=r"there is no point. Click tip"):
+        solve_hand_eye(unknown(scene), measured, [])
+    some = solve_hand_eye(unknown(scene), measured, [*first, *[point for point in points if point.arm == "PSM2"][:2]])
+    assert some.missing == {("PSM2", "left"): 2}
+    assert np.array_equal(some.scene.arm("PSM2").T_world_base, np.eye(4))
+
+
+def test_points_that_cannot_be_used_are_refused_in_words(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    good = clicked(scene, measured, range(2), ["left"], noise=0.0)
+    with pytest.raises(SettingsError, match="no frame 99; frames are 0 to 5"):
+        solve_hand_eye(scene, measured, [replace(good[0], frame=99)])
+    with pytest.raises(SettingsError, match=r"has no 'elbow'. Its landmarks are: tip, wrist yaw joint"):
+        solve_hand_eye(scene, measured, [replace(good[0], landmark="elbow")])
+    with pytest.raises(RobotError, match="no camera is called 'top'"):
+        solve_hand_eye(scene, measured, [replace(good[0], camera="top")])
+    with pytest.raises(SettingsError, match="Give two numbers"):
+        solve_hand_eye(scene, measured, [replace(good[0], pixel=(float("nan"), 1.0))])
+    same = [ImagePoint(0, "left", "PSM1", "tip", (300.0, 200.0))] * 6
+    with pytest.raises(SettingsError, match=r"Click others|click others"):
+        solve_hand_eye(scene, measured, same)
+
+
+def test_the_real_stereo_frames_are_calibrated_from_points_alone(shared_dir: Path) -> None:
+    sequence = Sequence.open(Path(__file__).parent.parent / "sequences/dvrk_stereo.toml")
+    points = clicked(sequence.scene, sequence.measured, (3, 9, 16, 22), ["left", "right"], noise=2.0)
+    start = unknown(sequence.scene, cameras=True)
+    result = solve_hand_eye(start, sequence.measured, points, HandEyeSettings(free_cameras=("right",)))
+    places = tips(sequence.scene, dict(sequence.measured), "PSM1")
+    for camera in ("left", "right"):
+        turn, sideways, depth = offset(result.scene, sequence.scene, "PSM1", camera, places)
+        said = result.deviations["PSM1", camera]
+        assert turn < 3.0 * said.rotation_deg < 6.0
+        assert sideways < 3.0 * said.sideways_mm < 2.0 and depth < 3.0 * said.depth_mm < 9.0
+    assert result.error < 4.0
+
+
+def test_the_command_reads_a_table_and_writes_a_sequence_file(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_sequence(frames=5, cameras=("left", "right"), width=640, height=480)
+    sequence = Sequence.open(path)
+    points = clicked(sequence.scene, sequence.measured, range(5), ["left"], noise=0.0)
+    rows = [
+        f"{sequence.frame_ids[point.frame]},left,PSM1,{point.landmark},{point.pixel[0]},{point.pixel[1]}"
+        for point in points
+    ]
+    table = tmp_path / "points.csv"
+    table.write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
+    main(["hand-eye", str(path), "--points", str(table), "--output", str(tmp_path / "out")])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "20 points agree to 0.0 px" in said and "PSM1 before left: known to" in said
+    after = Sequence.open(tmp_path / "out/sequence.toml")
+    assert np.abs(after.scene.arms[0].T_world_base - sequence.scene.arms[0].T_world_base).max() < 1e-5
+    written = json.loads((tmp_path / "out/hand_eye.json").read_text())
+    assert len(written["points"]) == 20 and written["poses"][0]["deviation"]["depth_mm"] > 0
+    table.write_text("frame,camera\n001,left\n")
+    with pytest.raises(SystemExit):
+        main(["hand-eye", str(path), "--points", str(table), "--output", str(tmp_path / "other")])
+    assert "has no column 'arm'" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "other").exists()
