@@ -138,7 +138,9 @@ VARIANTS = (
     Variant("_ROBUST of edges off", constants={"optimization.factors.edges._ROBUST": math.inf}),
     Variant("longest step of edges off", constants={"optimization.edge_alignment._LONGEST_STEP": math.inf}),
     Variant("_STILL 0", constants={"optimization.edge_alignment._STILL": 0.0}),
-    Variant("longest step of descents off", constants={"optimization.solvers.levenberg_marquardt._LONGEST_STEP": math.inf}),
+    Variant(
+        "longest step of descents off", constants={"optimization.solvers.levenberg_marquardt._LONGEST_STEP": math.inf}
+    ),
     Variant("damping off", constants={"optimization.solvers.levenberg_marquardt._FIRST_DAMPING": 1e-4}),
     Variant("_LEAST transmission 0.1", constants={"imaging.haze._LEAST": 0.1}),
     Variant("haze at full size", constants={"imaging.haze._COARSER": 1}),

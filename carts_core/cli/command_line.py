@@ -12,6 +12,7 @@ import tyro
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..stopping import exit_status, message, stopped_by_signals
+from .batch import Batch
 from .bench import Bench
 from .calibrate import Calibrate
 from .evaluate import Evaluate
@@ -43,6 +44,7 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]

@@ -16,11 +16,12 @@ from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_cs
 from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
 from ..fingerprints import fingerprint
 from ..model.scene import SceneState
+from ..optimization import Assessment
 from ..recording import Sequence
 from ..rendering import Renderer
 from ..stopping import finished_first
 from .origins import Origin, changes
-from .result_records import Record, read_records, records_text, row_fingerprint
+from .result_records import Record, judged, read_records, records_text, row_fingerprint
 from .selection import check_writable
 
 
@@ -32,6 +33,8 @@ class FrameResult:
     state: SceneState
     origin: Origin
     """What it was made from."""
+    assessment: Assessment | None = None
+    """How far it can be relied on, where that is known."""
 
 
 class FrameFolder:
@@ -136,7 +139,9 @@ class FrameFolder:
                     write_bytes(self._masks[camera] / f"{frame_id}.png", png)
                     fingerprints[camera] = fingerprint(png)
                 row = row_fingerprint(self._scene, result.row)
-                self._records[frame_id] = Record(result.origin, fingerprints, row, torch.get_num_threads())
+                self._records[frame_id] = Record(
+                    result.origin, fingerprints, row, torch.get_num_threads(), **judged(result.assessment)
+                )
             new = {result.row.frame_id: result.row for result in found}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])

@@ -15,9 +15,19 @@ from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import remove_file
 from ..fingerprints import fingerprint
-from ..optimization import Backgrounds, FrameOptimizer, SequenceOptimizer, StopReason, sequence_checkpoint
+from ..optimization import (
+    Assessment,
+    Backgrounds,
+    FrameEstimate,
+    FrameOptimizer,
+    SequenceOptimizer,
+    StopReason,
+    assess_estimate,
+    sequence_checkpoint,
+)
 from ..optimization.variables import Variables
 from ..recording import Frame, Sequence
+from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
@@ -182,7 +192,7 @@ class Optimizing:
             assessed[frame.frame_id] = optimizer.assessment
             source = "measured" if optimizer.stop_reason is StopReason.FAILED else "optimized"
             row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std())
-            part.output.write([FrameResult(row, best.state, origins[index])])
+            part.output.write([FrameResult(row, best.state, origins[index], optimizer.assessment)])
             stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
         print_hints(
@@ -222,13 +232,28 @@ class Optimizing:
         for index, estimate in optimizer.estimates.items():
             source = "edited" if estimate.start == "keyframe" else "optimized"
             row = KinematicsRow(estimate.frame_id, source, estimate.joint_positions, estimate.joint_std)
-            found.append(FrameResult(row, estimate.state, origins[index]))
+            judged = self._judged(part, estimate, backgrounds) if asked.verdicts else None
+            found.append(FrameResult(row, estimate.state, origins[index], judged))
         part.output.write(found)
         checkpoint.remove()
         if checkpoint.recalled:
             self._console.print("went on from where an earlier run was stopped")
         else:
             self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
+        print_hints(self._console, *verdict_hints(part.name, {one.row.frame_id: one.assessment for one in found}))
+
+    def _judged(self, part: _Part, estimate: FrameEstimate, backgrounds: Backgrounds) -> Assessment:
+        """The verdict on a frame of a sequence."""
+        assert isinstance(self._solver, SurfaceSolver)
+        return assess_estimate(
+            self._sequence.scene.with_cameras(part.cameras),
+            self._sequence.frame(estimate.index, part.domain, part.cameras),
+            estimate.state,
+            self._observer.predictor,
+            estimate.loss,
+            settings=self._solver,
+            backgrounds=backgrounds,
+        )
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
         """Position -> joint positions of the chosen frames that a person set."""

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ..export.kinematics import position_values, std_values
 from ..files import OutputPath, holds_file
 from ..fingerprints import fingerprint
 from ..model.scene import Scene
+from ..optimization import Assessment
 
 _FORMAT = "carts-results/1"
 
@@ -28,6 +30,19 @@ class Record:
     """Fingerprint of the row in the table."""
     threads: int
     """How many threads torch had; results do not depend on it."""
+    verdict: str = ""
+    """`good`, `doubtful` or `failed`; empty where it was not asked for."""
+    reason: str = ""
+    """For the verdict, one sentence."""
+    probability: float | None = None
+    """That the mask is wrong [1]."""
+
+
+def judged(found: Assessment | None) -> dict[str, Any]:
+    """The fields of a record that tell of a verdict."""
+    if found is None:
+        return {}
+    return {"verdict": found.verdict.value, "reason": found.reason, "probability": round(found.probability, 6)}
 
 
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:

@@ -88,7 +88,10 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
     for old, new in zip(before.cameras, after.cameras, strict=True):
         pairs.append((old, old.T_camera_world, new.T_camera_world))
     return [
-        (("T_world_base of " if isinstance(thing, Arm) else "T_camera_world of ") + thing.name, *_distance(old, new))
+        (
+            ("T_world_base of " if isinstance(thing, Arm) else "T_camera_world of ") + thing.name,
+            *pose_distance(old, new),
+        )
         for thing, old, new in pairs
         if not np.array_equal(old, new)
     ]
@@ -110,7 +113,7 @@ def remark(before: Scene, result: CalibrationResult) -> str | None:
 
 
 def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    angle, distance = _distance(before, after)
+    angle, distance = pose_distance(before, after)
     return {
         "before": before.tolist(),
         "after": after.tolist(),
@@ -119,7 +122,7 @@ def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"
     }
 
 
-def _distance(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+def pose_distance(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
     """Angle [deg] between two poses, and distance of their translations [mm]."""
     turned = after[:3, :3] @ before[:3, :3].T
     # The chord is exact for small angles, where the arc cosine of the trace is not.

@@ -7,6 +7,7 @@ from ..settings import FreeParameters as FreeParameters
 from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
+from .assessing import assess_estimate as assess_estimate
 from .base_frame_gain import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
@@ -58,5 +59,6 @@ __all__ = [
     "SurfaceSolver",
     "UnknownChange",
     "Verdict",
+    "assess_estimate",
     "propose_ignore",
 ]

@@ -10,7 +10,10 @@ import pytest
 from carts_core.cli.command_line import BAD_INPUT
 
 HEAVY = {"torch", "numba", "cv2", "kornia", "scipy", "trimesh", "matplotlib", "viser", "mitsuba"}
-COMMANDS = ("view", "optimize", "evaluate", "calibrate", "hand-eye", "render", "export", "synthesize", "train", "bench")
+COMMANDS = (
+    *("view", "optimize", "evaluate", "calibrate", "hand-eye", "render", "export", "synthesize", "train", "bench"),
+    "batch",
+)
 
 
 def _answer(*arguments: str) -> tuple[int, str, set[str]]:

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 
+from ...html import Cell, Table
 from . import paper
 from .frame import TOLERANCE
 from .measurement import Score
 from .scope import SYNTHETIC
 from .statistics import Measurements, Spread, scores
-from .tables import DOMAIN_LABELS, NOTHING, SHORT_LABELS, Cell, Table, paper_note, spread_text
+from .tables import DOMAIN_LABELS, NOTHING, SHORT_LABELS, paper_note, spread_text
 
 ROWS = (
     ("U-Net alone", "unet", None),

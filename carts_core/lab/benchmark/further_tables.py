@@ -6,13 +6,14 @@ from itertools import product
 from statistics import median
 from typing import get_args
 
+from ...html import Cell, Table
 from ...wording import counted
 from .measurement import Measurement, Score
 from .methods import METHODS
 from .occlusion import OCCLUSION, SHARE
 from .rooms import Half
 from .statistics import Measurements, Spread
-from .tables import DOMAIN_LABELS, NOTHING, Cell, Table, begun, spread_text
+from .tables import DOMAIN_LABELS, NOTHING, begun, spread_text
 
 
 @dataclass(frozen=True)

@@ -6,30 +6,7 @@ PAGE = """<!doctype html>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>CaRTS benchmark</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1f23; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.7rem; margin-bottom: .3rem; }
-h2 { margin-top: 2.6rem; border-bottom: 1px solid #d8dce0; padding-bottom: .2rem; }
-h3 { margin: 1.6rem 0 .2rem; }
-p { max-width: 62rem; margin: .3rem 0 .7rem; color: #4a5058; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .6rem; border-bottom: 1px solid #e4e7ea; text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid #aab2ba; font-weight: 600; }
-td { white-space: nowrap; }
-.targets td, .facts td { white-space: normal; }
-.targets td:nth-child(n+2):nth-child(-n+4) { white-space: nowrap; }
-.targets td:nth-child(5) { max-width: 15rem; }
-small { display: block; color: #737b84; font-size: .8em; }
-.met { color: #17713a; font-weight: 600; }
-.missed { color: #b02a1c; font-weight: 600; }
-.open { color: #737b84; }
-.warning { border-left: 4px solid #d9a300; background: #fff8e0; padding: .4rem .8rem; color: #5a4500; }
-nav a { margin-right: .8rem; }
-figure { margin: 1.4rem 0 2rem; }
-figure img { max-width: 100%; }
-figcaption { color: #4a5058; max-width: 62rem; }
-</style>
+<style>$style</style>
 </head>
 <body>
 <h1>CaRTS benchmark</h1>

@@ -9,6 +9,7 @@ from pathlib import Path
 from string import Template
 
 from ...files import OutputPath, csv_cell, write_text
+from ...html import STYLE, Table, anchor, figure_html, section_html, table_html
 from . import paper
 from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
@@ -18,7 +19,6 @@ from .measurement import Measurement
 from .page import PAGE
 from .speed_tables import pair_table, speed_table, stage_table, worse_table
 from .statistics import Measurements
-from .tables import Cell, Table
 from .target import Target
 from .targets import targets
 
@@ -83,11 +83,12 @@ def write_report(folder: OutputPath, measurements: list[Measurement], facts: Fac
     write_text(folder / "results.json", json.dumps(document, indent=1))
     write_text(folder / "results.csv", _csv(rows))
     page = Template(PAGE).substitute(
+        style=STYLE,
         facts=_facts(facts, measurements),
         targets=_targets(verdicts),
-        contents="".join(f'<a href="#{_anchor(title)}">{escape(title)}</a> ' for title, _ in sections),
+        contents="".join(f'<a href="#{anchor(title)}">{escape(title)}</a> ' for title, _ in sections),
         sections="".join(_section(title, tables) for title, tables in sections),
-        figures="".join(_figure(caption, path.relative_to(folder.path)) for caption, path in figures.items()),
+        figures="".join(figure_html(caption, path.relative_to(folder.path)) for caption, path in figures.items()),
         tolerance=f"{TOLERANCE:g}",
         source=escape(paper.SOURCE),
     )
@@ -169,30 +170,4 @@ def _targets(verdicts: list[Target]) -> str:
 
 
 def _section(title: str, tables: list[Table]) -> str:
-    body = "".join(map(_table, tables)) or "<p>Not measured.</p>"
-    return f'<section id="{_anchor(title)}"><h2>{escape(title)}</h2>{body}</section>'
-
-
-def _anchor(title: str) -> str:
-    return title.lower().replace(" ", "-")
-
-
-def _table(table: Table) -> str:
-    header = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
-    rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
-    return (
-        f"<h3>{escape(table.title)}</h3><p>{escape(table.caption)}</p>"
-        f'<div class="wide"><table><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table></div>'
-    )
-
-
-def _cell(cell: Cell) -> str:
-    note = f"<small>{escape(cell.note)}</small>" if cell.note else ""
-    return f"<td>{escape(cell.text)}{note}</td>"
-
-
-def _figure(caption: str, path: Path) -> str:
-    return (
-        f'<figure><img src="{path.as_posix()}" alt="{escape(caption)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+    return section_html(title, "".join(map(table_html, tables)) or "<p>Not measured.</p>")

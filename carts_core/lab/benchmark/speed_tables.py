@@ -3,13 +3,14 @@
 from collections.abc import Iterable
 from statistics import median
 
+from ...html import Cell, Table
 from .measurement import Measurement
 from .methods import METHODS
 from .pairing import GAINED, pairs
 from .scope import PAPERS_STEPS
 from .speed_targets import NEAR_FINAL, steps_to_final
 from .statistics import Measurements, Spread
-from .tables import DOMAIN_LABELS, NOTHING, Cell, Table, begun
+from .tables import DOMAIN_LABELS, NOTHING, begun
 
 
 def speed_table(data: Measurements) -> Table:

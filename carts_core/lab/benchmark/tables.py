@@ -1,7 +1,5 @@
 """What a table of the report is, and how numbers are written in it."""
 
-from dataclasses import dataclass
-
 from . import paper
 from .occlusion import OCCLUSION
 from .statistics import Spread
@@ -19,25 +17,6 @@ SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
 """Of the methods that are followed through iterations and errors."""
 NOTHING = "–"
 """In place of a number that is not there."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What stands in a table's cell."""
-
-    text: str
-    note: str = ""
-    """The paper's number, set small."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report."""
-
-    title: str
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
 
 
 def begun(error_deg: float | None) -> str:

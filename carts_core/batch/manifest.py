@@ -1,0 +1,131 @@
+"""Which jobs there are: a TOML file that names recordings, cameras, domains, and what is done with each."""
+
+import glob
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from ..errors import SettingsError
+from ..files import unique_file_names
+from ..files.reading import SETTINGS, parse_toml, read_text
+from ..wording import listed, shown
+
+FORMAT = "carts-batch/1"
+Step = Literal["import", "calibrate", "optimize", "sequence", "evaluate", "export"]
+STEPS: tuple[Step, ...] = get_args(Step)
+_KEYS = {"recordings", "cameras", "domains", "steps", "options"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording, as one camera (or some) saw it in one domain, and the steps to be taken with it."""
+
+    name: str
+    """Of its folder; unique in the manifest."""
+    recording: Path
+    """Sequence file, or what `carts import` reads where `import` is the first step."""
+    camera: str
+    """Name, or `all`."""
+    domain: str
+    """Name; empty for the sequence's first one."""
+    steps: tuple[Step, ...]
+    """In this order; a later one works on what the ones before it have made."""
+    options: Mapping[str, tuple[str, ...]]
+    """Step -> further options of its command."""
+
+
+def read_manifest(path: Path) -> list[Job]:
+    """The jobs of a manifest, in its order.
+
+    Raises:
+        SettingsError: it cannot be read, has a key, step or value that is not allowed, or a pattern matches no file.
+    """
+    try:
+        content = parse_toml(read_text(path, SETTINGS))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"manifest {path} cannot be read: {error}. Give a TOML file; docs: batch.") from error
+    if content.get("format") != FORMAT:
+        raise SettingsError(
+            f"manifest {path} has the format {shown(content.get('format'))}; write format = {FORMAT!r}."
+        )
+    tables = content.get("jobs")
+    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
+        raise SettingsError(f"manifest {path} has no [[jobs]]. Add at least one, with recordings and steps.")
+    strangers = set(content) - {"format", "jobs"}
+    if strangers:
+        raise SettingsError(f"manifest {path} has {listed(sorted(strangers))}; allowed are format and [[jobs]].")
+    found = [job for number, table in enumerate(tables, 1) for job in _jobs(path, f"{path}, jobs {number}", table)]
+    names = unique_file_names([job.name for job in found])
+    return [Job(name, *_fields(job)) for name, job in zip(names, found, strict=True)]
+
+
+def _fields(job: Job) -> tuple[Any, ...]:
+    return job.recording, job.camera, job.domain, job.steps, job.options
+
+
+def _jobs(manifest: Path, where: str, table: dict[str, Any]) -> Iterator[Job]:
+    if strangers := set(table) - _KEYS:
+        raise SettingsError(f"{where} has {listed(sorted(strangers))}; allowed are {listed(sorted(_KEYS))}.")
+    steps = _steps(where, _texts(where, table, "steps", None))
+    options = _options(where, table.get("options", {}), steps)
+    recordings = _recordings(manifest, where, _texts(where, table, "recordings", None))
+    cameras, domains = _texts(where, table, "cameras", ("all",)), _texts(where, table, "domains", ("",))
+    for recording, domain, camera in product(recordings, domains, cameras):
+        yield Job(_name(recording, domain, camera), recording, camera, domain, steps, options)
+
+
+def _texts(where: str, table: dict[str, Any], key: str, default: tuple[str, ...] | None) -> tuple[str, ...]:
+    value = table.get(key, default)
+    if isinstance(value, (list, tuple)) and value and all(isinstance(text, str) for text in value):
+        return tuple(dict.fromkeys(value))
+    raise SettingsError(f"{where}: {key} is {shown(value)}; give a list of at least one text.")
+
+
+def _steps(where: str, given: tuple[str, ...]) -> tuple[Step, ...]:
+    steps: tuple[Step, ...] = tuple(step for step in STEPS if step in given)
+    if unknown := [step for step in given if step not in STEPS]:
+        raise SettingsError(f"{where}: step {unknown[0]!r} is not known; allowed are {', '.join(STEPS)}.")
+    if steps != given:
+        raise SettingsError(
+            f"{where}: steps are {', '.join(given)}; they run in the order {', '.join(steps)}. Write so."
+        )
+    return steps
+
+
+def _options(where: str, given: Any, steps: tuple[Step, ...]) -> dict[str, tuple[str, ...]]:
+    if not isinstance(given, dict):
+        raise SettingsError(f"{where}: options is {shown(given)}; give a table with a list of texts for each step.")
+    if strangers := [name for name in given if name not in steps]:
+        raise SettingsError(f"{where}: options of {strangers[0]!r}, which is none of its steps ({', '.join(steps)}).")
+    return {step: _texts(f"{where}, options", given, step, None) for step in given}
+
+
+def _recordings(manifest: Path, where: str, patterns: tuple[str, ...]) -> list[Path]:
+    """Files and folders that patterns match, those of each pattern in the order of their names."""
+    folder, found = manifest.absolute().parent, []
+    for pattern in patterns:
+        matched = sorted(glob.glob(str(folder / pattern), recursive=True))
+        if not matched:
+            raise SettingsError(f"{where}: recording {pattern!r} matches nothing in {folder}. Correct or remove it.")
+        found += map(Path, matched)
+    return list(dict.fromkeys(found))
+
+
+def _name(recording: Path, domain: str, camera: str) -> str:
+    """The folder of a sequence file tells more than its name, which is often `sequence.toml`."""
+    stem = recording.parent.name if recording.name == "sequence.toml" else recording.stem
+    return "-".join(part for part in (stem, domain, camera if camera != "all" else "") if part)
+
+
+def shard(jobs: list[Job], text: str) -> list[Job]:
+    """Every n-th job, from the i-th on, of `i/n`; all shards together have every job once.
+
+    Raises:
+        SettingsError: the text is not `i/n` with 1 <= i <= n.
+    """
+    first, _, count = text.partition("/")
+    if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
+        raise SettingsError(f"--shard {text!r} is not readable. Give I/N, from 1/N to N/N, such as 2/8.")
+    return jobs[int(first) - 1 :: int(count)]

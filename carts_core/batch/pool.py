@@ -1,0 +1,125 @@
+"""Jobs side by side in processes of their own on this machine. A process that dies is replaced, its job begun again."""
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from ..stopping import Stopped, stopped_by_signals
+from .engine import ATTEMPTS, Outcome, Work, lost
+from .manifest import Job
+
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_PATIENCE = 10.0
+"""How long a process that is to end may take [s]."""
+
+
+@dataclass
+class _Worker:
+    process: BaseProcess
+    connection: Connection
+    job: Job | None = None
+    """What it works on."""
+
+
+class Pool:
+    """Processes that take one job after another.
+
+    Args:
+        work: what is done with a job; a function that can be named.
+        workers: number of processes.
+        threads: of each.
+    """
+
+    def __init__(self, work: Work, workers: int, threads: int) -> None:
+        self._work, self._workers, self._threads = work, workers, threads
+        self._context = multiprocessing.get_context("spawn")
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Do all jobs; yields what came of each as it is known. Ending it early ends the processes."""
+        waiting, attempts = deque(jobs), dict.fromkeys((job.name for job in jobs), 0)
+        workers: list[_Worker] = []
+        try:
+            while waiting or any(worker.job for worker in workers):
+                missing = min(self._workers, len(waiting) + sum(worker.job is not None for worker in workers))
+                workers += [self._started() for _ in range(missing - len(workers))]
+                for worker in workers:
+                    if worker.job is None and waiting:
+                        _hand(worker, waiting, attempts)
+                ready = wait([worker.connection for worker in workers if worker.job is not None], timeout=1.0)
+                for worker in [worker for worker in workers if worker.connection in ready]:
+                    job, worker.job = worker.job, None
+                    assert job is not None
+                    try:
+                        yield worker.connection.recv()
+                    except (EOFError, OSError):
+                        workers.remove(worker)
+                        _end(worker)
+                        if attempts[job.name] < ATTEMPTS:
+                            waiting.append(job)
+                        else:
+                            yield lost(job)
+        finally:
+            for worker in workers:
+                worker.connection.close()
+                if worker.job is not None:
+                    worker.process.terminate()
+            for worker in workers:
+                _end(worker)
+
+    def _started(self) -> _Worker:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(theirs, self._work), name="carts-batch", daemon=True)
+        with _threads_of_children(self._threads):
+            process.start()
+        theirs.close()
+        return _Worker(process, ours)
+
+
+def _hand(worker: _Worker, waiting: deque[Job], attempts: dict[str, int]) -> None:
+    """Give a job to a worker; one that has died meanwhile is noticed when its answer is awaited."""
+    worker.job = waiting.popleft()
+    attempts[worker.job.name] += 1
+    with suppress(OSError):
+        worker.connection.send(worker.job)
+
+
+def _end(worker: _Worker) -> None:
+    worker.connection.close()
+    worker.process.join(_PATIENCE)
+    if worker.process.is_alive():
+        worker.process.kill()
+        worker.process.join()
+    worker.process.close()
+
+
+@contextmanager
+def _threads_of_children(threads: int) -> Iterator[None]:
+    """Libraries read how many threads they may have when they are loaded, so it is in a child's environment."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, str(threads)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _serve(connection: Connection, work: Callable[[Job], Outcome]) -> None:
+    """What a process does: jobs, until there are no more or nobody asks any longer."""
+    with stopped_by_signals(), suppress(Stopped):
+        while True:
+            try:
+                job = connection.recv()
+            except (EOFError, OSError):
+                return
+            outcome = work(job)
+            with suppress(OSError):
+                connection.send(outcome)

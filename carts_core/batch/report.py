@@ -1,0 +1,239 @@
+"""The report over all jobs: one page, with plots and the worst frames beside it, and the same numbers as JSON."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path, PurePath
+from string import Template
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..evaluation.calibration import pose_distance
+from ..files import OutputPath, output_stream, write_bytes, write_text
+from ..files.reading import IMAGE, read_bytes
+from ..html import STYLE, Cell, Table, anchor, figure_html, section_html, table_html
+from .findings import Findings, FrameFinding, read_findings
+from .manifest import Job
+from .state import JobState, present_status
+
+matplotlib.use("Agg")
+matplotlib.rcParams["text.parse_math"] = False
+
+_SHOWN = 24
+"""Worst frames on the page."""
+_PAGE = Template("""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title><style>$style
+.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(20rem, 1fr)); gap: 1rem; }
+.gallery figure { margin: 0; }
+</style></head><body><h1>$title</h1><nav>$contents</nav>$sections</body></html>
+""")
+_VERDICTS = ("good", "doubtful", "failed")
+
+
+@dataclass(frozen=True)
+class _Done:
+    """What is known of a job."""
+
+    job: Job
+    status: str
+    state: JobState
+    findings: Findings | None
+
+
+def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
+    """Write `report/report.html`, `report/report.json` and the pictures; returns the page's path.
+
+    Args:
+        batch: its folder.
+        title: of the page.
+        jobs: all of the manifest.
+    """
+    folder, known = batch / "report", []
+    for job in jobs:
+        place = batch / "jobs" / job.name
+        status, state = present_status(place) if place.path.is_dir() else ("waiting", JobState())
+        known.append(_Done(job, status, state, read_findings(place) if place.path.is_dir() else None))
+    drifts, joints = _drifts(known), _joints(known)
+    sections = {
+        "Jobs": table_html(_job_table(known)),
+        "Verdicts": table_html(_verdict_table(known)),
+        "Worst frames": _worst(batch, folder, known),
+        "Base frames": table_html(_drift_table(drifts)),
+        "Joints": table_html(_joint_table(joints)) + _joint_figure(folder, joints),
+    }
+    contents = " ".join(f'<a href="#{anchor(name)}">{escape(name)}</a>' for name in sections)
+    body = "".join(section_html(name, html) for name, html in sections.items())
+    page = _PAGE.substitute(title=escape(title), style=STYLE, contents=contents, sections=body)
+    document = {
+        "format": "carts-batch-report/1",
+        "jobs": {entry.job.name: {"status": entry.status, "error": entry.state.error} for entry in known},
+        "verdicts": {entry.job.name: _verdicts(entry) for entry in known},
+        "base_frames": drifts,
+        "joints": {name: _statistics(*values) for name, values in joints.items()},
+    }
+    write_text(folder / "report.json", json.dumps(document, indent=1))
+    write_text(folder / "report.html", page)
+    return (folder / "report.html").path
+
+
+def _job_table(known: Sequence[_Done]) -> Table:
+    """Jobs that need somebody first."""
+    order = ["failed", "lost", "stopped", "running", "waiting", "done"]
+    rows = sorted(known, key=lambda entry: order.index(entry.status))
+    counts = Counter(entry.status for entry in known)
+    return Table(
+        "What became of the jobs",
+        ", ".join(f"{counts[status]} {status}" for status in order if counts[status]),
+        ("job", "recording", "status", "seconds", "error"),
+        tuple(
+            (
+                Cell(entry.job.name),
+                Cell(str(entry.job.recording)),
+                Cell(entry.status),
+                Cell(f"{sum(step.seconds for step in entry.state.steps.values()):.1f}"),
+                Cell(entry.state.error.strip().splitlines()[-1] if entry.state.error.strip() else ""),
+            )
+            for entry in rows
+        ),
+    )
+
+
+def _verdicts(entry: _Done) -> dict[str, int]:
+    counts = Counter(frame.verdict for frame in (entry.findings.frames if entry.findings else ()))
+    return {verdict: counts[verdict] for verdict in _VERDICTS}
+
+
+def _verdict_table(known: Sequence[_Done]) -> Table:
+    """Jobs with the largest share of bad frames first."""
+    counted = [(entry, _verdicts(entry)) for entry in known]
+    rows = [(entry.job.name, counts) for entry, counts in counted if sum(counts.values())]
+    rows.sort(key=lambda row: (-row[1]["failed"] / sum(row[1].values()), -row[1]["doubtful"] / sum(row[1].values())))
+    total = {verdict: sum(counts[verdict] for _, counts in rows) for verdict in _VERDICTS}
+    lines = [*([("all jobs", total)] if rows else []), *rows]
+    return Table(
+        "How far results can be relied on",
+        "Frames by verdict, as far as their images tell; nothing here knows the truth.",
+        ("job", *_VERDICTS, "frames"),
+        tuple(
+            (Cell(name), *(Cell(str(counts[verdict])) for verdict in _VERDICTS), Cell(str(sum(counts.values()))))
+            for name, counts in lines
+        ),
+    )
+
+
+def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[_Done]) -> str:
+    """Pictures of the frames whose masks are wrong most probably; copied, so that the folder can be sent on its own."""
+    frames: list[tuple[Job, FrameFinding]] = [
+        (entry.job, frame)
+        for entry in known
+        for frame in (entry.findings.frames if entry.findings else ())
+        if frame.picture
+    ]
+    frames.sort(key=lambda pair: -pair[1].probability)
+    shown = []
+    for number, (job, frame) in enumerate(frames[:_SHOWN], 1):
+        try:
+            picture = read_bytes((batch / "jobs" / job.name / frame.picture).path, IMAGE)
+        except OSError:
+            continue
+        name = f"worst-{number:02d}.jpg"
+        write_bytes(folder / name, picture)
+        caption = (
+            f"{job.name}, frame {frame.frame}, {frame.camera}: {frame.verdict}, probability of a wrong mask "
+            f"{frame.probability:.2f}. {frame.reason}"
+        )
+        shown.append(figure_html(caption, PurePath(name)))
+    text = "<p>The outline of each mask over its image, the most doubtful frames of all jobs first.</p>"
+    return text + f'<div class="gallery">{"".join(shown)}</div>' if shown else "<p>No frame has a verdict.</p>"
+
+
+def _drifts(known: Sequence[_Done]) -> list[dict[str, object]]:
+    """Of each base frame in each job: how far it is from that of the job before, in the manifest's order."""
+    found, before = [], {}
+    for entry in known:
+        for name, rows in (entry.findings.base_frames if entry.findings else {}).items():
+            present = np.array(rows)
+            angle, distance = pose_distance(before.get(name, present), present)
+            found.append({"base_frame": name, "job": entry.job.name, "rotation_deg": angle, "translation_mm": distance})
+            before[name] = present
+    return found
+
+
+def _drift_table(drifts: list[dict[str, object]]) -> Table:
+    return Table(
+        "Drift of base frames",
+        "How far each arm's base, seen from a camera, is from where it was in the job before, in the manifest's order.",
+        ("base frame", "job", "turned [deg]", "moved [mm]"),
+        tuple(
+            (
+                Cell(str(row["base_frame"])),
+                Cell(str(row["job"])),
+                Cell(f"{row['rotation_deg']:.3f}"),
+                Cell(f"{row['translation_mm']:.2f}"),
+            )
+            for row in sorted(drifts, key=lambda row: str(row["base_frame"]))
+        ),
+    )
+
+
+_Values = tuple[list[float], list[float]]
+"""Corrections and reported deviations of a joint [deg, mm]."""
+
+
+def _joints(known: Sequence[_Done]) -> dict[str, _Values]:
+    found: dict[str, _Values] = {}
+    for entry in known:
+        if entry.findings is not None:
+            for name, values in entry.findings.corrections.items():
+                corrections, deviations = found.setdefault(name, ([], []))
+                corrections += values
+                deviations += entry.findings.deviations.get(name, [])
+    return found
+
+
+def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> dict[str, float | int | None]:
+    values = np.asarray(corrections)
+    return {
+        "frames": len(values),
+        "mean": float(values.mean()),
+        "deviation": float(values.std()),
+        "median_size": float(np.median(np.abs(values))),
+        "largest_size": float(np.abs(values).max()),
+        "median_reported": float(np.median(deviations)) if len(deviations) else None,
+    }
+
+
+def _joint_table(joints: Mapping[str, _Values]) -> Table:
+    rows = []
+    for name, values in joints.items():
+        found = _statistics(*values)
+        numbers = [found[key] for key in ("mean", "deviation", "median_size", "largest_size", "median_reported")]
+        texts = ["–" if number is None else f"{number:.3f}" for number in numbers]
+        rows.append((Cell(name), Cell(str(found["frames"])), *map(Cell, texts)))
+    return Table(
+        "Error of measured joints",
+        "Corrected minus measured, over the frames of all jobs; degrees, or millimetres for joints that slide.",
+        ("joint", "frames", "mean", "deviation", "median size", "largest", "median reported deviation"),
+        tuple(rows),
+    )
+
+
+def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> str:
+    if not joints:
+        return ""
+    figure = Figure(figsize=(max(5.0, 1.5 + 0.5 * len(joints)), 5.0), layout="constrained")
+    axes = figure.subplots()
+    axes.boxplot([corrections for corrections, _ in joints.values()], widths=0.6, showfliers=False)
+    axes.set_xticks(range(1, len(joints) + 1), list(joints), fontsize=8, rotation=90)
+    axes.axhline(0.0, color="gray", linewidth=0.8)
+    axes.set_ylabel("corrected minus measured [deg, mm]")
+    axes.grid(axis="y", alpha=0.3)
+    with output_stream(folder / "joints.png") as stream:
+        figure.savefig(stream, format="png", dpi=110)
+    caption = "Corrections of each joint: median, quartiles, and 1.5 times their distance."
+    return figure_html(caption, PurePath("joints.png"))

@@ -1,0 +1,112 @@
+"""`carts batch`: an archive of recordings, job by job, on one machine or many."""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from ..console import Bar, Terminal
+from ..errors import CartsError, SettingsError
+from ..stopping import when_stopped
+from ..wording import counted
+from .selection import output_folder
+
+if TYPE_CHECKING:
+    from ..batch.manifest import Job
+    from ..files import OutputPath
+
+_NAMED = 5
+"""Failed jobs that are named in the end."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Import, calibrate, optimize, evaluate and export many recordings, side by side; run it again to go on."""
+
+    manifest: Annotated[Path, tyro.conf.Positional]
+    """Which recordings, cameras and domains, and what is done with each (docs: batch)."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/batch/NAME`, after the manifest. In `jobs`, each has a folder of its own."""
+    workers: int = 0
+    """Jobs side by side; as many as there are cores by default."""
+    threads: int = 1
+    """Of each job. One is most efficient where there are more jobs than cores."""
+    shard: str = "1/1"
+    """Only every N-th job, from the I-th on: `I/N`. Shards may run anywhere that sees the same folder."""
+    scheduler: str | None = None
+    """Give jobs to dask.distributed: address of its scheduler, or `local` for workers on this machine."""
+    again: bool = False
+    """Take steps again that are done; each redoes what has changed since."""
+    report_only: bool = False
+    """Run nothing; write the report over what is there."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 0:
+            raise SettingsError(f"--workers is {self.workers}; allowed is 0 (as many as there are cores) or more.")
+        if self.threads < 1:
+            raise SettingsError(f"--threads is {self.threads}; allowed is 1 or more.")
+
+    def run(self) -> None:
+        """Do the jobs of the shard, and write the report over all.
+
+        Raises:
+            CartsError: the manifest is not usable, or jobs have failed.
+        """
+        from ..batch.manifest import read_manifest, shard
+        from ..batch.report import write_batch_report
+        from .batch_job import check_options
+
+        console = Terminal()
+        jobs = read_manifest(self.manifest)
+        chosen = shard(jobs, self.shard)
+        check_options(jobs)
+        folder = output_folder(self.output, "batch", self.manifest.stem)
+        failed: dict[str, str] = {}
+        if not self.report_only:
+            failed = self._run(console, chosen, folder)
+        if len(chosen) == len(jobs):
+            console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
+        else:
+            console.print("this was one shard; --report-only writes the report once all are done")
+        if failed:
+            named = "".join(f"\n  {name}: {_last_line(error)}" for name, error in list(failed.items())[:_NAMED])
+            raise CartsError(
+                f"{len(failed)} of {counted(len(chosen), 'job')} failed; the same command tries them again. Their logs "
+                f"are in {folder / 'jobs'}.{named}"
+            )
+
+    def _run(self, console: Terminal, jobs: "list[Job]", folder: "OutputPath") -> dict[str, str]:
+        """Do jobs; name and error of each that failed."""
+        import os
+
+        from ..batch.pool import Pool
+        from ..extras import needs_extra
+        from .batch_job import BatchWork
+
+        workers, work = self.workers or os.cpu_count() or 1, BatchWork(folder, self.again)
+        if self.scheduler is None:
+            engine = Pool(work, min(workers, len(jobs)), self.threads)
+        else:
+            needs_extra("distributed", "cluster")
+            from ..batch.cluster import Cluster
+
+            engine = Cluster(work, self.scheduler, min(workers, len(jobs)), self.threads)
+        failed, counts = {}, Counter()
+        kept = f"{folder} holds what is done; the same command goes on from there"
+        with when_stopped(kept), Bar(console=console) as bar:
+            task = bar.add_task("jobs", total=len(jobs))
+            outcomes = engine.run(jobs)
+            for outcome in outcomes:
+                counts[outcome.status] += 1
+                bar.update(task, advance=1, description=f"jobs, {counts['failed']} failed")
+                if outcome.status == "failed":
+                    failed[outcome.job] = outcome.error
+        words = {"done": "done", "known": "already there", "busy": "left to another process", "failed": "failed"}
+        console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
+        return failed
+
+
+def _last_line(text: str) -> str:
+    return text.strip().splitlines()[-1] if text.strip() else "no reason is known"

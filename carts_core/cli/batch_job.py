@@ -1,0 +1,195 @@
+"""What a job of `carts batch` does: the plain commands, one after the other, into its own folder."""
+
+import contextlib
+import io
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from ..batch.engine import Outcome
+from ..batch.findings import write_findings
+from ..batch.manifest import Job, Step
+from ..batch.state import RunningJob, StepState, running
+from ..console import Terminal, log_to_stderr
+from ..errors import CartsError, SettingsError
+from ..files import OutputPath, write_text
+from ..fingerprints import code_fingerprint, fingerprint
+from ..process import tune_process
+from .calibrate import Calibrate
+from .evaluate import Evaluate
+from .export import Export
+from .import_ import Import
+from .optimize import Optimize
+
+_COMMANDS: dict[Step, type] = {
+    "import": Import,
+    "calibrate": Calibrate,
+    "optimize": Optimize,
+    "sequence": Optimize,
+    "evaluate": Evaluate,
+    "export": Export,
+}
+_GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain", "--verdicts")
+"""What a job sets itself."""
+_CODE = ("**/*.py",)
+
+
+@dataclass(frozen=True)
+class BatchWork:
+    """Does jobs; goes to the processes that do.
+
+    Args:
+        folder: of the batch.
+        again: whether steps that are done are taken again, whatever they were made from.
+    """
+
+    folder: OutputPath
+    again: bool = False
+
+    def __call__(self, job: Job) -> Outcome:
+        """Do a job; what is done of it is not done again."""
+        began = time.perf_counter()
+        folder = job_folder(self.folder, job)
+        with running(folder) as state:
+            if state is None:
+                return Outcome(job.name, "busy")
+            try:
+                done = _steps(job, folder, state, self.again)
+            except KeyboardInterrupt:
+                state.change(status="stopped")
+                raise
+            except CartsError as error:
+                return _failed(job, state, str(error), began)
+            except Exception as error:  # The other jobs go on, whatever happened to this one.
+                return _failed(job, state, "".join(traceback.format_exception(error)), began)
+            state.change(status="done", attempts=0)
+        return Outcome(job.name, "done" if done else "known", seconds=time.perf_counter() - began)
+
+
+def job_folder(batch: OutputPath, job: Job) -> OutputPath:
+    """Where all of a job lies."""
+    return batch / "jobs" / job.name
+
+
+def check_options(jobs: Sequence[Job]) -> None:
+    """See that every step's options are ones that its command has, before anything runs.
+
+    Raises:
+        SettingsError: one is not, or is set by the batch itself.
+    """
+    called: set[tuple[Step, tuple[str, ...]]] = set()
+    for job in jobs:
+        called |= {(step, job.options.get(step, ())) for step in job.steps}
+    for step, options in sorted(called):
+        for option in options:
+            if option.partition("=")[0] in _GIVEN:
+                raise SettingsError(f"options of {step}: {option} is set by the batch itself. Leave it out.")
+        _parsed(step, ["recording", *(["output"] if step == "export" else []), *options])
+
+
+def _parsed(step: Step, arguments: list[str]) -> Any:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            return tyro.cli(_COMMANDS[step], prog=f"carts {step}", args=arguments)
+    except SystemExit as end:
+        raise SettingsError(
+            f"options of {step}: `carts {step} {' '.join(arguments)}` is no command.\n{said.getvalue()}"
+        ) from end
+
+
+def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
+    state.change(status="failed", attempts=0, error=error)
+    return Outcome(job.name, "failed", error, time.perf_counter() - began)
+
+
+def _steps(job: Job, folder: OutputPath, state: RunningJob, again: bool) -> int:
+    """Take the steps that are not done; how many these were."""
+    tune_process(keep_memory=True)
+    log_to_stderr()
+    done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
+    sequence = job.recording
+    for step in job.steps:
+        options = job.options.get(step, ())
+        key = fingerprint(key, step, job.camera, job.domain, options, [_inputs(Path(text)) for text in options])
+        known = state.state.steps.get(step)
+        if again or known is None or known.key != key:
+            began = time.perf_counter()
+            with _logged(folder / f"{step}.log"):
+                _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
+            state.step_done(step, StepState(key, round(time.perf_counter() - began, 3)))
+            done += 1
+        if step in ("import", "calibrate"):
+            sequence = (folder / _FOLDERS[step] / "sequence.toml").path
+    if done:
+        write_findings(job, folder, sequence)
+    return done
+
+
+_FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}
+
+
+def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list[str]:
+    """Of a step's command, besides its options."""
+    chosen = ["--camera", job.camera, *(["--domain", job.domain] if job.domain else [])]
+    match step:
+        case "import":
+            return [str(sequence), "--output", str(folder / "recording"), "--overwrite"]
+        case "calibrate":
+            return [str(sequence), "--output", str(folder / "calibration"), "--overwrite", *chosen]
+        case "optimize":
+            return [str(sequence), "--output", str(folder / "optimize"), *chosen]
+        case "sequence":
+            further = ["--mode", "sequence", "--verdicts"]
+            return [str(sequence), "--output", str(folder / "sequence"), *further, *chosen]
+        case "evaluate":
+            return [str(sequence), "--json", str(folder / "evaluation.json"), *chosen]
+        case "export":
+            table = _table(job, folder)
+            corrected = ["--kinematics", str(table)] if table else []
+            return [str(sequence), str(folder / "export"), "--overwrite", *corrected, *chosen]
+
+
+def _table(job: Job, folder: OutputPath) -> Path | None:
+    """The kinematics that the steps before have found; None where nothing was optimized.
+
+    Raises:
+        SettingsError: there are several, since several cameras worked alone.
+    """
+    made = [step for step in ("sequence", "optimize") if step in job.steps]
+    found = sorted((folder / made[0]).path.glob("*/*/kinematics.csv")) if made else []
+    if len(found) > 1:
+        raise SettingsError(
+            f"job {job.name}: {len(found)} cameras worked alone, and an export holds one table. Name a camera for each "
+            "job, or add --together to the options."
+        )
+    return found[0] if found else None
+
+
+def _inputs(path: Path) -> list[str | int]:
+    """What tells whether a file was replaced; nothing for what is no file."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return []
+    return [str(path), found.st_size, found.st_mtime_ns]
+
+
+@contextlib.contextmanager
+def _logged(path: OutputPath) -> Iterator[None]:
+    """What the block prints goes into a file."""
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            try:
+                yield
+            except CartsError as error:
+                Terminal().print_error(error)
+                raise
+    finally:
+        write_text(path, printed.getvalue())

@@ -1,0 +1,96 @@
+"""A manifest names every job once, and what is wrong with it is said before anything runs."""
+
+from pathlib import Path
+
+import pytest
+
+from carts_core.batch.manifest import read_manifest, shard
+from carts_core.cli.batch_job import check_options
+from carts_core.errors import SettingsError
+
+JOBS = '[[jobs]]\nrecordings = ["*/sequence.toml"]\nsteps = ["sequence", "export"]\n'
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    for name in ("b", "a", "c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "sequence.toml").write_text("")
+    return tmp_path
+
+
+def manifest(archive: Path, text: str) -> Path:
+    path = archive / "archive.toml"
+    path.write_text(f'format = "carts-batch/1"\n{text}')
+    return path
+
+
+def test_every_recording_camera_and_domain_is_a_job(archive: Path) -> None:
+    jobs = read_manifest(manifest(archive, JOBS + 'cameras = ["left", "right"]\ndomains = ["regular", "smoke"]'))
+    assert len(jobs) == 3 * 2 * 2 and len({job.name for job in jobs}) == len(jobs)
+    assert [job.name for job in jobs[:4]] == ["a-regular-left", "a-regular-right", "a-smoke-left", "a-smoke-right"]
+    assert {job.recording for job in jobs} == {archive / name / "sequence.toml" for name in "abc"}
+
+
+def test_jobs_of_the_same_name_get_folders_of_their_own(archive: Path) -> None:
+    names = [job.name for job in read_manifest(manifest(archive, JOBS + JOBS))]
+    assert len(set(names)) == 6
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_shards_have_every_job_once(archive: Path, count: int) -> None:
+    jobs = read_manifest(manifest(archive, JOBS))
+    parts = [shard(jobs, f"{number}/{count}") for number in range(1, count + 1)]
+    assert sorted(job.name for part in parts for job in part) == sorted(job.name for job in jobs)
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "a/b", "1/0", "-1/2", ""])
+def test_a_shard_that_cannot_be_is_refused(archive: Path, text: str) -> None:
+    with pytest.raises(SettingsError, match="Give I/N, from 1/N to N/N"):
+        shard(read_manifest(manifest(archive, JOBS)), text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"has no \[\[jobs\]\]"),
+        ("jobs = 3", r"has no \[\[jobs\]\]"),
+        ("stuff = 1\n" + JOBS, "has stuff; allowed are format"),
+        (JOBS + "camera = 'left'", "has camera; allowed are cameras, domains"),
+        (JOBS + "cameras = 'left'", "cameras is 'left'; give a list"),
+        (JOBS + "cameras = []", r"cameras is \[\]; give a list"),
+        (JOBS.replace("export", "train"), "step 'train' is not known; allowed are import, calibrate"),
+        (JOBS.replace('"sequence", "export"', '"export", "sequence"'), "they run in the order sequence, export"),
+        (JOBS.replace("*/", "missing/"), "matches nothing"),
+        (JOBS + "[jobs.options]\noptimize = ['--together']", "options of 'optimize', which is none of its steps"),
+        (JOBS + "options = 1", "options is 1; give a table"),
+    ],
+)
+def test_what_is_wrong_with_a_manifest_is_said(archive: Path, text: str, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        read_manifest(manifest(archive, text))
+
+
+@pytest.mark.parametrize("content", ["format = 1", "format = ", 'format = "carts-batch/2"\n' + JOBS])
+def test_a_file_that_is_no_manifest_is_refused(archive: Path, content: str) -> None:
+    path = archive / "archive.toml"
+    path.write_text(content)
+    with pytest.raises(SettingsError, match="manifest"):
+        read_manifest(path)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--output", "is set by the batch itself"),
+        ("--camera=left", "is set by the batch itself"),
+        ("--wrong", "Unrecognized"),
+        ("--free", "is no command"),
+    ],
+)
+def test_an_option_that_its_command_does_not_have_is_refused_before_anything_runs(
+    archive: Path, option: str, message: str
+) -> None:
+    text = JOBS.replace(', "export"', "") + f'[jobs.options]\nsequence = ["{option}"]'
+    with pytest.raises(SettingsError, match=message):
+        check_options(read_manifest(manifest(archive, text)))

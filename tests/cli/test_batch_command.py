@@ -1,0 +1,236 @@
+"""`carts batch`: what the plain commands write, however the jobs are shared out and whatever stops them."""
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from carts_core.batch.manifest import read_manifest
+from carts_core.batch.report import write_batch_report
+from carts_core.batch.state import FILE, present_status
+from carts_core.cli import main
+from carts_core.cli.batch_job import BatchWork
+from carts_core.errors import CartsError
+from carts_core.files import output_path
+
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=2, width=160, height=128, domains=("regular", "dark"))
+
+
+def manifest(sequence: Path, count: int = 1, *, steps: str = '"optimize", "export"', further: str = "") -> Path:
+    """So many jobs of one frame."""
+    domains = '["regular", "dark"]'
+    path = sequence.parent / "archive.toml"
+    job = (
+        f'[[jobs]]\nrecordings = ["{sequence.name}"]\ndomains = {domains}\nsteps = [{steps}]\n'
+        '[jobs.options]\noptimize = ["--solver", "none", "--frames", "0"]\n'
+    )
+    if "export" in steps:
+        job += 'export = ["--format", "coco", "--frames", "0"]\n'
+
+    path.write_text('format = "carts-batch/1"\n' + count * job + further)
+    return path
+
+
+def results(batch: Path) -> dict[str, bytes]:
+    """Every file of the jobs but what tells when and where they ran."""
+    files = [path for path in sorted(batch.rglob("*")) if path.is_file()]
+    names = {path.relative_to(batch).as_posix(): path for path in files}
+    return {
+        name: path.read_bytes()
+        for name, path in names.items()
+        if not name.startswith("report/") and not name.endswith((FILE, ".log"))
+    }
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "carts_core.cli", "batch", *map(str, arguments)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=3600)
+
+
+def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    batch = tmp_path / "batch"
+    command = ["batch", str(manifest(sequence)), "--output", str(batch), "--workers", "1"]
+    main(command)
+    assert "2 done" in capsys.readouterr().out
+    for domain in ("regular", "dark"):
+        plain = tmp_path / "plain" / domain
+        chosen = ["--domain", domain, "--frames", "0"]
+        main(["optimize", str(sequence), "--output", str(plain / "optimize"), "--solver", "none", *chosen])
+        table = plain / "optimize" / domain / "left" / "kinematics.csv"
+        export = ["export", str(sequence), str(plain / "export"), "--format", "coco", "--kinematics", str(table)]
+        main([*export, *chosen])
+        (job,) = (batch / "jobs").glob(f"*{domain}")
+        made = results(job)
+        assert {name: made[name] for name in made if "/" in name} == results(plain)
+        (verdict,) = json.loads(made["findings.json"])["frames"]
+        assert verdict["verdict"] in ("good", "doubtful", "failed") and (job / verdict["picture"]).stat().st_size
+    before = {path: path.stat().st_mtime_ns for path in batch.rglob("*.png") if "report" not in path.parts}
+    capsys.readouterr()
+    main(command)
+    assert "2 already there" in capsys.readouterr().out
+    assert before and {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_the_report_has_failures_first_verdicts_joints_and_base_frames(sequence: Path, tmp_path: Path) -> None:
+    further = f'[[jobs]]\nrecordings = ["{sequence.name}"]\ndomains = ["foggy"]\nsteps = ["optimize"]\n'
+    jobs, batch = read_manifest(manifest(sequence, steps='"optimize"', further=further)), output_path(tmp_path / "b")
+    outcomes = {outcome.job: outcome for outcome in map(BatchWork(batch), jobs)}
+    failed = [outcome for outcome in outcomes.values() if outcome.status == "failed"]
+    assert len(failed) == 1 and "domain 'foggy' is not in" in failed[0].error
+    page = write_batch_report(batch, "CaRTS batch <archive>", jobs).read_text()
+    assert "<h1>CaRTS batch &lt;archive&gt;</h1>" in page
+    assert re.findall(r"<td>(done|failed)</td>", page) == ["failed", "done", "done"]
+    assert page.count("<figure>") == 3 and "<td>all jobs</td>" in page
+    report = json.loads((batch / "report" / "report.json").path.read_text())
+    assert [sum(counts.values()) for counts in report["verdicts"].values()] == [1, 1, 0]
+    assert len(report["joints"]) == 7 and all(joint["frames"] == 2 for joint in report["joints"].values())
+    assert [row["base_frame"] for row in report["base_frames"]] == ["PSM1 in left"] * 2
+    assert all(row["translation_mm"] == 0.0 for row in report["base_frames"])
+
+
+def test_a_base_frame_that_drifts_is_reported(sequence: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved.toml"
+    T = [[1, 0, 0, 0.003], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    moved.write_text(sequence.read_text().replace("[arms.joints]", f"T_world_base = {T}\n[arms.joints]"))
+    further = '[[jobs]]\nrecordings = ["moved.toml"]\nsteps = ["optimize"]\n[jobs.options]\n'
+    further += 'optimize = ["--solver", "none", "--frames", "0"]\n'
+    jobs, batch = read_manifest(manifest(sequence, steps='"optimize"', further=further)), output_path(tmp_path / "b")
+    assert [BatchWork(batch)(job).status for job in jobs] == ["done"] * 3
+    write_batch_report(batch, "drift", jobs)
+    rows = json.loads((batch / "report" / "report.json").path.read_text())["base_frames"]
+    assert [round(row["translation_mm"], 6) for row in rows] == [0.0, 0.0, 3.0]
+
+
+def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: Path, tmp_path: Path) -> None:
+    batch = output_path(tmp_path / "b")
+
+    def statuses() -> list[str]:
+        return [BatchWork(batch)(job).status for job in read_manifest(path)]
+
+    path = manifest(sequence, steps='"optimize"')
+    assert statuses() == ["done", "done"] and statuses() == ["known", "known"]
+    sequence.write_text(sequence.read_text() + "# another\n")
+    assert statuses() == ["done", "done"] and statuses() == ["known", "known"]
+    path.write_text(path.read_text().replace('"--frames", "0"]', '"--frames", "1"]'))
+    assert statuses() == ["done", "done"]
+    (batch / "jobs" / read_manifest(path)[0].name / FILE).path.write_text("{")
+    assert statuses() == ["done", "known"]
+
+
+def test_a_wrong_manifest_is_reported_and_nothing_is_made(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = manifest(sequence, further='[[jobs]]\nrecordings = ["nowhere"]\nsteps = ["optimize"]\n')
+    with pytest.raises(SystemExit):
+        main(["batch", str(path), "--output", str(tmp_path / "batch")])
+    assert "matches nothing" in capsys.readouterr().err and not (tmp_path / "batch").exists()
+
+
+def _children(process: int) -> list[int]:
+    """Processes that a process has started, and those that these have."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(path.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        if parent == process:
+            child = int(path.parent.name)
+            found += [child, *_children(child)]
+    return found
+
+
+def _killed_now_and_then(command: list[str | Path], every: float, seed: int) -> int:
+    """Run a batch while one of its workers is killed so often [s]; how many were."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "carts_core.cli", "batch", *map(str, command)],
+        env=ENVIRONMENT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    ended, killed, chance = threading.Event(), [], random.Random(seed)
+
+    def kill() -> None:
+        while not ended.wait(every):
+            workers = [child for child in _children(process.pid) if b"spawn_main" in _command_of(child)]
+            if workers:
+                chosen = chance.choice(workers)
+                killed.append(chosen)
+                os.kill(chosen, signal.SIGKILL)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    _, errors = process.communicate(timeout=3600)
+    ended.set()
+    thread.join()
+    assert process.returncode == 0, errors.decode()
+    return len(killed)
+
+
+def _command_of(process: int) -> bytes:
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_200_jobs_come_to_the_same_bytes_on_the_pool_in_shards_and_on_a_cluster_with_workers_killed(
+    sequence: Path, tmp_path: Path
+) -> None:
+    path, jobs = manifest(sequence, 100), 200
+    assert run(path, "--output", tmp_path / "whole", "--workers", "2").returncode == 0
+    whole = results(tmp_path / "whole")
+    assert sum(name.endswith("kinematics.csv") for name in whole) == jobs
+    for number in ("1/2", "2/2"):
+        finished = run(path, "--output", tmp_path / "shards", "--workers", "2", "--shard", number)
+        assert finished.returncode == 0, finished.stderr
+    assert results(tmp_path / "shards") == whole
+    for name, further in (("pool", []), ("cluster", ["--scheduler", "local"])):
+        killed = _killed_now_and_then([path, "--output", tmp_path / name, "--workers", "2", *further], 10.0, 1)
+        assert results(tmp_path / name) == whole and killed > 1
+        batch = output_path(tmp_path / name)
+        states = [present_status(batch / "jobs" / job.name) for job in read_manifest(path)]
+        assert [status for status, _ in states] == ["done"] * jobs
+        print(f"{name}: {killed} workers killed")
+
+
+@pytest.mark.slow
+def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_path: Path) -> None:
+    path = manifest(sequence, 2)
+    assert run(path, "--output", tmp_path / "whole", "--workers", "1").returncode == 0
+    command = [sys.executable, "-m", "carts_core.cli", "batch", str(path), "--output", str(tmp_path / "stopped")]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("stopped/jobs/*/findings.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode in (0, 128 + signal.SIGTERM)
+    assert process.returncode == 0 or "holds what is done; the same command goes on from there" in errors
+    finished = run(path, "--output", tmp_path / "stopped", "--workers", "1")
+    assert finished.returncode == 0 and "already there" in finished.stdout
+    assert results(tmp_path / "stopped") == results(tmp_path / "whole")
+
+
+def test_options_of_the_batch_are_checked() -> None:
+    for arguments in (["--workers", "-1"], ["--threads", "0"]):
+        with pytest.raises((SystemExit, CartsError)):
+            main(["batch", "archive.toml", *arguments])
