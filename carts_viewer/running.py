@@ -18,6 +18,7 @@ from carts_core.optimization import (
     FrameOptimizer,
     FreeParameters,
     Iterate,
+    SequenceAssessment,
     SequenceOptimizer,
     SequenceSettings,
     SolverSettings,
@@ -207,13 +208,18 @@ class SequenceRun:
         """Of every frame that was visited, in the light of all of them."""
         return self._optimizer.estimates
 
+    @property
+    def assessment(self) -> SequenceAssessment | None:
+        """At the end, how far all frames together can be relied on; None before, and of a run that was stopped."""
+        return self._optimizer.assessment
+
     def status(self) -> str:
         """How it goes, for people."""
         done, total = self._optimizer.progress
         if done == 0:
             return "Estimating a few frames to choose where to begin"
         if done == total:
-            return f"All {total} frames estimated, revising those that disagree"
+            return f"All {total} frames estimated, revising those that disagree and judging the fit"
         seconds = self._optimizer.seconds_left
         left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         return f"Frame {done} of {total}, about {left} left"

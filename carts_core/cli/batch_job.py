@@ -34,7 +34,7 @@ _COMMANDS: dict[Step, type] = {
     "evaluate": Evaluate,
     "export": Export,
 }
-_GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain", "--verdicts")
+_GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
 """What a job sets itself."""
 _CODE = ("**/*.py",)
 
@@ -145,7 +145,7 @@ def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list
         case "optimize":
             return [str(sequence), "--output", str(folder / "optimize"), *chosen]
         case "sequence":
-            further = ["--mode", "sequence", "--verdicts"]
+            further = ["--mode", "sequence"]
             return [str(sequence), "--output", str(folder / "sequence"), *further, *chosen]
         case "evaluate":
             return [str(sequence), "--json", str(folder / "evaluation.json"), *chosen]

@@ -54,7 +54,7 @@ class Calibrate:
         from ..files import MARKER, published, write_text
         from ..optimization import CalibrationOptimizer
         from ..recording import Sequence
-        from .hints import print_hints
+        from .hints import calibration_hint, print_hints
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
@@ -82,7 +82,7 @@ class Calibrate:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
         print_hints(console, self.network.caution)
         console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
-        print_hints(console, remark(sequence.scene, result))
+        print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
 
     def _summary(self, weights: str, indices: list[int], cameras: list[str]) -> dict:
         """How the folder was made."""

@@ -52,7 +52,7 @@ class Evaluate:
         from ..files import write_text
         from ..optimization import Backgrounds
         from ..recording import Sequence
-        from .hints import base_frame_hint, kept_start_hint, print_hints
+        from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_counts
         from .score_table import score_table
 
         console = Terminal()
@@ -87,6 +87,7 @@ class Evaluate:
                 console,
                 kept_start_hint(where, [score.stopped for score in seen]),
                 base_frame_hint(where, [score.base_frame_gain for score in seen]),
+                verdict_counts(where, [score.verdict for score in seen]),
             )
         required = self.solving.chosen.needs_background
         for group in camera_groups(cameras, self.together):

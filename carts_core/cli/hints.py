@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from rich.console import Console
 
-from ..optimization import BASE_FRAME_GAIN, Assessment, Verdict
+from ..optimization import BASE_FRAME_GAIN, Assessment, SequenceAssessment, StopReason, Verdict
 from ..wording import counted
 
 _NAMED = 5
@@ -35,6 +35,15 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     )
 
 
+def verdict_counts(where: str, verdicts: Sequence[str | None]) -> str | None:
+    """How many runs are good, doubtful and failed, or None if all are good or were not assessed."""
+    known = [verdict for verdict in verdicts if verdict is not None]
+    if set(known) <= {Verdict.GOOD.value}:
+        return None
+    counts = ", ".join(f"{known.count(verdict.value)} {verdict.value}" for verdict in Verdict)
+    return f"{where}: the images say of {counted(len(known), 'run')}: {counts}. The reasons are in --json."
+
+
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
     """A line for each reason why results are not to be relied on, or only in part.
 
@@ -51,6 +60,22 @@ def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list
         f"{', ...' if len(ids) > _NAMED else ''}). {reason} {remedy}"
         for (verdict, reason, remedy), ids in frames.items()
     ]
+
+
+def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
+    """Why a sequence as a whole is not to be relied on, or None if it is, or is not assessed."""
+    if found is None or found.verdict is Verdict.GOOD:
+        return None
+    kept = " Its failed frames keep the measured values." if found.verdict is Verdict.FAILED else ""
+    return f"{where}: the sequence is {found.verdict.value}.{kept} {found.reason} {found.remedy}"
+
+
+def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | None:
+    """The verdict on a calibration; None if it was not assessed."""
+    if found is None:
+        return None
+    kept = " The calibration is kept as it was." if stopped in (StopReason.FAILED, StopReason.START_KEPT) else ""
+    return f"Verdict: {found.verdict.value}. {found.reason}{kept} {found.remedy}".rstrip()
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:

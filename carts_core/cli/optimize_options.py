@@ -28,9 +28,6 @@ class OptimizeOptions:
     """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
     keyframes: Path | None = None
     """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
-    verdicts: bool = False
-    """`sequence` mode: judge each frame, which takes two predictions more; `frame` mode always does. The verdicts are
-    in results.json."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)

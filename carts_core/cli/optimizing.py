@@ -15,26 +15,17 @@ from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import remove_file
 from ..fingerprints import fingerprint
-from ..optimization import (
-    Assessment,
-    Backgrounds,
-    FrameEstimate,
-    FrameOptimizer,
-    SequenceOptimizer,
-    StopReason,
-    assess_estimate,
-    sequence_checkpoint,
-)
+from ..optimization import Backgrounds, FrameOptimizer, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
 from ..recording import Frame, Sequence
-from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
 from .frame_folder import FrameFolder, FrameResult
-from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_hints
+from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints
 from .optimize_options import OptimizeOptions
-from .origins import Origin, Origins
+from .origins import Origin as MadeFrom
+from .origins import Origins
 from .selection import output_folder
 
 
@@ -118,7 +109,7 @@ class Optimizing:
                 f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
             )
 
-    def _to_do(self, part: _Part, now: Mapping[int, Origin]) -> list[int]:
+    def _to_do(self, part: _Part, now: Mapping[int, MadeFrom]) -> list[int]:
         """Positions of the chosen frames that are not there as they would be made now; says why."""
         output, ids = part.output, self._sequence.frame_ids
         there = {row.frame_id for row in output.rows}
@@ -131,7 +122,7 @@ class Optimizing:
             self._console.print(f"{output.folder}: {count} of {total} redone: {reason}")
         return [index for index in now if index not in faults or faults[index]]
 
-    def _tell_of_others(self, part: _Part, common: Origin) -> None:
+    def _tell_of_others(self, part: _Part, common: MadeFrom) -> None:
         """Of frames in the folder that were not chosen."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
@@ -166,7 +157,7 @@ class Optimizing:
             there = f"{done} of {counted(total, 'frame')} are solved and kept in {part.output.checkpoint}"
         return f"{there}; the same command goes on from there"
 
-    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, Origin]) -> None:
+    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, MadeFrom]) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         if not todo:
             return
@@ -191,8 +182,10 @@ class Optimizing:
             assert best is not None and optimizer.stop_reason is not None
             assessed[frame.frame_id] = optimizer.assessment
             source = "measured" if optimizer.stop_reason is StopReason.FAILED else "optimized"
-            row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std())
-            part.output.write([FrameResult(row, best.state, origins[index], optimizer.assessment)])
+            found = optimizer.assessment
+            verdict = None if found is None else found.verdict.value
+            row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std(), verdict)
+            part.output.write([FrameResult(row, best.state, origins[index], found)])
             stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
         print_hints(
@@ -203,7 +196,7 @@ class Optimizing:
             *verdict_hints(part.name, assessed),
         )
 
-    def _as_sequence(self, part: _Part, origins: Mapping[int, Origin], common: Origin) -> None:
+    def _as_sequence(self, part: _Part, origins: Mapping[int, MadeFrom], common: MadeFrom) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
         backgrounds = Backgrounds.of(sequence, cameras, part.domain)
         starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
@@ -230,30 +223,18 @@ class Optimizing:
         self._looking = None
         found = []
         for index, estimate in optimizer.estimates.items():
-            source = "edited" if estimate.start == "keyframe" else "optimized"
-            row = KinematicsRow(estimate.frame_id, source, estimate.joint_positions, estimate.joint_std)
-            judged = self._judged(part, estimate, backgrounds) if asked.verdicts else None
-            found.append(FrameResult(row, estimate.state, origins[index], judged))
+            source = {Origin.KEYFRAME: "edited", Origin.MEASURED: "measured"}.get(estimate.start, "optimized")
+            verdict = None if estimate.assessment is None else estimate.assessment.verdict.value
+            row = KinematicsRow(estimate.frame_id, source, estimate.joint_positions, estimate.joint_std, verdict)
+            found.append(FrameResult(row, estimate.state, origins[index], estimate.assessment))
         part.output.write(found)
         checkpoint.remove()
         if checkpoint.recalled:
             self._console.print("went on from where an earlier run was stopped")
         else:
             self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
-        print_hints(self._console, *verdict_hints(part.name, {one.row.frame_id: one.assessment for one in found}))
-
-    def _judged(self, part: _Part, estimate: FrameEstimate, backgrounds: Backgrounds) -> Assessment:
-        """The verdict on a frame of a sequence."""
-        assert isinstance(self._solver, SurfaceSolver)
-        return assess_estimate(
-            self._sequence.scene.with_cameras(part.cameras),
-            self._sequence.frame(estimate.index, part.domain, part.cameras),
-            estimate.state,
-            self._observer.predictor,
-            estimate.loss,
-            settings=self._solver,
-            backgrounds=backgrounds,
-        )
+        assessed = {estimate.frame_id: estimate.assessment for estimate in optimizer.estimates.values()}
+        print_hints(self._console, sequence_hint(part.name, optimizer.assessment), *verdict_hints(part.name, assessed))
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
         """Position -> joint positions of the chosen frames that a person set."""

@@ -48,7 +48,8 @@ def judged(found: Assessment | None) -> dict[str, Any]:
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
     """Of a row of the table, with the digits that it has there."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
-    return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values])
+    verdict = [row.verdict] if row.verdict else []
+    return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
 
 
 def records_text(records: Mapping[str, Record]) -> str:

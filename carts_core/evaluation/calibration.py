@@ -62,8 +62,13 @@ def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, flo
 def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames[FrameResidual]) -> dict[str, Any]:
     """Both calibrations, their difference, and the residuals; matrices in metres, the rest as the keys say."""
     cameras = zip(before.cameras, result.scene.cameras, strict=True)
+    found = result.assessment
     return {
         "stopped": result.stop_reason,
+        "verdict": found and found.verdict.value,
+        "reason": found and found.reason,
+        "remedy": found and found.remedy,
+        "probability_of_failure": found and found.probability,
         "arms": {
             old.name: {"T_world_base": _difference(old.T_world_base, new.T_world_base)}
             for old, new in zip(before.arms, result.scene.arms, strict=True)

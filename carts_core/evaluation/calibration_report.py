@@ -85,6 +85,13 @@ def _unknowns_figure(result: CalibrationResult) -> Figure:
     return figure
 
 
+def _verdict(result: CalibrationResult) -> list[str]:
+    found = result.assessment
+    if found is None:
+        return []
+    return [f"Verdict: **{found.verdict.value}**. {found.reason} {found.remedy}".rstrip(), ""]
+
+
 def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]) -> str:
     cameras = _cameras(residuals)
     unchanged = not any(unknown.change for unknown in result.unknowns)
@@ -95,6 +102,7 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
         f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
         f"{result.stop_reason}. {which} is in `sequence.toml`, all numbers are in `calibration.json`.",
         "",
+        *_verdict(result),
         "| mean over the frames | before | after |",
         "|---|---|---|",
         f"| loss | {result.frame_losses_before.mean():.4f} | {result.frame_losses_after.mean():.4f} |",

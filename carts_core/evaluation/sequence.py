@@ -69,6 +69,7 @@ def evaluate_sequence(
                         estimate.iterations,
                         estimate.seconds / len(group),
                         estimate.start,
+                        assessment=estimate.assessment,
                     )
 
 

@@ -53,5 +53,6 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
         by_id[row.frame_id] = row
     chosen = ((index, by_id[sequence.frame_ids[index]]) for index in indices if sequence.frame_ids[index] in by_id)
     return [
-        ExportFrame(row.frame_id, row.source, row.joint_positions, row.joint_std, index=index) for index, row in chosen
+        ExportFrame(row.frame_id, row.source, row.joint_positions, row.joint_std, row.verdict, index=index)
+        for index, row in chosen
     ]

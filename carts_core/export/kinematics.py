@@ -1,6 +1,7 @@
 """Corrected kinematics as CSV: a row per frame, a column `source`, and `ARM.JOINT` for every joint [rad, m].
 
-Where standard deviations are known, a column `ARM.JOINT.std` [rad, m] follows for every joint.
+Where standard deviations are known, a column `ARM.JOINT.std` [rad, m] follows for every joint. Where a frame has a
+verdict, the last column is `verdict`.
 """
 
 import csv
@@ -30,6 +31,8 @@ class KinematicsRow:
     """Arm name -> [dofs], [rad, m]."""
     joint_std: Mapping[str, np.ndarray] | None = None
     """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, where not known."""
+    verdict: str | None = None
+    """How far the values can be relied on: good, doubtful or failed; None where nobody said."""
 
 
 def joint_columns(scene: Scene) -> list[str]:
@@ -57,15 +60,14 @@ def std_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
 def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
     """The table as text; the columns of standard deviations are there when a row has one."""
     rows = list(rows)
-    with_std = any(row.joint_std is not None for row in rows)
+    with_std, with_verdict = any(row.joint_std is not None for row in rows), any(row.verdict for row in rows)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(_header(scene, with_std))
+    table.writerow(_header(scene, with_std, with_verdict))
     for row in rows:
         values = [position_values(scene, row), *([std_values(scene, row)] if with_std else [])]
-        table.writerow(
-            [csv_cell(row.frame_id), csv_cell(row.source), *(f"{value:.9g}" for value in np.concatenate(values))]
-        )
+        numbers, verdict = np.concatenate(values), [csv_cell(row.verdict or "")] if with_verdict else []
+        table.writerow([csv_cell(row.frame_id), csv_cell(row.source), *(f"{value:.9g}" for value in numbers), *verdict])
     return text.getvalue()
 
 
@@ -81,28 +83,30 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
         raise SequenceError(f"{path} is not a readable kinematics table: {error}.") from error
 
 
-def _header(scene: Scene, with_std: bool) -> list[str]:
+def _header(scene: Scene, with_std: bool, with_verdict: bool = False) -> list[str]:
     columns = joint_columns(scene)
     further = [f"{column}.std" for column in columns] if with_std else []
-    return ["frame", "source", *map(csv_cell, [*columns, *further])]
+    return ["frame", "source", *map(csv_cell, [*columns, *further]), *(["verdict"] if with_verdict else [])]
 
 
 def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
     with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8", newline="") as file:
         table = csv.reader(file)
         header = next(table, [])
-        with_std = header == _header(scene, True)
-        if not with_std and header != _header(scene, False):
+        with_verdict = header[-1:] == ["verdict"]
+        with_std = header == _header(scene, True, with_verdict)
+        if not with_std and header != _header(scene, False, with_verdict):
             found, wanted = ", ".join(header), ", ".join(_header(scene, False))
             raise SequenceError(f"{path} has columns {shortened(found, 1000)}; expected are {wanted}. Remove it.")
         rows = []
         for line, cells in enumerate(table, start=2):
             try:
-                values = np.array([float(cell) for cell in cells[2:]])
+                values = np.array([float(cell) for cell in cells[2 : len(header) - with_verdict]])
             except ValueError:
                 values = np.empty(0)
-            if len(cells) != len(header) or len(values) != len(header) - 2:
-                raise SequenceError(f"{path}, line {line}: not {len(header) - 2} numbers. Remove the line.")
+            if len(cells) != len(header) or len(values) != len(header) - 2 - with_verdict:
+                wanted = len(header) - 2 - with_verdict
+                raise SequenceError(f"{path}, line {line}: not {wanted} numbers. Remove the line.")
             if not np.isfinite(values[: len(joint_columns(scene))]).all():
                 raise SequenceError(f"{path}, line {line}: a joint position is not finite. Remove the line.")
             positions, std = np.split(values, [len(joint_columns(scene))])
@@ -112,6 +116,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
                     text_of_cell(cells[1]),
                     _by_arm(scene, positions),
                     _by_arm(scene, std) if with_std else None,
+                    (text_of_cell(cells[-1]) or None) if with_verdict else None,
                 )
             )
     return rows

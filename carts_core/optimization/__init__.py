@@ -7,7 +7,6 @@ from ..settings import FreeParameters as FreeParameters
 from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
-from .assessing import assess_estimate as assess_estimate
 from .base_frame_gain import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
@@ -30,6 +29,7 @@ from .sequence_estimate import Origin as Origin
 from .verdict import Assessment as Assessment
 from .verdict import Evidence as Evidence
 from .verdict import Verdict as Verdict
+from .verdict_of_many import SequenceAssessment as SequenceAssessment
 
 __all__ = [
     "BASE_FRAME_GAIN",
@@ -51,6 +51,7 @@ __all__ = [
     "NetworkPredictor",
     "Origin",
     "Progress",
+    "SequenceAssessment",
     "SequenceOptimizer",
     "SequenceSettings",
     "SolverSettings",
@@ -59,6 +60,5 @@ __all__ = [
     "SurfaceSolver",
     "UnknownChange",
     "Verdict",
-    "assess_estimate",
     "propose_ignore",
 ]

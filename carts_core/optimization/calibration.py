@@ -21,6 +21,8 @@ from .frame import Progress
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
 from .variables import Variables
+from .verdict import Assessment, Verdict
+from .verdict_of_many import assess_calibration, worse_in
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class CalibrationResult:
     frame_weights: Float[np.ndarray, " frames"]
     """How far each frame counted, in [0, 1]."""
     stop_reason: StopReason
+    assessment: Assessment | None
+    """How far it can be relied on; None where the run was stopped before its end."""
 
 
 class CalibrationOptimizer:
@@ -119,12 +123,15 @@ class CalibrationOptimizer:
         self._problem = CalibrationProblem(self._scene, frames, predictor, self.free, settings, joint_prior_deg, ignore)
         self.variables = self._problem.variables
         self._fit = Fit(self._problem, torch.zeros_like(self.variables.lower), settings.iterations)
-        self._points = run_stages(settings.stages, self._fit)
+        self._points = self._judged(run_stages(settings.stages, self._fit))
         self._stages = sum(isinstance(stage, Descend) for stage in settings.stages)
         self._best_point: Point | None = None
         self.history: list[Progress] = []
         self.best: CalibrationIterate | None = None
         self.stop_reason: StopReason | None = None
+        self.assessment: Assessment | None = None
+        """At the end, how far the result can be relied on. What failed keeps the start, and so does what fits worse
+        than the start by any measure."""
 
     def cancel(self) -> None:
         """Stop; what was reached stays in `best` and `history`."""
@@ -160,6 +167,26 @@ class CalibrationOptimizer:
             self.best, self._best_point = iterate, point
         return iterate
 
+    def _judged(self, points: Iterator[Point]) -> Iterator[Point]:
+        """The points of the stages, and the start where the images contradict what they end with."""
+        yield from points
+        last, problem = self._best_point, self._problem
+        if last is None or problem.present is None:
+            return
+        start = torch.zeros_like(last.offsets)
+        before, after = problem.evidence(start), problem.evidence(last.offsets)
+        self.assessment = assess_calibration(after)
+        if not bool(last.offsets.any()):
+            return
+        failed = self.assessment.verdict is Verdict.FAILED
+        if not failed and not worse_in(before, after):
+            return
+        if not failed:
+            self.assessment = assess_calibration(before)
+        self._fit.offsets = start
+        self._fit.stop_reason = StopReason.FAILED if failed else StopReason.START_KEPT
+        yield replace(self._fit.evaluate(problem.present), epoch=(*last.epoch, "start"))
+
     def __iter__(self) -> Iterator[CalibrationIterate]:
         """Step until the optimization stops."""
         while (iterate := self.step()) is not None:
@@ -182,6 +209,7 @@ class CalibrationOptimizer:
             frame_losses_after=self._problem.frame_losses(offsets),
             frame_weights=evaluation.frame_weights.numpy().copy(),
             stop_reason=self.stop_reason or StopReason.CANCELLED,
+            assessment=self.assessment,
         )
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..model.scene import Scene
 from ..recording import Frame
+from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe
 from .elimination import Eliminated, eliminate
@@ -24,12 +25,17 @@ from .factors import Prior
 from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
 from .variables import Variables
+from .verdict import Evidence
 
 Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]
 """Per frame: camera name -> pixels that show an occluder."""
 
 _GOOD = 1.5
 """A frame whose loss is at most this many times the median counts in full, and less beyond it [1]."""
+
+
+_ASSESSED = 12
+"""Most frames that a calibration is assessed by."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +176,13 @@ class CalibrationProblem:
             part.evaluate(offsets, torch.zeros_like(part.own), self.present, gradient=False) for part in self._parts
         ]
         return np.array([evaluation.loss for evaluation in at_measured])
+
+    def evidence(self, offsets: Float[Tensor, " n"]) -> list[Evidence]:
+        """What the images of some frames, evenly spread, say of a calibration with joints as measured."""
+        losses = self.frame_losses(offsets)
+        chosen = spread(len(self._parts), _ASSESSED)
+        parts = [(self._parts[index], float(losses[index])) for index in chosen]
+        return [part.problem.evidence(torch.cat([torch.zeros_like(part.own), offsets]), loss) for part, loss in parts]
 
     def _combined(
         self, offsets: Tensor, evaluations: list[Evaluation], models: list[Eliminated]

@@ -25,7 +25,7 @@ from .observability import Uncertainty
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
 from .variables import Variables
-from .verdict import Assessment, Verdict, assess, evidence
+from .verdict import Assessment, Verdict, assess
 
 
 @dataclass(frozen=True)
@@ -193,8 +193,7 @@ class FrameOptimizer:
 
     def _assess(self, problem: FrameProblem, point: Point) -> Assessment:
         """The verdict on a point."""
-        start, end = (self._variables.state(at) for at in (torch.zeros_like(point.offsets), point.offsets))
-        return assess(evidence(problem.images(1.0), start, end, problem.predictor, point.evaluation.loss))
+        return assess(problem.evidence(point.offsets, point.evaluation.loss))
 
     def _improves(self, point: Point) -> bool:
         """Whether a point replaces the best one: it is better, or the two do not compare because it knows more."""

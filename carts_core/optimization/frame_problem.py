@@ -24,6 +24,7 @@ from .observability import uncertainty
 from .observation import Observation, observe
 from .predictor import SurfacePredictor
 from .variables import Variables
+from .verdict import Evidence, evidence
 
 _SHOWN_BLUR = 1.6
 """Iterates that somebody watches are compared under a blur of at most this [px of the working image]."""
@@ -189,6 +190,11 @@ class FrameProblem:
             similarity=paste(final.similarity, torch.ones_like(empty)),
             attention=paste(final.trust, empty),
         )
+
+    def evidence(self, offsets: Float[Tensor, " n"], loss: float) -> Evidence:
+        """What the images say for and against a point whose loss is known."""
+        start, end = (self.variables.state(at) for at in (self.start, offsets))
+        return evidence(self.images(1.0), start, end, self.predictor, loss)
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
         """The cost per pixel of the arms, as rendered and as observed.

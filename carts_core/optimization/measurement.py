@@ -22,6 +22,7 @@ from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
 from .stages import run_stages
 from .variables import Variables
+from .verdict import Evidence
 
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
@@ -39,6 +40,10 @@ class Measurement:
     """Of the image alone, linearized there, and scaled for the correlation of neighbouring pixels."""
     loss: float
     iterations: int
+
+    def left_out(self) -> "Measurement":
+        """Without the information of its image."""
+        return replace(self, information=Information.nothing(len(self.correction)))
 
 
 class FrameSolver:
@@ -104,6 +109,11 @@ class FrameSolver:
             problem.observe(first_observe(COMPARE), offsets)
             found.append(problem.evaluate(offsets, FINEST, gradient=False).stage_loss)
         return found
+
+    def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
+        """What the images say for and against a correction [n] whose loss is known."""
+        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        return self._problem(frame, variables, None).evidence(offsets, loss)
 
     def _problem(self, frame: Frame, variables: Variables, prior: Prior | None) -> FrameProblem:
         return FrameProblem(

@@ -13,6 +13,7 @@ from ..recording import Frame
 from .error_model import Gaussian, Information
 from .measurement import FrameSolver, Measurement
 from .variables import Variables
+from .verdict import Evidence
 
 
 def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
@@ -22,7 +23,7 @@ def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
         path: the file.
         made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
     """
-    return Checkpoint(path, made_with, (Measurement, Information))
+    return Checkpoint(path, made_with, (Measurement, Information, Evidence))
 
 
 class ResumableFrameSolver(FrameSolver):
@@ -55,6 +56,11 @@ class ResumableFrameSolver(FrameSolver):
         """As `FrameSolver.losses`."""
         key = _key("losses", frame, *corrections)
         return self._checkpoint.value(key, lambda: self._solver.losses(frame, variables, corrections))
+
+    def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
+        """As `FrameSolver.evidence`."""
+        key = _key("evidence", frame, correction, loss)
+        return self._checkpoint.value(key, lambda: self._solver.evidence(frame, variables, correction, loss))
 
 
 def _key(method: str, frame: Frame, *arguments: Any) -> str:

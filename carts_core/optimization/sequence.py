@@ -23,8 +23,10 @@ from .measurement import FrameSolver, Ignore, Measurement
 from .predictor import SurfacePredictor, predictor_of
 from .resumable import ResumableFrameSolver
 from .sequence_estimate import FrameEstimate, Origin, Visit
+from .sequence_verdict import assessed_estimates, assessed_sequence
 from .smoother import Smoother
 from .variables import Variables
+from .verdict_of_many import SequenceAssessment
 from .visiting_order import visiting_gaps
 
 _CONTRADICTS = 9.0
@@ -37,7 +39,8 @@ class SequenceOptimizer:
     A few frames, evenly spread, are solved alone first, and what suits all of them best is where the first frame
     starts. A later frame starts at the correction that the frames before it let expect, and is held there as firmly as
     they know it. After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what
-    came of it is visited again. Frames in `keyframes` stay exactly as given, and everything else follows them.
+    came of it is visited again. In the end all estimates are assessed; where the sequence failed, frames that did so
+    too keep their measured values. Frames in `keyframes` stay exactly as given, and everything else follows them.
 
     Args:
         scene: arms and cameras.
@@ -111,7 +114,10 @@ class SequenceOptimizer:
         self._visits: dict[int, Visit] = {}
         self._revisits: list[tuple[int, Gaussian]] | None = None
         self._estimates: dict[int, FrameEstimate] | None = None
+        self._judging: Iterator[FrameEstimate] | None = None
         self.stop_reason: str | None = None
+        self.assessment: SequenceAssessment | None = None
+        """How far all frames together can be relied on; None before the end."""
 
     @property
     def progress(self) -> tuple[int, int]:
@@ -167,6 +173,14 @@ class SequenceOptimizer:
             self._revisits = self._contradicted()
         if self._revisits:
             return self._visit_again(*self._revisits.pop())
+        if self._judging is None:
+            self._judging = assessed_estimates(self.estimates, self._smoother.smoothed(), self._solver, self._open)
+        if (judged := next(self._judging, None)) is not None:
+            self._estimates = self.estimates | {judged.index: judged}
+            return judged
+        self.assessment, self._estimates = assessed_sequence(
+            self.estimates, self._visits, self._scene, self._prior, bool(self._keyframes)
+        )
         self.stop_reason = "finished"
         return None
 
@@ -201,7 +215,7 @@ class SequenceOptimizer:
             if self._visits and measurement.information.mahalanobis(expected) > _CONTRADICTS:
                 # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
                 if lost:
-                    start, measurement = Origin.CARRIED, _left_out(measurement)
+                    start, measurement = Origin.CARRIED, measurement.left_out()
                 else:
                     self._smoother.restart(index)
         seconds = time.perf_counter() - began
@@ -263,7 +277,7 @@ class SequenceOptimizer:
         measurement = self._solver.warm(frame, variables, expected, expected.mean)
         start = Origin.WARM
         if measurement.information.mahalanobis(expected) > _CONTRADICTS:
-            start, measurement = Origin.CARRIED, _left_out(measurement)
+            start, measurement = Origin.CARRIED, measurement.left_out()
         measurement = replace(measurement, iterations=earlier.measurement.iterations + measurement.iterations)
         seconds = earlier.seconds + time.perf_counter() - began
         visit = self._visits[index] = Visit(frame.frame_id, variables, measurement, start, seconds)
@@ -283,8 +297,3 @@ class SequenceOptimizer:
             joint_positions={arm.name: given[arm.name].copy() for arm in self._scene.arms},
             joint_std={arm.name: np.zeros_like(given[arm.name]) for arm in self._scene.arms},
         )
-
-
-def _left_out(measurement: Measurement) -> Measurement:
-    """Without the information of its image."""
-    return replace(measurement, information=Information.nothing(len(measurement.correction)))

@@ -12,6 +12,7 @@ from .error_model import Gaussian
 from .measurement import Measurement
 from .observability import Uncertainty
 from .variables import Variables
+from .verdict import Assessment
 
 
 class Origin(StrEnum):
@@ -25,6 +26,8 @@ class Origin(StrEnum):
     """A person."""
     CARRIED = "carried"
     """The other frames alone: the image contradicts them and is left out."""
+    MEASURED = "measured"
+    """Nobody: the sequence failed, and so did this frame of it."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ class FrameEstimate:
     """Steps of the optimization, over all visits."""
     seconds: float
     """Time spent on the frame, reading included, over all visits [s]."""
+    assessment: Assessment | None = None
+    """How far it can be relied on; None before all frames were visited."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,10 @@ class Evidence:
     """Share of the rendered arms that differs from the mean background; None where that is not known [1]."""
     overlap_with_change: float | None
     """Overlap (soft Dice) of what is rendered and what differs from the mean background, near the arms [1]."""
+    still_in_view: float = 1.0
+    """Of the arms in view at the start, the smallest share that one of them still has of its area then [1]."""
+    masked: bool = False
+    """Whether what is called predicted are given masks, which count in the whole image."""
 
 
 @torch.no_grad()
@@ -59,9 +63,12 @@ def evidence(
     """
     before, maps = (images.renderer.surface_maps(state) for state in (start, end))
     covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
-    window = Window.around(covered.sum(1), round(_MARGIN * images.scale), predictor.stride, images.size)
+    margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
+    window = Window.around(covered.sum(1), margin, predictor.stride, images.size)
     rendered, weight = window.of(covered), window.of(images.weight)
-    near = attention((rendered > 0).to(rendered), round(_NEAR * images.scale)) * weight
+    near = weight
+    if not predictor.masked:
+        near = attention((rendered > 0).to(rendered), round(_NEAR * images.scale)) * weight
     conditioned, alone = (
         predictor.predict(images.images, given, window)[:, COVERAGE].sum(1, keepdim=True) * near
         for given in (maps, torch.zeros_like(maps))
@@ -78,7 +85,19 @@ def evidence(
         predicted=_share(alone, rendered),
         changed=None if changed is None else _share(changed, rendered),
         overlap_with_change=None if changed is None else _overlap(rendered, changed),
+        still_in_view=_still_in_view(images, start, end),
+        masked=predictor.masked,
     )
+
+
+def _still_in_view(images: FrameImages, start: SceneState, end: SceneState) -> float:
+    """See `Evidence.still_in_view`."""
+    before, after = (images.renderer.segment(state) for state in (start, end))
+    shares = [1.0]
+    for arm in range(len(start.joint_positions)):
+        if (was := int((before == arm).sum())) >= _OUT_OF_VIEW * before.size:
+            shares.append(int((after == arm).sum()) / was)
+    return min(shares)
 
 
 def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:
@@ -137,12 +156,19 @@ _WITH_CHANGE = (8.427, 6.783, 2.379, -4.861, -3.073, -5.614)
 """Bias, and weights of loss, residual, agreement, unconditioned (and overlap with change) in the log odds of a failure:
 logistic regressions over frames of known truth, none of them held out."""
 
+_MASK_MIDDLE, _MASK_SLOPE = 0.8, 22.0
+"""Overlap with a given mask at which a fit is as likely right as wrong, and how fast the log odds fall beyond it: it is
+good from 0.9 on, since the mask is what is wanted, and doubtful below, since a mask may have holes."""
+
 _POSSIBLE, _LIKELY = 0.1, 0.5
 """Probability of failure from which a fit is doubtful, and from which it has failed [1]."""
 
 _OUT_OF_VIEW, _UNSEEN, _AT_RANDOM = 5e-4, 0.05, 0.5
 """Share of the images below which no arm is in view, share of an arm below which nothing of it is predicted, and
 agreement below which a prediction says nothing of the fit [1]."""
+
+_LEFT = 0.3
+"""Share of its area at the start below which an arm has left the image [1]."""
 
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
@@ -160,6 +186,11 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
         "Check that the image shows them (not black, not covered) and that it belongs to these kinematics.",
     ),
     (
+        lambda found: found.still_in_view < _LEFT,
+        "An arm that was in view at the start has left the image.",
+        "Set it roughly by hand and run again, or check T_camera_world and T_world_base.",
+    ),
+    (
         lambda found: found.changed is not None and found.changed < _UNSEEN,
         "The image does not differ from the empty background where the arms should be.",
         "Check that the image shows the arms and belongs to these kinematics, or leave the frame out.",
@@ -172,6 +203,8 @@ _REMEDY_FAILED = "Set the arm roughly by hand and run again, check the calibrati
 
 def _weakest(found: Evidence) -> str:
     """What speaks most against a fit, in words."""
+    if found.masked:
+        return "what is rendered and the given mask differ."
     against = {
         "what the network predicts lies elsewhere.": found.agreement,
         "without the fit as a hint, the network predicts something else.": found.unconditioned,
@@ -182,6 +215,8 @@ def _weakest(found: Evidence) -> str:
 
 
 def _probability_of_failure(found: Evidence) -> float:
+    if found.masked:
+        return 1.0 / (1.0 + math.exp(_MASK_SLOPE * (found.agreement - _MASK_MIDDLE)))
     values = [found.loss, found.residual, found.agreement, found.unconditioned]
     bias, *weights = _WITHOUT_CHANGE
     if found.overlap_with_change is not None:

@@ -46,6 +46,20 @@ def test_csv_has_no_columns_of_deviations_that_nobody_knows(dataset: Dataset) ->
     assert header == ["frame", "source", *joint_columns(dataset.scene)]
 
 
+@pytest.mark.parametrize("with_std", [True, False])
+def test_verdicts_come_back_with_the_kinematics(dataset: Dataset, tmp_path: Path, with_std: bool) -> None:
+    verdicts = ["good", None, "failed"]
+    rows = [
+        replace(frame, verdict=verdict, joint_std=frame.joint_std if with_std else None)
+        for frame, verdict in zip(dataset.frames, verdicts, strict=True)
+    ]
+    path = tmp_path / "table.csv"
+    path.write_text(kinematics_csv(dataset.scene, rows), encoding="utf-8")
+    found = read_kinematics_csv(path, dataset.scene)
+    assert [row.verdict for row in found] == verdicts
+    assert kinematics_csv(dataset.scene, found) == kinematics_csv(dataset.scene, rows)
+
+
 @pytest.mark.parametrize("text", ["frame,a\n1,2\n", "", "\udcff"])
 def test_a_table_of_something_else_is_refused(dataset: Dataset, tmp_path: Path, text: str) -> None:
     path = tmp_path / "table.csv"

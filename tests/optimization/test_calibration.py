@@ -20,6 +20,8 @@ from carts_core.optimization import (
     DescentSolver,
     FreeParameters,
     ImagePredictor,
+    StopReason,
+    Verdict,
 )
 from carts_core.optimization.calibration import with_fixed_gauge
 from carts_core.optimization.calibration_problem import frame_weights
@@ -125,6 +127,23 @@ def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
     assert result.stop_reason == "converged" and len(optimizer.history) == optimizer.history[-1].index + 1
     for unknown in result.unknowns:
         assert 0 < unknown.deviation <= unknown.prior_deviation * (1 + 1e-6)
+
+
+def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start(
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+) -> None:
+    wrong = with_wrong_base(sequence.scene)
+    right = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
+    list(right)
+    assert right.assessment is not None and right.assessment.verdict is Verdict.GOOD
+    # Every image belongs to the kinematics of another frame.
+    predictor.maps = [maps.flip(-1) for maps in predictor.maps]
+    failed = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
+    list(failed)
+    result = failed.result()
+    assert result.assessment is not None and result.assessment.verdict is Verdict.FAILED and result.assessment.remedy
+    assert result.stop_reason is StopReason.FAILED
+    assert np.array_equal(result.scene.arms[0].T_world_base, wrong.arms[0].T_world_base)
 
 
 def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(

@@ -1,0 +1,57 @@
+"""How far the estimates of a sequence can be relied on, and what becomes of those that failed."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+
+from ..model.scene import Scene
+from ..recording import Frame
+from .error_model import Gaussian
+from .measurement import FrameSolver
+from .sequence_estimate import FrameEstimate, Origin, Visit
+from .variables import Variables
+from .verdict import Verdict, assess
+from .verdict_of_many import SequenceAssessment, assess_sequence
+
+
+def assessed_estimates(
+    estimates: Mapping[int, FrameEstimate],
+    corrections: Mapping[int, Gaussian],
+    solver: FrameSolver,
+    opened: Callable[[int], tuple[Frame, Variables]],
+) -> Iterator[FrameEstimate]:
+    """Estimates with their assessments.
+
+    Args:
+        estimates: position -> final estimate.
+        corrections: position -> the correction of the measured values that it is.
+        solver: that knows the images.
+        opened: gives the frame at a position, and its unknowns.
+    """
+    for index, estimate in estimates.items():
+        began = time.perf_counter()
+        frame, variables = opened(index)
+        found = assess(solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
+        yield replace(estimate, assessment=found, seconds=estimate.seconds + time.perf_counter() - began)
+
+
+def assessed_sequence(
+    estimates: Mapping[int, FrameEstimate], visits: Mapping[int, Visit], scene: Scene, prior: Gaussian, keyframes: bool
+) -> tuple[SequenceAssessment, dict[int, FrameEstimate]]:
+    """The verdict on the whole, and all estimates; where it has failed, frames that failed keep their measured values.
+
+    Args:
+        estimates: position -> assessed estimate; at least one.
+        visits: what is kept of the frames.
+        scene: of the sequence.
+        prior: what is expected of a correction before any image.
+        keyframes: whether a person set some; that counts more than the images, and all estimates stay.
+    """
+    found = {index: estimate.assessment for index, estimate in estimates.items() if estimate.assessment is not None}
+    whole, kept = assess_sequence(list(found.values())), dict(estimates)
+    if whole.verdict is Verdict.FAILED and not keyframes:
+        for index, assessment in found.items():
+            if assessment.verdict is Verdict.FAILED:
+                measured = replace(visits[index], start=Origin.MEASURED).estimate(scene, index, prior, prior)
+                kept[index] = replace(measured, assessment=assessment, seconds=estimates[index].seconds)
+    return whole, kept

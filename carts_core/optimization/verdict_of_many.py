@@ -1,0 +1,103 @@
+"""Whether a sequence or a calibration can be relied on, from what each of its frames says."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from .verdict import Assessment, Evidence, Verdict, assess
+
+_MANY, _MOST = 0.1, 0.5
+"""Share of frames not to be relied on from which a sequence is doubtful, and share of failed ones from which it has
+failed [1]."""
+
+_CLEARLY = 2.0
+"""Standard errors of a mean difference beyond which it is none of chance."""
+
+_BETTER_HIGHER = ("agreement", "unconditioned", "overlap_with_change")
+_BETTER_LOWER = ("residual", "loss")
+
+_CALIBRATION_REMEDY = (
+    "Check that robot, camera and joints are those of the images, start from a pose that is nearer, or give masks "
+    "(--observe masks)."
+)
+
+
+@dataclass(frozen=True)
+class SequenceAssessment:
+    """A verdict on frames that were corrected together."""
+
+    verdict: Verdict
+    reason: str
+    """One sentence for people."""
+    remedy: str
+    """What to try, one sentence; empty where nothing has to be."""
+    probability: float
+    """Mean of the frames' probabilities that their masks are wrong [1]."""
+    counts: Mapping[str, int]
+    """Verdict -> frames."""
+
+
+def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
+    """The verdict on a sequence of at least one frame.
+
+    Args:
+        frames: the verdicts on its frames.
+    """
+    counts = Counter(frame.verdict for frame in frames)
+    named = {verdict.value: counts[verdict] for verdict in Verdict}
+    probability = float(np.mean([frame.probability for frame in frames]))
+    against = Counter((frame.reason, frame.remedy) for frame in frames if frame.verdict is not Verdict.GOOD)
+    share = len(frames) - counts[Verdict.GOOD]
+    if counts[Verdict.FAILED] >= _MOST * len(frames):
+        verdict = Verdict.FAILED
+    elif share > _MANY * len(frames):
+        verdict = Verdict.DOUBTFUL
+    else:
+        return SequenceAssessment(Verdict.GOOD, "The images support the fit.", "", probability, named)
+    (reason, remedy), _ = against.most_common(1)[0]
+    told = f"{share} of {len(frames)} frames are not to be relied on, most of them for this: {reason}"
+    return SequenceAssessment(verdict, told, remedy, probability, named)
+
+
+def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
+    """The verdict on a calibration, from the mean evidence of its frames, with joints as measured.
+
+    Args:
+        frames: the evidence of each; at least one.
+    """
+    found = assess(mean_evidence(frames))
+    if found.verdict is Verdict.GOOD:
+        return replace(found, reason="The images support the calibration.")
+    reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")
+    reason = reason.replace("The image supports the fit only", "The images support the calibration only")
+    return replace(found, reason=reason, remedy=found.remedy if found.nothing_there else _CALIBRATION_REMEDY)
+
+
+def mean_evidence(frames: Sequence[Evidence]) -> Evidence:
+    """Mean over frames; what one of them does not know is left out."""
+    values = {}
+    for field in fields(Evidence):
+        known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
+        values[field.name] = float(np.mean(known)) if len(known) == len(frames) else None
+    return Evidence(**values | {"masked": all(frame.masked for frame in frames)})
+
+
+def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]:
+    """What measures say that frames fit worse than before, beyond chance; their names.
+
+    Args:
+        before, after: of the same frames, in the same order.
+    """
+    found = []
+    for names, sign in ((_BETTER_HIGHER, -1.0), (_BETTER_LOWER, 1.0)):
+        for name in names:
+            pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(before, after, strict=True)]
+            if any(None in pair for pair in pairs):
+                continue
+            rise = sign * np.array([new - old for old, new in pairs])
+            error = rise.std(ddof=1) / np.sqrt(len(rise)) if len(rise) > 1 else 0.0
+            if rise.mean() > max(_CLEARLY * error, 1e-6):
+                found.append(name)
+    return found

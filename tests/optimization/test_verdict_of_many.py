@@ -1,0 +1,80 @@
+"""What many frames together are said to be worth."""
+
+from dataclasses import replace
+
+import pytest
+
+from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_counts
+from carts_core.optimization import Assessment, Evidence, StopReason, Verdict
+from carts_core.optimization.verdict import assess
+from carts_core.optimization.verdict_of_many import assess_calibration, assess_sequence, mean_evidence, worse_in
+
+RIGHT = Evidence(
+    area=0.05,
+    start_area=0.05,
+    loss=0.01,
+    residual=0.05,
+    agreement=0.95,
+    unconditioned=0.93,
+    predicted=0.95,
+    changed=None,
+    overlap_with_change=None,
+)
+WRONG = replace(RIGHT, loss=0.2, residual=0.8, agreement=0.4, unconditioned=0.1, predicted=0.1)
+
+
+def verdicts(right: int, wrong: int) -> list[Assessment]:
+    return [assess(RIGHT)] * right + [assess(WRONG)] * wrong
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "wanted"),
+    [(20, 0, Verdict.GOOD), (19, 1, Verdict.GOOD), (15, 5, Verdict.DOUBTFUL), (10, 10, Verdict.FAILED)],
+)
+def test_a_sequence_is_as_good_as_most_of_its_frames(right: int, wrong: int, wanted: Verdict) -> None:
+    found = assess_sequence(verdicts(right, wrong))
+    assert found.verdict is wanted and found.counts == {"good": right, "doubtful": 0, "failed": wrong}
+    assert (sequence_hint("left", found) is None) == (wanted is Verdict.GOOD)
+
+
+def test_the_verdict_on_a_sequence_names_the_reason_of_most_frames_and_what_to_try() -> None:
+    unseen = assess(replace(RIGHT, start_area=0.0))
+    found = assess_sequence([unseen] * 3 + verdicts(2, 1))
+    assert unseen.reason in found.reason and found.remedy == unseen.remedy
+    hint = sequence_hint("left", found)
+    assert hint is not None and "keep the measured values" in hint
+
+
+def test_an_arm_that_has_left_the_image_makes_a_fit_fail_however_well_the_others_fit() -> None:
+    found = assess(replace(RIGHT, still_in_view=0.1))
+    assert found.verdict is Verdict.FAILED and "left the image" in found.reason and found.remedy
+
+
+def test_a_calibration_is_judged_by_the_mean_of_its_frames() -> None:
+    good, failed = assess_calibration([RIGHT] * 5), assess_calibration([WRONG] * 5)
+    assert good.verdict is Verdict.GOOD and good.reason == "The images support the calibration."
+    assert failed.verdict is Verdict.FAILED and "calibration" in failed.reason and "--observe masks" in failed.remedy
+    assert "kept as it was" in (calibration_hint(failed, StopReason.FAILED) or "")
+    assert mean_evidence([RIGHT, WRONG]).agreement == pytest.approx(0.675)
+
+
+def test_what_is_worse_beyond_chance_is_named() -> None:
+    before = [replace(RIGHT, agreement=0.95 + 0.001 * i) for i in range(6)]
+    assert worse_in(before, before) == []
+    lower = [replace(found, agreement=found.agreement - 0.01) for found in before]
+    assert worse_in(before, lower) == ["agreement"] and worse_in(lower, before) == []
+    uneven = [replace(f, residual=f.residual + (0.3 if i == 0 else -0.05)) for i, f in enumerate(before)]
+    assert worse_in(before, uneven) == []
+
+
+@pytest.mark.parametrize(
+    ("agreement", "wanted"), [(0.97, Verdict.GOOD), (0.85, Verdict.DOUBTFUL), (0.6, Verdict.FAILED)]
+)
+def test_where_masks_are_fitted_the_overlap_with_them_decides(agreement: float, wanted: Verdict) -> None:
+    assert assess(replace(RIGHT, masked=True, agreement=agreement)).verdict is wanted
+
+
+def test_an_evaluation_counts_its_verdicts_where_not_all_are_good() -> None:
+    assert verdict_counts("left", ["good", None]) is None
+    said = verdict_counts("left", ["good", "failed", "good"])
+    assert said is not None and "2 good, 0 doubtful, 1 failed" in said
