@@ -2,9 +2,12 @@
 
 import os
 import signal
+import sys
+import sysconfig
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -22,6 +25,23 @@ class Stopped(KeyboardInterrupt):
         self.number = number
 
 
+_NEVER_CUT = (
+    *("importlib.", "_frozen_importlib", "llvmlite.", "numba.", "weakref", "_weakref"),
+    "carts_core.project.database",
+)
+"""Modules, by the beginning of their names, in which no exception may be raised from outside.
+
+Numba loads kernels through LLVM, and a project is opened through SQLite, which call back into Python: an exception
+there is lost, and LLVM ends the process with SIGSEGV. In finalizers it is lost, too. A half imported module is useless.
+"""
+_OURS = ("carts_core", "carts_viewer")
+_INSTALLED = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")))
+_PATIENCE = 2.0
+"""How long a stop waits for a moment when no library is at work, which could take it for an error of its own [s]."""
+_AGAIN = 0.02
+"""After how long a signal that has to wait comes again [s]."""
+
+
 class _Unfinished:
     """How many blocks have to be finished first, and the signal that waits for them."""
 
@@ -33,24 +53,32 @@ class _Unfinished:
 def stopped_by_signals() -> Iterator[None]:
     """Have SIGTERM and SIGHUP, as Ctrl-C, raise `Stopped` in the main thread while the block runs.
 
-    A signal that is ignored stays so, as SIGHUP is under `nohup`. Child processes get the system's own handling.
+    One that comes while a library is at work waits for its end, two seconds at most; one that comes while a module is
+    imported, a kernel is loaded or an object is finalized waits for that however long it takes. A signal that is
+    ignored stays so, as SIGHUP is under `nohup`. Child processes get the system's own handling.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     taken = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
-    owner = os.getpid()
+    owner, repeated, since = os.getpid(), _Repeated(), None
+    # The context manager's frame, that of contextlib, and the one that runs the block.
+    begin = sys._getframe(2)
 
     def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal since
+        since = since or time.monotonic()
         if os.getpid() != owner:
             # A forked child, which is to end as one that never heard of this.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         elif _Unfinished.blocks:
             _Unfinished.waiting = number
-        else:
+        elif _may_be_cut(frame, begin) and (_is_ours(frame) or time.monotonic() - since > _PATIENCE):
             raise Stopped(number)
+        else:
+            repeated.send(number)
 
     for number in taken:
         signal.signal(number, stop)
@@ -60,6 +88,53 @@ def stopped_by_signals() -> Iterator[None]:
         _Unfinished.waiting = None
         for number in taken:
             signal.signal(number, before[number])
+        repeated.end()
+
+
+class _Repeated:
+    """Sends signals to this process a moment later, until the end of the block that they are for."""
+
+    def __init__(self) -> None:
+        self._lock, self._over = threading.Lock(), False
+        # A handler may run between any two instructions, where it must not wait for a lock; writing a byte it may.
+        self._asked, self._ask = os.pipe()
+        os.set_blocking(self._ask, False)
+        threading.Thread(target=self._work, name="carts-signals", daemon=True).start()
+
+    def send(self, number: int) -> None:
+        with suppress(BlockingIOError):
+            os.write(self._ask, bytes([number]))
+
+    def end(self) -> None:
+        with self._lock:
+            self._over = True
+        os.close(self._ask)
+
+    def _work(self) -> None:
+        while number := os.read(self._asked, 1):
+            time.sleep(_AGAIN)
+            with self._lock:
+                if not self._over:
+                    os.kill(os.getpid(), number[0])
+        os.close(self._asked)
+
+
+def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
+    """Whether an exception may be raised in a frame; what called the frame `begin` does not count."""
+    while frame is not None and frame is not begin:
+        module = frame.f_globals.get("__name__") or ""
+        if frame.f_code.co_name == "__del__" or module.startswith(_NEVER_CUT):
+            return False
+        frame = frame.f_back
+    return True
+
+
+def _is_ours(frame: FrameType | None) -> bool:
+    """Whether a frame runs code of ours, or of who calls us, and none of a library."""
+    if frame is None:
+        return True
+    package = str(frame.f_globals.get("__name__")).partition(".")[0]
+    return package in _OURS or not frame.f_code.co_filename.startswith(_INSTALLED)
 
 
 @contextmanager

@@ -10,9 +10,9 @@ _SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, 
 
 
 class EndRequest:
-    """While entered, these signals end `wait`; before `wait` is reached they are a `KeyboardInterrupt`.
+    """While entered, these signals end `wait`; until `ready` they do as before, or raise `KeyboardInterrupt`.
 
-    After that they do nothing more, so what is being saved is saved. A signal that is ignored (`nohup`) stays so.
+    After that they do nothing else, so what is being saved is saved. A signal that is ignored (`nohup`) stays so.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,11 @@ class EndRequest:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._ready:
-            raise KeyboardInterrupt
+            former = self._former[number]
+            if not callable(former):
+                raise KeyboardInterrupt
+            former(number, frame)
+            return
         try:
             os.write(self._ask, b"x")
         except BlockingIOError:

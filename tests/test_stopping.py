@@ -4,9 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from carts_core.rendering.visibility_numba import rasterize
 from carts_core.stopping import Stopped, exit_status, finished_first, message, stopped_by_signals, when_stopped
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -64,3 +69,85 @@ with stopped_by_signals():
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
     assert (ran.stdout.strip(), ran.stderr) == ("-15", "")
+
+
+_SIGNAL_IN_CALLBACK = """
+import os, signal, sys, time
+from test_stopping import draw
+from carts_core.stopping import stopped_by_signals
+
+def calls(frame, event, argument):
+    if frame.f_code.co_name == "_raw_object_cache_getbuffer":
+        sys.setprofile(None)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+with stopped_by_signals():
+    sys.setprofile(calls)
+    draw()
+    time.sleep(30)
+"""
+
+
+def draw() -> None:
+    """Draw a triangle."""
+    corners = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
+    rasterize(corners, np.array([[0, 1, 2]]), [50.0, 50.0, 20.0, 20.0], 40, 40)
+
+
+def test_a_signal_while_a_kernel_is_loaded_stops_when_it_is_loaded() -> None:
+    # What LLVM calls back cannot raise: the exception is lost, and the process ends with SIGSEGV.
+    draw()
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", _SIGNAL_IN_CALLBACK]
+    ran = subprocess.run(command, check=False, capture_output=True, text=True, timeout=250, env=environment)
+    assert ran.returncode == 1 and ran.stderr.endswith("Stopped: SIGTERM\n"), (ran.returncode, ran.stderr)
+
+
+def test_a_signal_in_an_import_or_a_finalizer_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    send = f"import os\nos.kill(os.getpid(), {int(signal.SIGTERM)})\n"
+    (tmp_path / "imported_while_stopped.py").write_text(send + "whole = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(Stopped), stopped_by_signals():
+        import imported_while_stopped  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
+
+        assert imported_while_stopped.whole
+        time.sleep(30)
+
+    class Finalized:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            sum(range(10))
+
+    with pytest.raises(Stopped), stopped_by_signals():
+        Finalized()
+        time.sleep(30)
+
+
+def test_a_signal_in_a_library_waits_for_its_end_but_not_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    for patience, seconds in ((10.0, 1.0), (0.3, 30.0)):
+        monkeypatch.setattr("carts_core.stopping._PATIENCE", patience)
+        ends = []
+        with pytest.raises(Stopped), stopped_by_signals():
+            timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
+            timer.start()
+            threading.Event().wait(seconds)
+            ends.append(seconds)
+            time.sleep(30)
+        assert ends == ([seconds] if patience > seconds else [])
+
+
+def test_a_signal_that_waits_at_the_end_of_the_block_does_nothing_more(tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nx = 1\n")
+    code = """
+import sys, time
+from carts_core import stopping
+stopping._AGAIN = 0.5
+with stopping.stopped_by_signals():
+    import module
+time.sleep(1.0)
+print(module.x)
+"""
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "1\n", "")

@@ -46,7 +46,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
             _check_free(folder, output, overwrite)
             yield replace(output, names=(*output.names[:-1], staging.name, output.name), draft=key is None)
             _check_free(folder, output, overwrite)
-            _sync_all(staging.descriptor)
+            _sync(staging.descriptor, output.name)
             _move(staging, folder, output.name)
             os.fsync(folder)
             key = None
@@ -110,16 +110,24 @@ def _is_export(folder: int, name: str) -> bool:
         os.close(descriptor)
 
 
-def _sync_all(folder: int) -> None:
-    """Have everything in a folder on disk."""
-    for _, _, files, descriptor in os.fwalk(".", dir_fd=folder):
-        for name in files:
-            file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=descriptor)
-            try:
-                os.fsync(file)
-            finally:
-                os.close(file)
+def _sync(folder: int, name: str) -> None:
+    """Have an output in an open folder, and everything in it, on disk; its name there will not be the final one."""
+    found = status(folder, name)
+    if found is not None and not stat.S_ISDIR(found.st_mode):
+        _sync_file(folder, name)
+        return
+    for _, _, files, descriptor in os.fwalk(name, dir_fd=folder):
+        for file in files:
+            _sync_file(descriptor, file)
         os.fsync(descriptor)
+
+
+def _sync_file(folder: int, name: str) -> None:
+    file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
 def _move(staging: Staging, folder: int, name: str) -> None:

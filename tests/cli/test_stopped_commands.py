@@ -9,18 +9,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import pytest
 
-from carts_core.cli import main
 from carts_core.lab.training.checkpoint import load_checkpoint
 from carts_core.networks.weights import read_weights
 
 POLITE = [signal.SIGTERM, signal.SIGHUP]
+STOPS = 28
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 SMALL_RUN = [
     *("--architecture.widths", "4", "6", "8", "--architecture.encoder-convolutions", "1", "1", "1"),
@@ -54,33 +53,53 @@ def check_results(folder: Path) -> int:
     return len(frames)
 
 
+Run = Callable[..., tuple[int, str]]
+"""Runs a command that gets a signal, after some seconds or when a file changes; its status and what it printed."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    log = tmp_path_factory.mktemp("forked") / "log.txt"
+    server = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("forked.py"))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+    assert server.stdin is not None and server.stdout is not None
+    stdin, stdout = server.stdin, server.stdout
+
+    def run(
+        arguments: list[str], seconds: float = 500.0, number: int = signal.SIGKILL, sign: Path | None = None
+    ) -> tuple[int, str]:
+        asked = {"seconds": seconds, "signal": number, "sign": sign and str(sign)}
+        stdin.write(json.dumps({"arguments": arguments, "log": str(log), **asked}) + "\n")
+        stdin.flush()
+        return int(stdout.readline()), log.read_text().replace("\n", " ")
+
+    yield run
+    stdin.close()
+    server.wait(60)
+
+
 @pytest.mark.parametrize(("mode", "number"), [("frame", signal.SIGTERM), ("sequence", signal.SIGHUP)])
 def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_been_stopped(
-    sequence: Path, tmp_path: Path, mode: str, number: signal.Signals, capsys: pytest.CaptureFixture[str]
+    sequence: Path, tmp_path: Path, mode: str, number: signal.Signals, run: Run
 ) -> None:
-    command = ["optimize", str(sequence), "--mode", mode, "--settings", "iterations=8", "--output"]
-    main([*command, str(tmp_path / "whole")])
+    command = ["optimize", str(sequence), "--mode", mode, "--settings", "iterations=4", "--output"]
+    assert run([*command, str(tmp_path / "whole")])[0] == 0
     folder = tmp_path / "stopped" / "regular" / "left"
     sign = folder / ("results.json" if mode == "frame" else "checkpoint.txt")
-    arguments = [sys.executable, "-m", "carts_core.cli", *command, str(tmp_path / "stopped")]
-    for sent in (number, signal.SIGKILL):
-        before = sign.stat().st_size if sign.exists() else 0
-        process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
-        deadline = time.monotonic() + 200
-        while process.poll() is None and not (sign.exists() and sign.stat().st_size > before):
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        process.send_signal(sent)
-        _, told = process.communicate(timeout=100)
-        if sent != signal.SIGKILL:
-            assert process.returncode == 128 + number, told
-            assert f"stopped by {number.name}; " in told and "the same command goes on from there" in told
-            said = re.search(r"(\d+) (?:frame|of \d+ frames)", told)
-            assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
-    capsys.readouterr()
-    main([*command, str(tmp_path / "stopped")])
-    told = capsys.readouterr().out
-    assert "already there" in told if mode == "frame" else "went on from where" in told
+    stopped = [*command, str(tmp_path / "stopped")]
+    status, told = run(stopped, number=number, sign=sign)
+    assert status == 128 + number, told
+    assert f"stopped by {number.name}; " in told and "the same command goes on from there" in told
+    said = re.search(r"(\d+) (?:frame|of \d+ frames)", told)
+    assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
+    assert run(stopped, number=signal.SIGKILL, sign=sign)[0] == -signal.SIGKILL
+    status, told = run(stopped)
+    assert status == 0 and ("already there" in told if mode == "frame" else "went on from where" in told), told
     assert contents(tmp_path / "stopped") == contents(tmp_path / "whole")
 
 
@@ -96,32 +115,6 @@ class Campaign:
     ends: int = 0
 
 
-@contextmanager
-def forked(log: Path) -> Iterator[Callable[[list[str], float, int], tuple[int, str]]]:
-    """Runs a command that gets a signal after some seconds; its status and what it printed."""
-    server = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("forked.py"))],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-    )
-    assert server.stdin is not None and server.stdout is not None
-    stdin, stdout = server.stdin, server.stdout
-
-    def run(arguments: list[str], seconds: float, number: int) -> tuple[int, str]:
-        request = {"arguments": arguments, "log": str(log), "seconds": seconds, "signal": number}
-        stdin.write(json.dumps(request) + "\n")
-        stdin.flush()
-        return int(stdout.readline()), log.read_text()
-
-    try:
-        yield run
-    finally:
-        stdin.close()
-        server.wait(60)
-
-
 def campaigns(sequence: Path, folder: Path) -> dict[str, Campaign]:
     optimize = ["optimize", str(sequence), "--settings", "iterations=8", "--output"]
     few = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
@@ -134,10 +127,10 @@ def campaigns(sequence: Path, folder: Path) -> dict[str, Campaign]:
     return {name: Campaign(name, arguments, folder / name) for name, arguments in made.items()}
 
 
-def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Random) -> None:
+def stop_often(run: Run, campaign: Campaign, times: int, randoms: random.Random) -> None:
     """Stop and start again until it was stopped that often; whenever it comes to its end, compare and start over."""
     began = time.monotonic()
-    status, told = run(campaign.arguments, 500.0, signal.SIGKILL)
+    status, told = run(campaign.arguments)
     length = time.monotonic() - began
     assert status == 0, told
     campaign.whole = contents(campaign.output)
@@ -171,7 +164,7 @@ def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Ra
         acknowledged = kept
         if said := re.search(r"left holds (\d+) frame", told):
             assert int(said[1]) == kept, told
-    status, told = run([*campaign.arguments, *overwrite], 500.0, signal.SIGKILL)
+    status, told = run([*campaign.arguments, *overwrite])
     assert status == 0 and contents(campaign.output) == campaign.whole, told
     campaign.ends += 1
 
@@ -180,32 +173,30 @@ def stop_often(run: Callable, campaign: Campaign, times: int, randoms: random.Ra
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("name", ["frame", "sequence", "calibrate", "export"])
 def test_commands_stopped_at_28_random_moments_come_to_the_same_bytes(
-    name: str, sequence: Path, tmp_path: Path
+    name: str, sequence: Path, tmp_path: Path, run: Run
 ) -> None:
     campaign = campaigns(sequence, tmp_path / "out")[name]
-    with forked(tmp_path / "log.txt") as run:
-        stop_often(run, campaign, 28, random.Random(name))
+    stop_often(run, campaign, STOPS, random.Random(name))
     print(f"{name}: {campaign.stops} stops, {campaign.ends} ends, the same bytes at each")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_training_stopped_at_28_random_moments_loses_no_step_that_it_said_it_has(tmp_path: Path) -> None:
+def test_training_stopped_at_28_random_moments_loses_no_step_that_it_said_it_has(tmp_path: Path, run: Run) -> None:
     randoms, output = random.Random(8), tmp_path / "run"
     step, said = 0, 0
-    with forked(tmp_path / "log.txt") as run:
-        for _ in range(28):
-            number = randoms.choice([*POLITE, signal.SIGKILL])
-            status, told = run(["train", str(output), *SMALL_RUN], randoms.uniform(0.0, 12.0), number)
-            assert status in (0, 128 + number, -number), told
-            checkpoint = load_checkpoint(output)
-            now = checkpoint.step if checkpoint else 0
-            assert now >= step
-            if found := re.search(r"holds (\d+) step", told):
-                said += 1
-                assert now == int(found[1]), told
-            step = now
-    print(f"train: 28 stops, {said} times it said what it holds, {step} steps at last")
+    for _ in range(STOPS):
+        number = randoms.choice([*POLITE, signal.SIGKILL])
+        status, told = run(["train", str(output), *SMALL_RUN], randoms.uniform(0.0, 12.0), number)
+        assert status in (0, 128 + number, -number), told
+        checkpoint = load_checkpoint(output)
+        now = checkpoint.step if checkpoint else 0
+        assert now >= step
+        if found := re.search(r"holds (\d+) step", told):
+            said += 1
+            assert now == int(found[1]), told
+        step = now
+    print(f"train: {STOPS} stops, {said} times it said what it holds, {step} steps at last")
     for weights in output.glob("*.safetensors"):
         if weights.name != "checkpoint.safetensors":
             read_weights(weights)
