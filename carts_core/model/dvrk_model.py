@@ -14,11 +14,12 @@ from xml.etree import ElementTree
 
 from ..errors import RobotError
 from ..extras import needs_extra
-from ..files.reading import CALIBRATION, MESH, open_regular, read_text
+from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, read_text
 from ..recording.importing.yaml_files import parse_yaml
 from ..wording import counted
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI, PsmGeometry
+from .xacro_guard import guarded_xacro
 
 PACKAGE = "dvrk_model"
 _PREFIX = "PSM1_"
@@ -133,7 +134,9 @@ def _expanded(model: Path, chosen: Instrument) -> str:
     packages.update_package_cache({PACKAGE: str(model.resolve())})
     options = {"instrument": chosen.number, "show_rcm": "false", "is_virtual": "true"}
     try:
-        return XacroDoc.from_file(str(arm), subargs=options, resolve_packages=False).to_urdf_string()
+        with guarded_xacro():
+            text = read_text(arm, ROBOT)
+            return XacroDoc.from_string(text, subargs=options, resolve_packages=False).to_urdf_string()
     except Exception as error:  # xacro raises whatever the macros' expressions raise
         raise RobotError(
             f"{arm} cannot be expanded for instrument {chosen.number} ({error}). Check out dvrk_model again, whole."

@@ -168,6 +168,10 @@ def test_another_folder_and_broken_macros_are_refused(model, tmp_path):
     (model / "urdf/Classic/PSM1.urdf.xacro").write_text(f"{XACRO}<xacro:nothing/></robot>")
     with pytest.raises(RobotError, match="cannot be expanded"):
         dvrk_urdf(model, "400093", model)
+    code = "[().__class__.__base__ for _ in [1]]"
+    (model / "urdf/Classic/PSM1.urdf.xacro").write_text(f'{XACRO}<link name="${{{code}}}"/></robot>')
+    with pytest.raises(RobotError, match="is not one that is calculated"):
+        dvrk_urdf(model, "400093", model)
     (model / "urdf/Classic/PSM1.urdf.xacro").write_text(f'{XACRO}<link name="world"/></robot>')
     with pytest.raises(RobotError, match="has no link 'roll_link'"):
         dvrk_urdf(model, "400093", model)

@@ -1,0 +1,208 @@
+"""Xacro without Python: expressions of a model are calculated here, since xacro would run any code that they hold.
+
+Xacro hands what stands in `${...}` and `$(eval ...)` to Python's `eval`, and keeps it from little. Here an expression
+is numbers, texts, lists, comparisons, properties and the functions of this module; everything else is refused.
+"""
+
+import ast
+import math
+import operator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from ..errors import RobotError
+from ..files.reading import CALIBRATION, ROBOT, read_text
+from ..recording.importing.yaml_files import parse_yaml
+
+_LONGEST = 100_000
+"""Longest text or list that an expression may make."""
+_LARGEST = 2.0**63
+"""Largest whole number."""
+_LONGEST_EXPRESSION = 2_000
+_MOST_ELEMENTS = 10_000
+"""Most elements that a model may expand to, over all runs of xacro; dVRK's have some hundreds."""
+_DECLARES = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
+
+_BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.Pow: lambda base, exponent: float(base) ** float(exponent),
+}
+_UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+    ast.Not: operator.not_,
+}
+_COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.In: lambda item, where: item in where,
+    ast.NotIn: lambda item, where: item not in where,
+    ast.Is: operator.is_,
+    ast.IsNot: operator.is_not,
+}
+_OF_MATH = "acos asin atan atan2 ceil cos degrees exp fabs floor fmod hypot log pow radians sin sqrt tan".split()
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **{function.__name__: function for function in (abs, bool, float, int, len, max, min, round, str)},
+    **{name: getattr(math, name) for name in _OF_MATH},
+}
+_OF_TEXTS = ("lower", "upper", "strip")
+_MESSAGES = ("message", "warning", "error")
+
+
+@contextmanager
+def guarded_xacro() -> Iterator[None]:
+    """While entered, xacro runs no code of a model, reads regular files of a bounded size, and comes to an end."""
+    import xacro  # noqa: PLC0415 - an extra
+    from xacro import substitution_args  # noqa: PLC0415
+
+    parse, call, calls = xacro.parse, xacro.handle_macro_call, 0
+
+    def parse_file(content: Any, filename: str | None = None) -> Any:
+        if content is None:
+            content = read_text(Path(xacro.root_dir or "", filename or ""), ROBOT)
+        if isinstance(content, str) and _DECLARES.search(content):
+            raise RobotError(f"{filename or 'the model'} declares a document type or entities, which no model needs")
+        return parse(content)
+
+    def counted_call(*arguments: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > _MOST_ELEMENTS:
+            raise RobotError(f"the model expands to more than {_MOST_ELEMENTS:,} elements")
+        return call(*arguments)
+
+    def refused(text: str, context: Any) -> str:
+        raise RobotError(f"$(eval {text}) is not evaluated; write ${{...}}")
+
+    def evaluate(text: str, symbols: Mapping[str, Any], local: Any = None) -> Any:
+        return Expression(symbols, xacro.abs_filename_spec).value(text)
+
+    with ExitStack() as patched:
+        for module, name, function in (
+            (xacro, "safe_eval", evaluate),
+            (xacro, "parse", parse_file),
+            (xacro, "handle_macro_call", counted_call),
+            (substitution_args, "_eval", refused),
+        ):
+            patched.enter_context(mock.patch.object(module, name, function))
+        yield
+
+
+class Expression:
+    """Calculates expressions.
+
+    Args:
+        symbols: properties by name.
+        path_of: the path of a file that the model names.
+    """
+
+    def __init__(self, symbols: Mapping[str, Any], path_of: Callable[[str], str]) -> None:
+        self._symbols, self._path_of = symbols, path_of
+
+    def value(self, text: str) -> Any:
+        """The value of an expression.
+
+        Raises:
+            RobotError: it holds something that is not calculated here.
+            SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: it is none, or has no value.
+        """
+        if len(text) > _LONGEST_EXPRESSION:
+            raise RobotError(f"an expression is longer than {_LONGEST_EXPRESSION:,} characters")
+        return self._of(ast.parse(text.strip(), mode="eval").body)
+
+    def _of(self, node: ast.expr) -> Any:
+        result = self._calculated(node)
+        if isinstance(result, int) and abs(result) > _LARGEST:
+            raise RobotError("a whole number in an expression has more than 64 bits")
+        if isinstance(result, str | list) and len(result) > _LONGEST:
+            raise RobotError(f"a text in an expression is longer than {_LONGEST} characters")
+        return result
+
+    def _calculated(self, node: ast.expr) -> Any:
+        match node:
+            case ast.Constant(value=bool() | int() | float() | str() | None):
+                result = node.value
+            case ast.Name(id=name):
+                result = self._symbol(name)
+            case ast.List() | ast.Tuple():
+                result = [self._of(element) for element in node.elts]
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _UNARY:
+                result = _UNARY[type(op)](self._of(operand))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+                result = _binary(op, self._of(left), self._of(right))
+            case ast.BoolOp(op=op, values=values):
+                result = self._first(values, isinstance(op, ast.Or))
+            case ast.Compare():
+                result = self._comparison(node)
+            case ast.IfExp(test=test, body=body, orelse=other):
+                result = self._of(body if self._of(test) else other)
+            case ast.Subscript(value=value, slice=place):
+                result = self._of(value)[self._of(place)]
+            case ast.Attribute(value=value, attr=name):
+                result = self._entry(value, name)
+            case ast.Call(func=function, args=arguments, keywords=[]):
+                result = self._call(function, arguments)
+            case _:
+                raise RobotError(f"the expression {ast.unparse(node)!r} is not one that is calculated")
+        return result
+
+    def _symbol(self, name: str) -> Any:
+        value = self._symbols[name]
+        if not isinstance(value, str | bool | int | float | list | tuple | Mapping | None):
+            raise RobotError(f"{name!r} is no property with a value")
+        return value
+
+    def _entry(self, value: ast.expr, name: str) -> Any:
+        if isinstance(value, ast.Name) and value.id == "math" and name in ("pi", "e"):
+            return getattr(math, name)
+        entries = self._of(value)
+        if not isinstance(entries, Mapping):
+            raise RobotError(f"{ast.unparse(value)!r} has no entries, so {name!r} is none of them")
+        return entries[name]
+
+    def _first(self, values: list[ast.expr], wanted: bool) -> Any:
+        """Of `or`, the first true value, of `and`, the first that is not; else the last."""
+        result: Any = None
+        for value in values:
+            result = self._of(value)
+            if bool(result) is wanted:
+                break
+        return result
+
+    def _comparison(self, node: ast.Compare) -> bool:
+        values = [self._of(value) for value in (node.left, *node.comparators)]
+        pairs = zip(values, node.ops, values[1:], strict=False)
+        return all(_COMPARISONS[type(op)](left, right) for left, op, right in pairs)
+
+    def _call(self, function: ast.expr, arguments: list[ast.expr]) -> Any:
+        values = [self._of(argument) for argument in arguments]
+        match function:
+            case ast.Name(id=name) | ast.Attribute(value=ast.Name(id="math"), attr=name) if name in _FUNCTIONS:
+                return _FUNCTIONS[name](*values)
+            case ast.Name(id="load_yaml") | ast.Attribute(value=ast.Name(id="xacro"), attr="load_yaml"):
+                return parse_yaml(read_text(Path(self._path_of(str(*values))), CALIBRATION))
+            case ast.Attribute(value=ast.Name(id="xacro"), attr=name) if name in _MESSAGES:
+                return ""
+            case ast.Attribute(value=value, attr=name) if name in _OF_TEXTS:
+                return getattr(str(self._of(value)), name)(*values)
+        raise RobotError(f"the function {ast.unparse(function)!r} is not one that a model may call")
+
+
+def _binary(op: ast.operator, left: Any, right: Any) -> Any:
+    # A text times a number, or formatted with one, may become as long as it likes before anybody sees.
+    if not isinstance(op, ast.Add) and not (isinstance(left, int | float) and isinstance(right, int | float)):
+        raise TypeError(f"{type(op).__name__} is for numbers")
+    return _BINARY[type(op)](left, right)
