@@ -13,6 +13,7 @@ import trimesh
 from jaxtyping import Bool, Float, UInt8
 
 from ...errors import CartsError
+from ...files import write_text
 from ...model.camera import Camera
 from ...model.robot import Robot
 from ...model.scene import Arm, Scene
@@ -51,7 +52,7 @@ def write_arm(folder: Path) -> Path:
     finger = '<visual><origin xyz="0 {y} 0.1"/><geometry><box size="0.03 0.02 0.09"/></geometry></visual>'
     lines[-1] = finger.format(y=0.03) + finger.format(y=-0.03) + "</link>"
     path = folder / "seven_joint_arm.urdf"
-    path.write_text("\n".join([*lines, "</robot>"]), encoding="utf-8")
+    write_text(path, "\n".join([*lines, "</robot>"]))
     return path
 
 
