@@ -22,6 +22,7 @@ from .import_ import Import
 from .optimize import Optimize
 from .render import Render
 from .robot import RobotCommand
+from .robots import Robots
 from .synthesize import Synthesize
 from .train import Train
 from .view import View
@@ -46,6 +47,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
+    | Annotated[Robots, tyro.conf.subcommand("robots")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

@@ -5,9 +5,8 @@ is taken. The three joints that carry it are those of the dVRK's controller, whi
 linkage of the Si arm is tilted by 9.3 degrees of pitch against it, since it was made for looking at.
 """
 
-import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,7 +17,8 @@ from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, read_text
 from ..recording.importing.yaml_files import parse_yaml
 from ..wording import counted
 from .mesh_files import mesh_path
-from .psm_kinematics import CLASSIC, SI, PsmGeometry
+from .psm_kinematics import CLASSIC, SI
+from .psm_urdf import carrier
 from .xacro_guard import guarded_xacro
 
 PACKAGE = "dvrk_model"
@@ -119,7 +119,7 @@ def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
             if element.tag in ("link", "parent", "child") and key in element.attrib:
                 element.set(key, element.attrib[key].removeprefix(_PREFIX))
     _keep_what_is_seen(root)
-    for position, element in enumerate(_carrier(CLASSIC if chosen.generation == "Classic" else SI)):
+    for position, element in enumerate(carrier(CLASSIC if chosen.generation == "Classic" else SI)):
         root.insert(position, element)
     _relocate_meshes(root, model, folder)
     ElementTree.indent(root)
@@ -170,29 +170,6 @@ def _is_below(link: str, joints: Mapping[str, ElementTree.Element]) -> bool:
             return False
         link = _link(joints[link], "parent")
     return True
-
-
-def _carrier(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
-    """Links and joints from the remote centre to the instrument's base, as the controller has them."""
-    half_turn = repr(math.pi / 2)
-    places = (
-        ("yaw", "revolute", "0 0 0", f"0 -{half_turn} {half_turn}"),
-        ("pitch", "revolute", "0 0 0", f"0 -{half_turn} -{half_turn}"),
-        ("insertion", "prismatic", f"0 {geometry.remote_center} 0", f"{half_turn} 0 0"),
-    )
-    parent = "base_link"
-    yield ElementTree.Element("link", name=parent)
-    for (name, kind, xyz, rpy), (lower, upper) in zip(places, geometry.limits, strict=False):
-        joint = ElementTree.Element("joint", name=name, type=kind)
-        child = f"{name}_link"
-        ElementTree.SubElement(joint, "parent", link=parent)
-        ElementTree.SubElement(joint, "child", link=child)
-        ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
-        ElementTree.SubElement(joint, "axis", xyz="0 0 1")
-        ElementTree.SubElement(joint, "limit", lower=str(lower), upper=str(upper), effort="1000", velocity="0.4")
-        yield joint
-        yield ElementTree.Element("link", name=child)
-        parent = child
 
 
 def _link(joint: ElementTree.Element, role: str) -> str:

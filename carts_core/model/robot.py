@@ -12,6 +12,7 @@ from torch import Tensor
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
 from . import mesh_cache
+from .instruments import robot_file
 from .kinematics import Kinematics, exact_right_angles
 from .mesh_files import mesh_path
 from .meshes import LinkMesh, build_link_meshes, load_visual
@@ -60,7 +61,7 @@ class Robot:
         """Read a URDF and its visual meshes; decimated meshes come from the cache the second time.
 
         Args:
-            urdf: path of the URDF; mesh paths are relative to it.
+            urdf: path of the URDF, mesh paths are relative to it; or `builtin:NAME`.
             base_link: frame of the link transforms, the URDF's root by default.
             max_faces: triangles of the whole robot after decimation.
             progress: called with a line for people, now and then.
@@ -69,7 +70,7 @@ class Robot:
             RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.
         """
         # Resolved once, here: what is found beside the URDF stays found when the working directory changes.
-        urdf = Path(urdf).absolute()
+        urdf = robot_file(urdf).absolute()
         report = progress or (lambda line: None)
         try:
             root = parsed_urdf(read_text(urdf, ROBOT), urdf)

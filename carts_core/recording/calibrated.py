@@ -9,9 +9,8 @@ import tomlkit
 
 from ..files.reading import SEQUENCE, read_text
 from ..model.camera import HALF_PIXEL
+from ..model.instruments import SCHEME
 from ..model.scene import Scene
-
-_BUILTIN = "builtin:"
 
 
 def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate") -> str:
@@ -47,7 +46,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
     move(document.get("frames", {}), "table", "video")
     for table, old, new in zip(document["arms"], before.arms, after.arms, strict=True):
         move(table, "table", "truth", "T_world_base")
-        if not table["robot"].startswith(_BUILTIN):
+        if not table["robot"].startswith(SCHEME):
             move(table, "robot")
         if not np.array_equal(old.T_world_base, new.T_world_base):
             table["T_world_base"] = _matrix(new.T_world_base)

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SequenceError, SettingsError
+from ..errors import RobotError, SequenceError, SettingsError
 from ..files.reading import VALUES, parse_json, read_text
 from ..model.camera import HALF_PIXEL, Camera, rigid_transform
+from ..model.instruments import SCHEME, robot_file
 from ..wording import listed, shown
 from .toml_table import TomlTable, closest
 
@@ -121,18 +122,16 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def resolve_robot(table: TomlTable, shipped: dict[str, Path]) -> Path:
+def resolve_robot(table: TomlTable) -> Path:
     """The URDF that the key `robot` names: a path, or `builtin:NAME`.
 
     Raises:
-        SequenceError: no robot of that name is shipped.
+        SequenceError: no robot of that name is built in.
     """
     value = table.take("robot", str)
-    scheme, mark, name = value.partition(":")
-    if mark and scheme == "builtin":
-        if name not in shipped:
-            raise table.error(
-                "robot", f"is {shown(value)}. Shipped are: {', '.join(f'builtin:{known}' for known in shipped)}."
-            )
-        return shipped[name]
+    if value.startswith(SCHEME):
+        try:
+            return robot_file(value)
+        except RobotError as error:
+            raise table.error("robot", f"is not known: {error}") from error
     return table.path(value)

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from ..model.camera import FARTHEST
 from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
-from ..resources import shipped_robot
 from ..wording import shown
 from .calibration import resolve_robot, take_transform
 from .camera_input import CameraInput, take_camera_input
@@ -134,7 +133,7 @@ def _take_arm(
     progress: Callable[[str], None] | None,
 ) -> ArmInput:
     name = table.take("name", str)
-    urdf = resolve_robot(table, {"psm_lnd": shipped_robot()})
+    urdf = resolve_robot(table)
     base_link = table.take("base_link", str, None)
     if (key := (urdf.resolve(), base_link)) not in robots:
         robots[key] = Robot.load(urdf, base_link=base_link, progress=progress)

@@ -10,7 +10,10 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
+from ...files.reading import ROBOT, read_text
+from ...model.instruments import SCHEME, robot_file
 from ...model.psm_kinematics import JOINT_NAMES
+from ...model.urdf_check import parsed_urdf
 from .. import Sequence
 from .found import FoundArm, FoundCamera, FoundRecording
 from .placing import MAX_GAP
@@ -131,13 +134,14 @@ def _toml(recording: FoundRecording, place: Path) -> str:
 
 
 def _arm_lines(arm: FoundArm, place: Path, timed: bool) -> list[str]:
-    builtin = arm.robot.startswith("builtin:")
-    urdf = Path(arm.robot).absolute()
-    if not builtin and not urdf.is_file():
+    builtin = arm.robot.startswith(SCHEME)
+    urdf = robot_file(arm.robot).absolute()
+    if not urdf.is_file():
         raise SequenceError(
             f"robot {arm.robot} of {arm.name} is missing. Give the path of a URDF (carts robot makes one)."
         )
-    has_jaw = builtin or 'name="jaw"' in urdf.read_text(encoding="utf-8", errors="replace")
+    joints = parsed_urdf(read_text(urdf, ROBOT), urdf).iter("joint")
+    has_jaw = any(joint.get("name") == "jaw" and joint.get("type") != "fixed" for joint in joints)
     lines = [
         "",
         "[[arms]]",

@@ -1,0 +1,251 @@
+"""Tips of instruments. Jaw link's frame, millimetres.
+
+y points to the tip and z is the yaw axis. A jaw lies on the side of its sign along x, its gripping face near
+x = 0.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from .solids import Solid, bar, cylinder, plate, together, wire
+
+Table = tuple[tuple[float, float], ...]
+"""Pairs of a place along the blade, 0 at its root and 1 at its end, and a length [mm]."""
+
+FIRST, SECOND = -1, 1
+"""Sides of the jaws `jaw_1_link` and `jaw_2_link`."""
+
+
+@dataclass(frozen=True)
+class Hub:
+    """The discs around the yaw axis that the tip turns on."""
+
+    radius: float = 3.4
+    """[mm]"""
+    height: float = 2.6
+    """Half the height of both together [mm]."""
+
+
+@dataclass(frozen=True)
+class Jaws:
+    """Two blades that open like pliers."""
+
+    length: float
+    """From the yaw axis to the end of the closed jaws [mm]."""
+    widths: Table
+    """Half width of a blade, across the opening plane."""
+    thickness: Table
+    """From the gripping face outwards."""
+    hub: Hub = Hub()
+    root: float = 4.0
+    """Where the blades begin [mm]."""
+    arch: float = 0.0
+    """How far the middle of the blades bends sideways [mm]."""
+    turn: float = 0.0
+    """How far their ends bend sideways [mm]."""
+    windows: tuple[tuple[float, float], ...] = ()
+    """Openings in a blade, from and to, places along it."""
+    rim: float = 0.75
+    """Width of what is left beside a window [mm]."""
+    insert: float = 0.0
+    """Thickness of an insert of another material in the gripping face [mm]."""
+    pivot: float = 0.0
+    """How far beyond the yaw axis the jaws turn [mm]."""
+
+    def jaw(self, side: int) -> Solid:
+        """The metal part of one jaw."""
+        first = self.root - self.pivot
+        parts = [_hub(self.hub, side, self.pivot), _neck(self, side)]
+        edges = [0.0, *(edge for window in self.windows for edge in window), 1.0]
+        for number, (start, stop) in enumerate(itertools.pairwise(edges)):
+            # Neighbours overlap a little, so that no gap shows between them.
+            places = np.linspace(max(start - 0.005, 0.0), min(stop + 0.005, 1.0), 7)
+            table = self._stations(side, places, first)
+            if number % 2 == 0:
+                parts.append(bar(table))
+                continue
+            low, high = table.copy(), table.copy()
+            low[:, 4] = np.minimum(table[:, 3] + self.rim, table[:, 4])
+            high[:, 3] = np.maximum(table[:, 4] - self.rim, table[:, 3])
+            parts += [bar(low), bar(high)]
+        return together(parts)
+
+    def base(self) -> Solid | None:
+        """What the jaws turn on, beyond the yaw axis."""
+        if not self.pivot:
+            return None
+        reach = self.pivot + 0.55 * self.hub.radius
+        places = [(-0.6, 0.9), (2.5, 0.95), (0.6 * self.pivot, 0.8), (self.pivot, 0.6), (reach, 0.4)]
+        bridge = bar(np.array([(y, -r * self.hub.radius, r * self.hub.radius, -1.25, 1.25) for y, r in places]))
+        return together([cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32), bridge])
+
+    def inserted(self, side: int) -> Solid | None:
+        """The insert of one jaw, if it has one."""
+        if not self.insert:
+            return None
+        table = self._stations(side, np.linspace(0.3, 0.985, 8), self.root - self.pivot)
+        table[:, 1:3] = sorted((side * 0.03, side * (self.insert + 0.05)))
+        table[:, 3] += 0.12
+        table[:, 4] -= 0.12
+        return bar(table, 0.1)
+
+    def _stations(self, side: int, places: np.ndarray, first: float) -> Float[np.ndarray, "n 5"]:
+        places = np.sort(np.concatenate([places, [0.96, 0.985]])) if places[-1] == 1.0 else places
+        y = first + places * (self.length - self.pivot - first)
+        width, thickness = _at(self.widths, places), _at(self.thickness, places)
+        # The end is rounded off.
+        taper = np.interp(places, [0.9, 0.96, 0.985, 1.0], [1.0, 0.86, 0.66, 0.3])
+        middle = self.turn * places**2 + 4 * self.arch * places * (1 - places)
+        outer = side * thickness * np.minimum(1.0, taper + 0.25)
+        inner = np.full_like(outer, side * max(0.06, self.insert))
+        outer = side * np.maximum(np.abs(outer), np.abs(inner) + 0.15)
+        x = np.sort(np.stack([inner, outer], axis=1), axis=1)
+        return np.column_stack([y, x, middle - width * taper, middle + width * taper])
+
+
+@dataclass(frozen=True)
+class Scissors:
+    """Two thin blades that pass each other."""
+
+    length: float
+    """From the yaw axis to the end [mm]."""
+    widths: Table
+    """Half width of a blade in the opening plane."""
+    blade: float = 0.95
+    """Thickness of a blade [mm]."""
+    hub: Hub = Hub(2.4, 2.0)
+    turn: float = 0.0
+    """How far the ends bend sideways [mm]."""
+    root: float = 2.0
+    """Where the blades begin [mm]."""
+    pivot: float = 0.0
+    """Always 0: blades turn about the yaw axis."""
+
+    def jaw(self, side: int) -> Solid:
+        """One blade with its hub."""
+        places = np.array([0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.96, 1.0])
+        width = _at(self.widths, places) * np.interp(places, [0.9, 0.96, 1.0], [1.0, 0.8, 0.35])
+        middle = self.turn * places**2
+        y = self.root + places * (self.length - self.root)
+        # The cutting edge reaches a little over the middle.
+        edge, back = -side * 0.25 * np.minimum(width, 1.0), side * (2 * width - 0.25 * np.minimum(width, 1.0))
+        x = np.sort(np.stack([edge, back], axis=1), axis=1)
+        z = (0.03, self.blade) if side == FIRST else (-self.blade, -0.03)
+        table = np.column_stack([y, x, middle + z[0], middle + z[1]])
+        return together([_hub(self.hub, side, 0.0), bar(table, 0.15)])
+
+    def inserted(self, side: int) -> Solid | None:
+        """Nothing: a blade is of one material."""
+        return None
+
+
+@dataclass(frozen=True)
+class ClipApplier:
+    """Two bowed arms with a groove for a clip at their ends."""
+
+    length: float = 22.2
+    """From the yaw axis to the end [mm]."""
+    bow: float = 3.7
+    """Largest distance of an arm's outside from the middle [mm]."""
+    height: float = 1.15
+    """Half the width of an arm across the opening plane [mm]."""
+    hub: Hub = Hub()
+    pivot: float = 0.0
+    """Always 0: the arms turn about the yaw axis."""
+
+    def jaw(self, side: int) -> Solid:
+        """One arm with its base."""
+        near, far = 11.0, self.length
+        low, high = (1.35, self.hub.height) if side == FIRST else (-self.hub.height, -1.35)
+        base = [(1.0, 0.9), (3.0, 1.0), (6.0, 0.6), (9.0, 1.0), (near, 0.2)]
+        outline = [(side * -x, y) for y, x in base] + [(side * self.bow * 0.97, near), (side * self.bow, 2.0)]
+        parts = [_hub(self.hub, side, 0.0), plate(outline, low, high, "z")]
+        places = np.linspace(0.0, 1.0, 9)
+        outer = side * np.interp(places, [0, 0.2, 0.9, 1.0], [self.bow, 0.97 * self.bow, 0.55 * self.bow, 1.5])
+        inner = side * np.interp(places, [0, 0.2, 0.85, 1.0], [0.45, 1.7, 0.7, 0.7])
+        x = np.sort(np.stack([inner, outer], axis=1), axis=1)
+        y = near - 1.5 + places * (far - near + 1.5)
+        # At its foot the arm is as high as the base, which lies off the middle.
+        foot = (places < 0.2).astype(float)
+        below = -self.height + foot * min(0.0, low + self.height)
+        above = self.height + foot * max(0.0, high - self.height)
+        parts.append(bar(np.column_stack([y, x, below, above])))
+        for start, stop in ((far - 2.4, far - 1.7), (far - 0.8, far)):
+            lip = sorted((side * 0.12, side * 1.4))
+            parts.append(bar(np.array([(y, *lip, -self.height, self.height) for y in (start, stop)])))
+        return together(parts)
+
+    def inserted(self, side: int) -> Solid | None:
+        """Nothing: an arm is of one material."""
+        return None
+
+
+@dataclass(frozen=True)
+class Electrode:
+    """A tip without jaws: a bent wire, or a paddle, on an insulated collar."""
+
+    path: tuple[tuple[float, float], ...]
+    """Middle of the wire from the collar on, (x, y) [mm]."""
+    radius: float = 0.62
+    """Of the wire [mm]."""
+    collar: float = 6.4
+    """Where the collar ends [mm]."""
+    paddle: tuple[float, float, float] | None = None
+    """Length, half width and half thickness of a paddle at the end of the wire [mm]."""
+    hub: Hub = Hub(3.3, 2.5)
+    height: float = 0.9
+    """Of the wire over the middle, along the yaw axis [mm]."""
+
+    def body(self) -> Solid:
+        """Hub and collar."""
+        collar = [cylinder(1.7, 2.0, self.collar, "y"), cylinder(1.1, self.collar - 0.2, self.collar + 0.9, "y")]
+        hub = cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32)
+        return together([hub, *(part.moved(z=self.height) for part in collar)])
+
+    def electrode(self) -> Solid:
+        """The wire, and the paddle if there is one."""
+        path = np.array([(x, y, self.height) for x, y in self.path])
+        parts = [wire(path, [self.radius] * (len(path) - 1) + [0.7 * self.radius])]
+        if self.paddle:
+            length, width, thickness = self.paddle
+            end = path[-1, 1]
+            places = np.array([0.0, 0.15, 0.3, 0.8, 0.93, 1.0])
+            half = width * np.array([0.5, 0.85, 1.0, 1.0, 0.8, 0.4])
+            low, high = self.height - thickness, self.height + thickness
+            rows = [(end - 0.4 + s * length, -w, w, low, high) for s, w in zip(places, half, strict=True)]
+            parts.append(bar(np.array(rows)))
+        return together(parts)
+
+
+Tip = Jaws | Scissors | ClipApplier | Electrode
+
+
+def _at(table: Sequence[tuple[float, float]], places: np.ndarray) -> np.ndarray:
+    keys, values = zip(*table, strict=True)
+    return np.interp(places, keys, values)
+
+
+def _hub(hub: Hub, side: int, pivot: float) -> Solid:
+    """The half of the hub that one jaw has, above or below the other's; a jaw with a pivot has a lug instead."""
+    low, high = (0.03, hub.height) if side == FIRST else (-hub.height, -0.03)
+    return cylinder(0.6 * hub.radius if pivot else hub.radius, low, high, "z", 32)
+
+
+def _neck(tip: Jaws, side: int) -> Solid:
+    """From the hub's half, off the middle, to the blade in the middle."""
+    first = tip.root - tip.pivot
+    width, thickness = tip.widths[0][1], tip.thickness[0][1]
+    low, high = (0.05, tip.hub.height - 0.1) if side == FIRST else (0.1 - tip.hub.height, -0.05)
+    radius = 0.55 * tip.hub.radius
+    rows = []
+    for y, share in ((0.0, 0.0), (0.45 * first, 0.0), (0.8 * first, 0.5), (first + 0.3, 1.0)):
+        inner, outer = sorted((side * max(0.06, tip.insert) * share, side * (radius + share * (thickness - radius))))
+        if share < 1.0:
+            # Behind the blade the neck is about the hub's middle.
+            inner, outer = (inner - 0.5, outer) if side == SECOND else (inner, outer + 0.5)
+        rows.append((y, inner, outer, low + share * (-width - low), high + share * (width - high)))
+    return bar(np.array(rows))

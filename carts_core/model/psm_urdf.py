@@ -1,0 +1,50 @@
+"""The part of a PSM's URDF that every instrument has: links and joints from the remote centre to its base."""
+
+import math
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+from .psm_kinematics import PsmGeometry
+
+
+def quarter_turns(roll: int, pitch: int, yaw: int) -> str:
+    """The attribute `rpy` of a rotation by quarter turns, with all digits."""
+    return " ".join("0" if turns == 0 else repr(turns * math.pi / 2) for turns in (roll, pitch, yaw))
+
+
+def joint(
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    xyz: str = "0 0 0",
+    rpy: str = "0 0 0",
+    limits: tuple[float, float] | None = None,
+) -> ElementTree.Element:
+    """A joint about, or along, the z axis of its child."""
+    element = ElementTree.Element("joint", name=name, type=kind)
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+    ElementTree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
+    if limits is not None:
+        ElementTree.SubElement(element, "axis", xyz="0 0 1")
+        ElementTree.SubElement(
+            element, "limit", lower=str(limits[0]), upper=str(limits[1]), effort="1000", velocity="0.4"
+        )
+    return element
+
+
+def carrier(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
+    """Links and joints from the remote centre to the instrument's base, as the dVRK's controller has them."""
+    places = (
+        ("yaw", "revolute", "0 0 0", quarter_turns(0, -1, 1)),
+        ("pitch", "revolute", "0 0 0", quarter_turns(0, -1, -1)),
+        ("insertion", "prismatic", f"0 {geometry.remote_center} 0", quarter_turns(1, 0, 0)),
+    )
+    parent = "base_link"
+    yield ElementTree.Element("link", name=parent)
+    for (name, kind, xyz, rpy), limits in zip(places, geometry.limits, strict=False):
+        child = f"{name}_link"
+        yield joint(name, kind, parent, child, xyz, rpy, limits)
+        yield ElementTree.Element("link", name=child)
+        parent = child

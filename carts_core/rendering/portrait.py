@@ -1,0 +1,96 @@
+"""A picture of a robot by itself: the tip of an instrument from near by, or a whole arm."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from ..model.camera import Camera
+from ..model.parts import link_parts
+from ..model.robot import Robot
+from ..model.scene import Arm, Light, Scene
+from .renderer import Renderer
+
+_BACKDROP = 0.92
+_FOCAL_LENGTH = 2.4
+"""In widths of the picture [1]."""
+_MARGIN = 1.25
+_TILT = np.deg2rad(35.0)
+_OPEN = 0.45
+"""Where joints stand, a part of their range above 0; jaws are then open."""
+_SUPERSAMPLING = 2
+_GAMMA = 1 / 1.5
+_STEP = 0.1
+"""How far the last joint is moved to see what it moves [rad]."""
+
+
+def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndarray, "height width 3"]:
+    """A robot before a plain backdrop, RGB: what its shaft carries if it is an instrument, else all of it.
+
+    Args:
+        robot: any.
+        width, height: of the picture [px].
+    """
+    joints, opening = _pose(robot)
+    parts = link_parts(robot)[[mesh.link for mesh in robot.meshes]]
+    points = _points(robot, joints)
+    shown = [cloud for cloud, part in zip(points, parts, strict=True) if part > 0]
+    carried_by = [cloud for cloud, part in zip(points, parts, strict=True) if part == 0]
+    if shown and carried_by:
+        R = _side_view(np.concatenate(shown).mean(0) - np.concatenate(carried_by).mean(0), opening)
+    else:
+        shown, R = points, _from_above()
+    cloud = np.concatenate(shown)
+    centre = (cloud.min(0) + cloud.max(0)) / 2
+    radius = np.linalg.norm(cloud - centre, axis=1).max() * _MARGIN
+    T_camera_base = np.eye(4)
+    T_camera_base[:3, :3] = R
+    T_camera_base[:3, 3] = (0, 0, radius * (1 + 2 * _FOCAL_LENGTH * width / min(width, height))) - R @ centre
+    focal = _FOCAL_LENGTH * width
+    camera = Camera("portrait", width, height, (focal, focal, width / 2, height / 2), np.eye(4))
+    scene = Scene((Arm("robot", robot, T_camera_base),), (camera,), Light(ambient=0.35, diffuse=0.75, specular=0.3))
+    renderer = Renderer(scene, width=width * _SUPERSAMPLING, height=height * _SUPERSAMPLING)
+    with torch.no_grad():
+        rendering = renderer(scene.state({"robot": joints.numpy()}))
+    silhouette = rendering.silhouette[0, ..., None].numpy()
+    image = rendering.image[0].permute(1, 2, 0).numpy() ** _GAMMA + _BACKDROP * (1 - silhouette)
+    fine = np.clip(image, 0, 1).reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3)
+    return np.rint(fine.mean((1, 3)) * 255).astype(np.uint8)
+
+
+def _pose(robot: Robot) -> tuple[Float[torch.Tensor, " dofs"], Float[np.ndarray, "3"]]:
+    """Joints that are straight, with jaws open; and the direction in which the last joint moves what it moves."""
+    low, high = robot.joint_limits.double().clamp(-np.pi, np.pi).T
+    joints = torch.zeros(len(low), dtype=torch.float64).clamp(low, high)
+    moved = joints.clone()
+    moved[-1] += _STEP
+    ways = [after - before for before, after in zip(_points(robot, joints), _points(robot, moved), strict=True)]
+    means = np.array([way.mean(0) for way in ways])
+    if (means @ means.T).min() < -1e-9:
+        # Jaws move against each other.
+        joints[-1] = (_OPEN * high[-1]).clamp(low[-1], high[-1])
+    _, _, axes = np.linalg.svd(np.concatenate(ways), full_matrices=False)
+    return joints, axes[0]
+
+
+def _points(robot: Robot, joints: torch.Tensor) -> list[Float[np.ndarray, "V 3"]]:
+    """The vertices of every mesh in the base frame [m]."""
+    Ts = robot.forward_kinematics(joints).numpy()
+    return [mesh.vertices @ Ts[mesh.link, :3, :3].T + Ts[mesh.link, :3, 3] for mesh in robot.meshes]
+
+
+def _side_view(along: Float[np.ndarray, "3"], opening: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """R_camera_base that has the tip on the right, seen obliquely onto the plane in which jaws open."""
+    right = along / np.linalg.norm(along)
+    across = opening - (opening @ right) * right
+    across /= np.linalg.norm(across)
+    down = np.cos(_TILT) * across + np.sin(_TILT) * np.cross(right, across)
+    return np.stack([right, down, np.cross(right, down)])
+
+
+def _from_above() -> Float[np.ndarray, "3 3"]:
+    """R_camera_base of a look at the base frame's origin, obliquely from above; z is up."""
+    forward = np.array([-1.0, 0.8, -0.55])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
