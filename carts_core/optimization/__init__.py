@@ -19,6 +19,7 @@ from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
 from .masks import MaskPredictor as MaskPredictor
+from .predictor import FramePredictor as FramePredictor
 from .predictor import ImagePredictor as ImagePredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
@@ -44,6 +45,7 @@ __all__ = [
     "Evidence",
     "FrameEstimate",
     "FrameOptimizer",
+    "FramePredictor",
     "FreeParameters",
     "ImagePredictor",
     "Iterate",

@@ -23,7 +23,7 @@ from ..model.scene import Scene
 from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..recording import MeanBackground
 from .inputs import pixel_weights, stacked_images
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor
 
 _PATCH = 3
 """Side of the patches over which differences are averaged [px of the working image]."""
@@ -179,7 +179,7 @@ class Backgrounds:
         """Whether the background of each camera of a scene is there."""
         return all(camera.name in self.images for camera in scene.cameras)
 
-    def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: SurfacePredictor) -> Background:
+    def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: FramePredictor) -> Background:
         """The backgrounds of a scene's cameras in a width and height [px].
 
         Raises:

@@ -13,7 +13,7 @@ from ..model.scene import Scene
 from ..rendering import Renderer
 from .counterfactual import Backgrounds, without_background
 from .inputs import pixel_weights, stacked_images, working_size
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class FrameImages:
         scale: float,
         working_width: int,
         dehaze: float,
-        predictor: SurfacePredictor,
+        predictor: FramePredictor,
         backgrounds: Backgrounds | None = None,
     ) -> "FrameImages":
         """Images at `scale` times the working size, as far as the predictor's stride allows.

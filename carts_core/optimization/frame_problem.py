@@ -22,7 +22,7 @@ from .frame_images import FrameImages
 from .ignore import propose_ignore
 from .observability import uncertainty
 from .observation import Observation, observe
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor
 from .variables import Variables
 from .verdict import Evidence, evidence
 
@@ -58,7 +58,7 @@ class FrameProblem:
         self,
         scene: Scene,
         images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
-        predictor: SurfacePredictor,
+        predictor: FramePredictor,
         variables: Variables,
         settings: SurfaceSolver,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,

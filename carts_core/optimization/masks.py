@@ -1,6 +1,7 @@
 """Given masks as the target: what a person painted or another program found stands in the place of the network."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from ..errors import SettingsError
 from ..imaging.window import Window
 from ..model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ..recording import Frame
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor, SurfacePredictor
 
 GivenMask = Bool[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
 """Which share of each pixel the arms cover, all of them together; a soft edge has values between 0 and 1."""
@@ -21,10 +22,8 @@ _STRIDE = 8
 """Windows are multiples of this without a network [px]."""
 
 
-class MaskPredictor(SurfacePredictor):
-    """Predicts what given masks say: where arms are, and nothing of their parts and normals.
-
-    `for_frame` gives the predictor that knows a frame's masks; every optimizer asks for it.
+class MaskPredictor:
+    """Has each frame's given masks in the place of a network; a `SurfacePredictor`.
 
     Args:
         network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
@@ -38,38 +37,20 @@ class MaskPredictor(SurfacePredictor):
         masks: Callable[[int], Mapping[str, GivenMask]] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self._network, self._masks, self._device = network, masks, torch.device(device)
+        self._network, self._masks = network, masks
+        self.device = torch.device(device) if network is None else network.device
 
-    @property
-    def device(self) -> torch.device:
-        """See `SurfacePredictor`."""
-        return self._device if self._network is None else self._network.device
-
-    @property
-    def stride(self) -> int:
-        """See `SurfacePredictor`."""
-        return _STRIDE if self._network is None else self._network.stride
-
-    @property
-    def masked(self) -> bool:
-        """See `SurfacePredictor`."""
-        return True
-
-    @property
-    def knows_parts(self) -> bool:
-        """See `SurfacePredictor`."""
-        return self._network is not None
-
-    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> SurfacePredictor:
+    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
         """The predictor of one frame.
 
         Raises:
             SettingsError: a camera has no mask of the frame and there is no network, or a mask is of another size.
         """
+        network = None if self._network is None else self._network.for_frame(frame, cameras)
         given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)
         missing = [name for name in cameras if name not in given]
-        if missing and self._network is not None:
-            return self._network.for_frame(frame, cameras)
+        if missing and network is not None:
+            return network
         if missing:
             raise SettingsError(
                 f"frame {frame.frame_id} has no mask of camera {missing[0]!r} to be fitted. Give one, leave the frame "
@@ -82,7 +63,28 @@ class MaskPredictor(SurfacePredictor):
                     f"{frame.images[name].shape[:2]}. Give a mask in the size of the image."
                 )
         masks = tuple(np.asarray(given[name], np.float32) for name in cameras)
-        return _FrameMasks(self._network, masks, self._device)
+        return _FrameMasks(masks, network, self.device)
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameMasks:
+    """The masks of one frame: where arms are, and of parts and normals what the network says, if there is one."""
+
+    masks: tuple[Float[np.ndarray, "height width"], ...]
+    """In the order of the cameras."""
+    network: FramePredictor | None
+    device: torch.device
+    masked: bool = True
+
+    @property
+    def knows_parts(self) -> bool:
+        """See `FramePredictor`."""
+        return self.network is not None
+
+    @property
+    def stride(self) -> int:
+        """See `FramePredictor`."""
+        return _STRIDE if self.network is None else self.network.stride
 
     def predict(
         self,
@@ -90,41 +92,14 @@ class MaskPredictor(SurfacePredictor):
         given: Float[Tensor, "cameras 6 height width"],
         window: Window,
     ) -> Float[Tensor, "cameras 6 h w"]:
-        """Not known without a frame.
-
-        Raises:
-            SettingsError: always.
-        """
-        raise SettingsError("masks belong to frames. Call `for_frame` first, and predict with what it returns.")
-
-
-class _FrameMasks(MaskPredictor):
-    """The masks of one frame, in the order of the cameras."""
-
-    def __init__(
-        self, network: SurfacePredictor | None, given: Sequence[Float[np.ndarray, "h w"]], device: torch.device
-    ) -> None:
-        super().__init__(network, device=device)
-        self._given = given
-
-    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> SurfacePredictor:
-        """It is of one already."""
-        return self
-
-    def predict(
-        self,
-        images: Float[Tensor, "cameras 3 height width"],
-        given: Float[Tensor, "cameras 6 height width"],
-        window: Window,
-    ) -> Float[Tensor, "cameras 6 h w"]:
-        """See `SurfacePredictor.predict`."""
+        """See `FramePredictor.predict`."""
         size = images.shape[-1], images.shape[-2]
-        reduced = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in self._given])
+        reduced = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in self.masks])
         covered = window.of(torch.from_numpy(reduced)).to(self.device)
-        if self._network is None:
+        if self.network is None:
             maps = covered.new_zeros(len(covered), SURFACE_CHANNELS, *covered.shape[-2:])
         else:
-            maps = self._network.predict(images, given, window) * covered[:, None]
+            maps = self.network.predict(images, given, window) * covered[:, None]
         # All of the mask is some part; what the network takes for none of them is the first one.
         parts = maps[:, COVERAGE]
         parts = parts * (covered / parts.sum(1).clamp(min=1e-6)).clamp(max=1.0)[:, None]

@@ -14,7 +14,7 @@ from ..settings.stages import Observe
 from ..threads import total
 from .frame_images import FrameImages
 from .losses import attention
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Observation:
 
 @torch.no_grad()
 def observe(
-    images: FrameImages, predictor: SurfacePredictor, state: SceneState, stage: Observe, *, whole: bool = False
+    images: FrameImages, predictor: FramePredictor, state: SceneState, stage: Observe, *, whole: bool = False
 ) -> Observation:
     """Predict surface maps.
 

@@ -1,4 +1,4 @@
-"""Who says what an image shows: the surface network, given masks, or in tests somebody who is always right."""
+"""What predicts the surface maps of an image: the surface network, given masks, or in tests the truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 
 
-class SurfacePredictor(Protocol):
-    """Predicts the surface maps of images (`carts_core.model.surface`)."""
+class FramePredictor(Protocol):
+    """Predicts the surface maps of one frame's images (`carts_core.model.surface`)."""
 
     @property
     def masked(self) -> bool:
@@ -24,8 +24,8 @@ class SurfacePredictor(Protocol):
 
     @property
     def knows_parts(self) -> bool:
-        """Whether it knows parts and normals, and not only the coverage of the whole arm, which is then in the first
-        channel."""
+        """Whether it predicts parts and normals, and not only the coverage of the whole arm, which is then in the
+        first channel."""
         ...
 
     @property
@@ -53,19 +53,28 @@ class SurfacePredictor(Protocol):
         """
         ...
 
-    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> "SurfacePredictor":
+
+class SurfacePredictor(Protocol):
+    """Has a predictor for each frame."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where all of them compute."""
+        ...
+
+    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
         """The predictor of one frame, as some cameras see it."""
         ...
 
 
 class ImagePredictor:
-    """To be derived from by predictors that know nothing but the images that they are shown."""
+    """Base of predictors that need nothing but images, so that one serves all frames."""
 
     masked = False
     knows_parts = True
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> Self:
-        """The same for all frames; see `SurfacePredictor.for_frame`."""
+        """See `SurfacePredictor.for_frame`."""
         return self
 
 
@@ -77,12 +86,12 @@ class NetworkPredictor(ImagePredictor):
 
     @property
     def device(self) -> torch.device:
-        """See `SurfacePredictor`."""
+        """See `FramePredictor`."""
         return self.extractor.device
 
     @property
     def stride(self) -> int:
-        """See `SurfacePredictor`."""
+        """See `FramePredictor`."""
         return self.extractor.stride
 
     def predict(
@@ -91,7 +100,7 @@ class NetworkPredictor(ImagePredictor):
         given: Float[Tensor, "cameras 6 height width"],
         window: Window,
     ) -> Float[Tensor, "cameras 6 h w"]:
-        """See `SurfacePredictor.predict`."""
+        """See `FramePredictor.predict`."""
         return self.extractor.surface(window.of(images), window.of(given))
 
 

@@ -14,7 +14,7 @@ from ..model.scene import SceneState
 from ..model.surface import COVERAGE
 from .frame_images import FrameImages
 from .losses import attention
-from .predictor import SurfacePredictor
+from .predictor import FramePredictor
 
 _MARGIN, _NEAR = 16, 8
 """What the network is shown beyond the arms, and how far from them predictions count [px of the working image]."""
@@ -51,7 +51,7 @@ class Evidence:
 
 @torch.no_grad()
 def evidence(
-    images: FrameImages, start: SceneState, end: SceneState, predictor: SurfacePredictor, loss: float
+    images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
     """What images say for and against a fit; runs the predictor twice.
 
