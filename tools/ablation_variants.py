@@ -103,7 +103,7 @@ VARIANTS = (
     Variant("Descend.steps 12", _every(Descend, steps=12)),
     Variant("no RandomRestart", _without(_RESTART)),
     Variant("RandomRestart.candidates 32", _at(_RESTART, candidates=32)),
-    Variant("RandomRestart.spread 1", _at(_RESTART, spread=1.0)),
+    Variant("RandomRestart.deviation 1", _at(_RESTART, deviation=1.0)),
     Variant("RandomRestart.if_loss 0.03", _at(_RESTART, if_loss=0.03)),
     Variant("arms are never lost", constants={"optimization.stages.arm_is_lost": lambda *_: False}),
     Variant("_SUPPORT 0", constants={"optimization.search._SUPPORT": 0.0}),

@@ -29,9 +29,9 @@ class Evaluate:
     json: Path | None = None
     """Write the scores of all frames and their means to this file; folders on the way to it are made."""
     mode: Mode = "frame"
-    """Optimize each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+    """Optimize each frame alone, or all together, so that frames inform each other (docs: sequences)."""
     together: bool = False
-    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
+    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)

@@ -30,8 +30,8 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     if not kept:
         return None
     return (
-        f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}, as the image hardly speaks against "
-        "it there."
+        f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}: there it fits the image as well as "
+        "the optimized values."
     )
 
 
@@ -79,7 +79,7 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
-    """A suggestion, if on average over frames the base frames look wrong, else None.
+    """A suggestion, if on average over frames the base frames are probably wrong, else None.
 
     Args:
         where: camera, or what else tells people which frames are meant.
@@ -89,7 +89,7 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
     if not known or np.mean(known) < BASE_FRAME_GAIN:
         return None
     return (
-        f"{where}: base frames or the camera's pose look wrong. Joints cannot explain what is left of the difference, "
-        f"and free base frames would take {100 * np.mean(known):.0f} % off it. Try `carts calibrate`, or add "
-        "--base-frames."
+        f"{where}: base frames or the camera's pose are probably wrong. Free base frames would reduce the remaining "
+        f"difference between image and rendering by {100 * np.mean(known):.0f} %, which joints cannot. Try "
+        "`carts calibrate`, or add --base-frames."
     )

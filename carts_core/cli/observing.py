@@ -1,4 +1,4 @@
-"""What is fitted: what the network sees in the images, given masks, or both."""
+"""What is fitted: predictions of the network, given masks, or both."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -28,7 +28,7 @@ class Observing(Network):
     """What is fitted, the networks, and where they run."""
 
     observe: Literal["network", "masks", "both"] = "network"
-    """What is fitted: what the network sees, the sequence's masks (no network is loaded), or both: the masks, with
+    """What is fitted: predictions of the network, the sequence's masks (no network is loaded), or both: the masks, with
     parts and normals from the network, which serves frames without a mask alone."""
 
     def observer(self, settings: SolverSettings) -> Observer:

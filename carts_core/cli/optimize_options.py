@@ -19,13 +19,13 @@ class OptimizeOptions:
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras if they look together."""
+    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras under --together."""
     overwrite: bool = False
     """Start over: everything that the folder holds is made again."""
     mode: Mode = "frame"
-    """Correct each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+    """Correct each frame alone, or all together, so that frames inform each other (docs: sequences)."""
     together: bool = False
-    """Let all chosen cameras look at a frame in one optimization (stereo); otherwise each works alone."""
+    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
     keyframes: Path | None = None
     """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)

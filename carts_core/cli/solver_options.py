@@ -27,7 +27,7 @@ class SolverOptions:
     """Which solver, and with what settings."""
 
     solver: Annotated[SolverName, tyro.conf.EnumChoicesFromValues] = SolverName.SURFACE
-    """Solver: `surface` is the default; `occluded` looks past what lies over the arms; `acs`, `acs_reference`, `l1` and
+    """Solver: `surface` is the default; `occluded` runs again without occluded pixels; `acs`, `acs_reference`, `l1` and
     `paper` compare image features as the paper does; `none` only compares the start."""
     settings: tuple[str, ...] = ()
     """Settings that differ from the solver's: TOML files as --print-settings writes them, or single ones such as
@@ -47,11 +47,11 @@ class SolverOptions:
         return changed(SequenceSettings(), _table(self.settings, "sequence"), "[sequence]")
 
     def freed(self, free: FreeParameters) -> FreeParameters:
-        """What is free, with what the settings say of it."""
+        """What is free, from options and settings."""
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """See that the solver is the one that knows how certain it is.
+        """Check that the solver is the one that estimates its uncertainty.
 
         Raises:
             SettingsError: it is not.

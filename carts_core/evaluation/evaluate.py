@@ -61,7 +61,7 @@ def evaluate(
         sequence: with masks, true kinematics, both or neither.
         networks: the networks, or another predictor of surface maps.
         frames: positions in the sequence.
-        cameras: names; every one sees the frame alone, unless they look `together`.
+        cameras: names; each is optimized alone, unless `together`.
         domains: names.
         settings, free: of the optimization.
         perturb_deg: 0 starts at the measured joint positions. Otherwise the start is the true joint positions (the

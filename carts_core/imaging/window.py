@@ -1,4 +1,4 @@
-"""The part of an image that is compared, so that the network does not look at the rest."""
+"""The part of an image that is compared; the network runs on nothing else."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Surface maps: what an image shows of the instruments, pixel by pixel, and nothing of how it looks.
+"""Surface maps: what an image shows of the instruments, pixel by pixel, without colours and light.
 
 A surface map has `SURFACE_CHANNELS` channels: which share of a pixel each of `PARTS` covers, in [0, 1], and the mean
 unit normal of what covers it times that coverage, in the camera's frame (x right, y down, z forward). Background is

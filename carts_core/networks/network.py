@@ -90,7 +90,7 @@ class FeatureNetwork(UNet):
     """The paper's network: a mask is a linear function of its features, and those are what ACS compares.
 
     Images are standardised first: their local mean is taken off and what is left gets unit deviation. Exposure, colour
-    casts and anything that smoothly veils the image then change little before the first convolution, without the
+    casts and anything that is laid smoothly over the image then change little before the first convolution, without the
     network ever having been shown such a thing.
     """
 

@@ -19,8 +19,6 @@ from .surface_network import SurfaceNetwork
 from .tensor_bytes import tensor_bytes
 
 VERSION = "1"
-WORKING_SIZE = (320, 240)
-"""Width and height [px] that a 640x480 image is reduced to before the network sees it."""
 
 _NETWORKS: dict[str, Callable[[Architecture], UNet]] = {
     f"carts-{network.kind}-network": network for network in (FeatureNetwork, SurfaceNetwork)

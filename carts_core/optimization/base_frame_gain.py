@@ -1,4 +1,4 @@
-"""Whether base frames look wrong: what free ones would explain of what joints leave."""
+"""Whether base frames are probably wrong: what free ones would explain of the residual that joints leave."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ _BLUR = 3.0
 
 @torch.no_grad()
 def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: FreeParameters) -> float:
-    """Share of what the last observation still holds against a point that free base frames would explain [1].
+    """Share of the surface residual at a point that free base frames would explain [1].
 
     What the present unknowns alone would still explain does not count, and a joint at its limit stays there.
 

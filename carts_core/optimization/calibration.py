@@ -53,16 +53,16 @@ class UnknownChange:
     """deg, mm, px or %, of all the other values."""
     change: float
     deviation: float
-    """Standard deviation that the curvature tells, pixels taken for independent."""
+    """Standard deviation from the curvature, with pixels taken for independent."""
     deviation_between_frames: float
     """The same from how much the frames contradict each other, which also knows errors that pixels share."""
     prior_deviation: float
-    """Before any image was looked at; an unknown whose `deviation` is close to this was not seen."""
+    """Before any image was used; an unknown whose `deviation` is close to this was not determined."""
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The best calibration, and what speaks for it."""
+    """The best calibration, and the evidence for it."""
 
     scene: Scene
     """As given, with the new calibration."""
@@ -162,8 +162,7 @@ class CalibrationOptimizer:
             seconds=time.perf_counter() - began,
         )
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
-        best = self._best_point
-        if best is None or point.epoch != best.epoch or iterate.loss < best.evaluation.loss:
+        if point.improves_on(self._best_point):
             self.best, self._best_point = iterate, point
         return iterate
 

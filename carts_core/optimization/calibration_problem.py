@@ -135,9 +135,9 @@ class CalibrationProblem:
         self.present: Descend | None = None
         self._lowest, self._begun = math.inf, False
 
-    def epoch(self, blur: float) -> tuple[int, float]:
-        """Losses compare within an epoch: one observation, under one blur."""
-        return self._parts[0].problem.epoch(blur)
+    def objective_key(self, blur: float) -> tuple[int, float]:
+        """Which objective it is: one observation, under one blur. Losses compare within it."""
+        return self._parts[0].problem.objective_key(blur)
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
         """Observe all frames; those that fit badly count less from here on."""

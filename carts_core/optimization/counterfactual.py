@@ -1,8 +1,8 @@
-"""What the network takes for an arm although no arm is there: what it also sees in the empty background.
+"""False positives of the network in the background, found by running it once on the mean background.
 
-The paper compares an image with BG_m + rendering, so what looks like an arm in the background is in both. The surface
-network sees one image at a time. It looks at the mean background once, and what it sees there is taken from what it
-sees in an image, as far as the image still shows that background.
+The paper compares an image with BG_m + rendering, so whatever resembles an arm in the background is in both. The
+surface network has one image at a time. It is run once on the mean background, and what it predicts there is
+subtracted from its predictions in an image, as far as the image still shows that background.
 """
 
 from collections.abc import Iterable, Mapping
@@ -38,7 +38,7 @@ _FOREIGN = 0.06
 """Median difference from which a background is not that of the image [1]."""
 
 _DECEPTIVE = 0.08
-"""Share of a background that the network takes for arms, from which it is not let see it [1]."""
+"""Share of a background with false positives from which the network gets images without that background [1]."""
 
 _NEUTRAL = 0.75, 0.55, 0.45
 """What is put in the place of such a background, RGB: tissue without features."""
@@ -56,11 +56,11 @@ class Background:
     known: Float[Tensor, "cameras 1 h w"]
     """How far they are known to show no arm [1]."""
     seen: Float[Tensor, "cameras 1 h w"]
-    """What the network takes for an arm in them, where they are known."""
+    """Coverage that the network predicts in them, where they are known: false positives."""
 
     @property
     def deceptive(self) -> bool:
-        """Whether the network takes much of what is there for arms."""
+        """Whether the network has many false positives there."""
         return float(self.seen.mean()) > _DECEPTIVE
 
     def changed(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> Float[Tensor, "cameras 1 h w"]:
@@ -97,10 +97,10 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
     for _ in range(_FITS):
         total = weight.sum(1, keepdim=True)
         x_mean, y_mean = (weight * x).sum(1, keepdim=True) / total, (weight * y).sum(1, keepdim=True) / total
-        spread = (weight * (x - x_mean).square()).sum(1, keepdim=True) / total
-        together = (weight * (x - x_mean) * (y - y_mean)).sum(1, keepdim=True) / total
+        variance = (weight * (x - x_mean).square()).sum(1, keepdim=True) / total
+        covariance = (weight * (x - x_mean) * (y - y_mean)).sum(1, keepdim=True) / total
         # A background of one colour says nothing of the gain; then it stays 1.
-        gain = ((together + 1e-4) / (spread + 1e-4)).clamp(0.3, 3.0)
+        gain = ((covariance + 1e-4) / (variance + 1e-4)).clamp(0.3, 3.0)
         offset = y_mean - gain * x_mean
         error = (y - gain * x - offset).abs()
         scale = 2.0 * error.median(1, keepdim=True).values.clamp(min=0.01)
@@ -111,7 +111,7 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
 def without_background(
     images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"]
 ) -> Float[Tensor, "cameras 3 h w"]:
-    """What has changed in images, before a background in which there is nothing to be seen."""
+    """What has changed in images, before a background without features."""
     neutral = torch.tensor(_NEUTRAL, device=images.device)[:, None, None]
     return changed * images + (1.0 - changed) * neutral
 
@@ -125,7 +125,7 @@ class Recording(Protocol):
 
 
 class Backgrounds:
-    """The mean backgrounds of cameras, and what the network sees in them; one object serves all frames.
+    """The mean backgrounds of cameras, and the network's false positives in them; one object serves all frames.
 
     Args:
         images: camera name -> mean background BG_m.

@@ -9,8 +9,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What a quadratic model says of the shared unknowns when its own ones always stand at their best. On the CPU, in
-    double precision."""
+    """A quadratic model of the shared unknowns, with a frame's own ones at their best (Schur complement). On the CPU,
+    in double precision."""
 
     gradient: Float[Tensor, " shared"]
     curvature: Float[Tensor, "shared shared"]

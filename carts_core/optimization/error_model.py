@@ -1,7 +1,7 @@
 """The error of measured kinematics over time: constant + slow drift + noise, for every unknown, as a Kalman smoother.
 
 A correction is what is added to a measured value. Of each unknown it is the sum of three parts: a constant, a drift
-that forgets itself over `drift_seconds` (an Ornstein-Uhlenbeck process), and noise that is new in every frame. All are
+that decorrelates over `drift_seconds` (an Ornstein-Uhlenbeck process), and noise that is new in every frame. All are
 Gaussian around 0. The images tell of the sum only, and often of a few directions of it only; the parts are what
 carries knowledge to other frames.
 """
@@ -26,7 +26,7 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Information:
-    """What one frame says of its correction x: a log likelihood of -x.precision.x / 2 + vector.x."""
+    """What one frame measures of its correction x: a log likelihood of -x.precision.x / 2 + vector.x."""
 
     precision: Float[np.ndarray, "n n"]
     """[1/rad^2]; may be singular: what the image does not show."""
@@ -57,8 +57,8 @@ class Information:
         n = len(self.vector)
         residual = self.vector - self.precision @ expected.mean
         difference = np.linalg.solve(self.precision + np.eye(n), residual)
-        spread = np.eye(n) + expected.covariance @ self.precision
-        return float(residual @ np.linalg.solve(spread, difference)) / n
+        whitened = np.eye(n) + expected.covariance @ self.precision
+        return float(residual @ np.linalg.solve(whitened, difference)) / n
 
 
 _EXACT = 1e14
@@ -103,7 +103,7 @@ class ErrorModel:
         return combined(state, information, self._sum)
 
     def smoothed(self, filtered: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
-        """Corrections of all frames, each in the light of all others (Rauch, Tung and Striebel, 1965).
+        """Corrections of all frames, each given all others (Rauch, Tung and Striebel, 1965).
 
         Args:
             filtered: filtered states, after each frame.

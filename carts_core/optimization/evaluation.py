@@ -1,4 +1,4 @@
-"""What a problem says of one point: the objective, its quadratic model, and what it looks like."""
+"""A problem evaluated at one point: the objective, its quadratic model, and the rendered images."""
 
 from dataclasses import dataclass
 

@@ -20,7 +20,7 @@ from .losses import attention, attentional_loss, cosine_similarity, smooth_l1
 from .variables import Variables
 
 _SURROUNDINGS = 16
-"""What the network sees beyond the attention [px of the working image]."""
+"""How far the network's input reaches beyond the attention [px of the working image]."""
 
 
 class FeatureProblem:
@@ -67,7 +67,7 @@ class FeatureProblem:
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
         """Observed features are computed when a window is compared first."""
 
-    def epoch(self, blur: float) -> tuple[int, float]:
+    def objective_key(self, blur: float) -> tuple[int, float]:
         """All losses compare: each is of the final attention."""
         return 0, 0.0
 

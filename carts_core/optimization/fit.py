@@ -42,8 +42,8 @@ class Problem(Protocol):
         """The objective at a point, as a stage compares it."""
         ...
 
-    def epoch(self, blur: float) -> tuple[int, float]:
-        """Losses compare within an epoch."""
+    def objective_key(self, blur: float) -> tuple[int, float]:
+        """Which objective a stage with this blur evaluates. Losses compare among points of the same one."""
         ...
 
 
@@ -53,8 +53,12 @@ class Point:
 
     offsets: Float[Tensor, " n"]
     evaluation: Evaluation
-    epoch: tuple[Any, ...]
-    """Losses compare among points of the same epoch."""
+    objective_key: tuple[Any, ...]
+    """Which objective was evaluated. Losses compare among points of the same one."""
+
+    def improves_on(self, best: "Point | None") -> bool:
+        """Whether it replaces the best point so far: its loss is lower, or both do not compare and it came later."""
+        return best is None or self.objective_key != best.objective_key or self.evaluation.loss < best.evaluation.loss
 
 
 @dataclass
@@ -101,7 +105,7 @@ class Fit:
         """Evaluate the present estimate."""
         self.used += 1
         evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)
-        return Point(self.offsets, evaluation, (self.restarts, *self.problem.epoch(stage.blur)))
+        return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
 
     def restart(self, offsets: Float[Tensor, " n"]) -> None:
         """Go on from elsewhere, with more care than before."""

@@ -30,13 +30,13 @@ from .verdict import Assessment, Verdict, assess
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of an optimization and what it looks like. A copy: nothing later changes it."""
+    """A point of an optimization, with its rendering. A copy: nothing later changes it."""
 
     index: int
     """Number of steps before it; 0 is the start."""
     state: SceneState
     loss: float
-    """Without the prior. Comparable within one observation, and under one blur if nobody watches."""
+    """Without the prior. Comparable within one observation, and if not `live` under one blur."""
     terms: dict[str, float]
     """Parts of the objective that was descended."""
     gradient_norms: dict[str, float]
@@ -83,7 +83,7 @@ class FrameOptimizer:
         scene: arms and cameras.
         frame: observed images and measured joint positions.
         backgrounds: camera name -> mean background BG_m. A `DescentSolver` needs them all; a `SurfaceSolver` takes
-            what looks like an arm in them for none, and goes without where one is missing. `Backgrounds` that serve
+            what looks like an arm in them for none, and does without where one is missing. `Backgrounds` that serve
             several frames save time.
         networks: the networks, or another predictor of surface maps.
         ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` leaves them out.
@@ -91,8 +91,8 @@ class FrameOptimizer:
         settings: the solver, `SurfaceSolver()` by default.
         free: what is unknown.
         cameras: names of the cameras that take part, all by default.
-        live: whether someone watches. If nobody does, a `SurfaceSolver` saves a third of its time: iterates of coarse
-            stages are seen and rated as coarsely as they are compared. The end is the same.
+        live: whether iterates are displayed. If not, a `SurfaceSolver` saves a third of its time: iterates of coarse
+            stages are rendered and rated as coarsely as they are compared. The end is the same.
 
     Raises:
         SettingsError: an image or background is missing or of the wrong size, or nothing is free.
@@ -147,7 +147,7 @@ class FrameOptimizer:
         self._points = self._judged(run_stages(self.settings.stages, self._fit))
         self.assessment: Assessment | None = None
         """At the end, how far the result can be relied on; None before, and for solvers other than `SurfaceSolver`.
-        What failed keeps its start, unless the image speaks against that even more."""
+        What failed keeps its start, unless the image contradicts that even more."""
 
     @property
     def proposed(self) -> dict[str, Bool[np.ndarray, "h w"]]:
@@ -169,7 +169,7 @@ class FrameOptimizer:
             return None
         iterate = self._iterate(point, time.perf_counter() - began)
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
-        if self.best is None or self._improves(point):
+        if point.improves_on(self._best_point):
             self.best, self._best_point = iterate, point
         return iterate
 
@@ -184,7 +184,7 @@ class FrameOptimizer:
         if self.assessment.verdict is not Verdict.FAILED or not bool(last.offsets.any()):
             return
         ended, fit.offsets = fit.offsets, torch.zeros_like(fit.offsets)
-        start = replace(fit.evaluate(FINEST), epoch=(*last.epoch, "start"))
+        start = replace(fit.evaluate(FINEST), objective_key=(*last.objective_key, "start"))
         if self.assessment.nothing_there or self._assess(problem, start).probability <= self.assessment.probability:
             fit.stop_reason = StopReason.FAILED
             yield start
@@ -195,18 +195,13 @@ class FrameOptimizer:
         """The verdict on a point."""
         return assess(problem.evidence(point.offsets, point.evaluation.loss))
 
-    def _improves(self, point: Point) -> bool:
-        """Whether a point replaces the best one: it is better, or the two do not compare because it knows more."""
-        best = self._best_point
-        return best is None or point.epoch != best.epoch or point.evaluation.loss < best.evaluation.loss
-
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""
         while (iterate := self.step()) is not None:
             yield iterate
 
     def base_frame_gain(self) -> float | None:
-        """Share of what the images still hold against the best iterate that free base frames would explain [1].
+        """Share of the surface residual at the best iterate that free base frames would explain [1].
 
         By the linear model, so it costs one more comparison and no run. Pixels that are ignored, on a proposal too, do
         not count. Several cameras count together, so a single one with a wrong pose shows less.

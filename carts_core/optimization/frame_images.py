@@ -31,7 +31,7 @@ class FrameImages:
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
-    """Share of what is seen of arms that the empty background shows as well [1]; None where that is not known."""
+    """Share of the predicted coverage that is predicted in the empty background, too [1]; None where not known."""
     changed: Float[Tensor, "cameras 1 h w"] | None
     """How surely each pixel differs from the empty background [1]; None where that is not known."""
     renderer: Renderer

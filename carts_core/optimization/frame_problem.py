@@ -41,8 +41,8 @@ class FrameProblem:
         settings: noise, weights, working size.
         ignore: camera name -> pixels that show an occluder.
         prior: of the unknowns; as the settings expect by default.
-        backgrounds: of the cameras; what the predictor also sees in them is no arm.
-        live: whether coarse stages are also compared under a fine blur, for somebody who watches. It takes a third
+        backgrounds: of the cameras; what is predicted in them as well counts as a false positive.
+        live: whether coarse stages are also compared under a fine blur, for a display. It takes a third
             more time and changes no step.
 
     Attributes:
@@ -111,19 +111,19 @@ class FrameProblem:
         return self._images[scale]
 
     def reset(self) -> None:
-        """Forget what was observed and proposed."""
+        """Drop the observation and the proposed ignore mask."""
         if self.proposed:
             self._given, self._images, self._edges = (self._given[0], self._ignore), {}, None
         self._observation, self._factors, self.observations, self.proposed = None, {}, 0, {}
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"], *, whole: bool = False) -> None:
-        """Have the predictor look at the images, conditioned on the start or on an estimate."""
+        """Have surface maps of the images predicted, conditioned on the start or on an estimate."""
         given = self.start if stage.given is Given.START else offsets
         state = self.variables.state(given)
         self.observation = observe(self.images(stage.scale), self.predictor, state, stage, whole=whole)
 
     def ignore_occluders(self, evaluation: Evaluation) -> bool:
-        """Leave out what probably lies over the arms, from a fit's evaluation; False if nothing does."""
+        """Leave out pixels that probably show an occluder, from a fit's evaluation; False if there are none."""
         silhouette, similarity = evaluation.silhouette.cpu().numpy(), evaluation.similarity.cpu().numpy()
         self.proposed = propose_ignore(self.scene, silhouette, similarity)
         if self.proposed:
@@ -141,8 +141,8 @@ class FrameProblem:
             )
         return self._factors[key]
 
-    def epoch(self, blur: float) -> tuple[int, float]:
-        """Losses compare within an epoch: an observation, and where nobody watches one blur."""
+    def objective_key(self, blur: float) -> tuple[int, float]:
+        """Which objective it is: one observation and, if not live, one blur. Losses compare within it."""
         return self.observations, 0.0 if self._live else blur
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""An ignore mask that nobody painted: where the image contradicts an estimate at the arms, something lies over them."""
+"""A proposed ignore mask: where an image contradicts an estimate at the arms, something probably occludes them."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ _MOST = 0.5
 def propose_ignore(
     scene: Scene, silhouette: Float[np.ndarray, "cameras h w"], similarity: Float[np.ndarray, "cameras h w"]
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
-    """Pixels that probably show an occluder: areas at the arms where the network sees something else than is rendered.
+    """Pixels that probably show an occluder: areas at the arms where the prediction differs from the rendering.
 
     An occluder that the network takes for background makes a gap in the arm, one that it takes for an instrument
     sticks out of the arm. Both count, if they touch the silhouette.

@@ -1,6 +1,6 @@
 """Where a sequence starts: of what a few frames measure alone, what suits all of these best.
 
-A single image may deceive (smoke, a tool in front), and the network is conditioned on the estimate, so a wrong start
+A single image may mislead (smoke, a tool in front), and the network is conditioned on the estimate, so a wrong start
 would be confirmed in every frame after it. Errors of kinematics are much the same in all frames; those of images are
 not.
 """

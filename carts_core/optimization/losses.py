@@ -1,4 +1,4 @@
-"""Losses between what is seen and what is rendered."""
+"""Losses between observed and rendered features."""
 
 import cv2
 import numpy as np

@@ -100,7 +100,7 @@ class _FrameMasks:
             maps = covered.new_zeros(len(covered), SURFACE_CHANNELS, *covered.shape[-2:])
         else:
             maps = self.network.predict(images, given, window) * covered[:, None]
-        # All of the mask is some part; what the network takes for none of them is the first one.
+        # All of the mask is some part; where the network predicts none, it is the first one.
         parts = maps[:, COVERAGE]
         parts = parts * (covered / parts.sum(1).clamp(min=1e-6)).clamp(max=1.0)[:, None]
         parts[:, 0] += covered - parts.sum(1)

@@ -27,7 +27,7 @@ class Uncertainty:
     std: tuple[float, ...]
     """Standard deviation [rad], [m] for prismatic joints and translations."""
     expected: tuple[float, ...]
-    """The same before the image was looked at."""
+    """The same before the image was used."""
 
     def verdict(self, name: str) -> Verdict:
         """Whether the image determined an unknown: it has become three times as certain, a little, or not at all."""
@@ -53,7 +53,7 @@ def uncertainty(
     Args:
         names: of the unknowns.
         curvature: J^T J / noise^2 and the prior, per offset.
-        prior: inverse variance of each offset before the image was looked at.
+        prior: inverse variance of each offset before the image was used.
         scales: what an offset of 1 is in units of its unknown.
         common: what the gradient would be off by for one standard deviation of an error that all pixels share. Pixels
             cannot average it out, so it comes on top of what their noise does, but never above what was expected.

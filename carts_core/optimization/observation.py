@@ -22,7 +22,7 @@ class Observation:
     """Predicted surface maps in a window of the images, and what their pixels are worth."""
 
     images: FrameImages
-    """What was looked at."""
+    """The images that were observed."""
     window: Window
     """Which part of it [px of these images]."""
     maps: Float[Tensor, "cameras 6 h w"]

@@ -43,7 +43,7 @@ def best_random_start(
         seed: of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
-    deviation = stage.spread * problem.prior.marginal.rsqrt().cpu()
+    deviation = stage.deviation * problem.prior.marginal.rsqrt().cpu()
     problem.observe(Observe(scale=stage.scale, given=Given.START, haze=False), offsets, whole=True)
     best = offsets
     for group in problem.variables.groups:

@@ -52,7 +52,7 @@ class SequenceOptimizer:
         free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] that a person set.
         ignore: position -> camera name -> pixels that show an occluder; none by default.
-        backgrounds: of the cameras; what looks like an arm in them is taken for none.
+        backgrounds: of the cameras, for what the network takes for an arm in them.
         cameras: names of the cameras that take part, all by default.
         checkpoint: keeps what was found on disk, for a run that goes on after a stop; see `sequence_checkpoint`.
 
@@ -88,9 +88,9 @@ class SequenceOptimizer:
         for positions in self._keyframes.values():
             self._scene.state(positions)
         gaps = visiting_gaps(times, self.model)
-        strangers = set(self._keyframes) - set(gaps)
-        if strangers:
-            raise SettingsError(f"keyframe {min(strangers)} is not among the frames. Choose it too, or leave it out.")
+        unknown = set(self._keyframes) - set(gaps)
+        if unknown:
+            raise SettingsError(f"keyframe {min(unknown)} is not among the frames. Choose it too, or leave it out.")
         self._solver = FrameSolver(
             self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds
         )
@@ -138,7 +138,7 @@ class SequenceOptimizer:
 
     @property
     def estimates(self) -> dict[int, FrameEstimate]:
-        """Position -> estimate of every frame visited so far, in the light of all of them; ordered as visited."""
+        """Position -> estimate of every frame visited so far, given all of them; ordered as visited."""
         if self._estimates is None:
             corrections = self._smoother.smoothed()
             self._estimates = {

@@ -1,4 +1,4 @@
-"""What sequence mode says of a frame, and what it keeps of one that was visited."""
+"""The estimate of a frame of a sequence, and what is kept of a frame that was visited."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -32,7 +32,7 @@ class Origin(StrEnum):
 
 @dataclass(frozen=True)
 class FrameEstimate:
-    """One frame of a sequence, in the light of the others that were seen."""
+    """One frame of a sequence, given the measurements of the others."""
 
     index: int
     frame_id: str

@@ -1,4 +1,4 @@
-"""What the measurements of several frames say of each of them together."""
+"""A Kalman filter and Rauch-Tung-Striebel smoother of the corrections of frames."""
 
 from collections.abc import Collection, Mapping
 from math import inf

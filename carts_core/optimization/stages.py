@@ -118,8 +118,8 @@ def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient, uncertainty=before.uncertainty)
         point = replace(point, evaluation=evaluation)
-    # It is what counts in the end, whatever the loss says, which knows no edges.
-    yield replace(point, epoch=(*point.epoch, "end"))
+    # It is what counts in the end, whatever its loss, in which edges have no part.
+    yield replace(point, objective_key=(*point.objective_key, "end"))
 
 
 @run_stage.register

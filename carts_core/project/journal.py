@@ -150,11 +150,6 @@ def add_export(record: ExportRecord) -> Script:
     return script
 
 
-def _stored(figure: float | None) -> float | None:
-    """As SQLite gives it back: it keeps no negative zero."""
-    return None if figure is None else figure + 0.0
-
-
 def _record(time: Any, format: Any, path: Any, frames: Any, settings: Any) -> ExportRecord:
     texts = [_typed(text, str) for text in (format, path, settings)]
     return ExportRecord(_typed(time, float), texts[0], texts[1], _typed(frames, int), texts[2])

@@ -1,4 +1,4 @@
-"""Which frame to look at next."""
+"""Which frame to review next."""
 
 import math
 from bisect import bisect_left, bisect_right

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..model.scene import Scene, SceneState
@@ -16,7 +16,7 @@ from .motion import carry_motion
 from .outline import Outline, normal_motion, outline_pixels, outline_position
 from .points import visible_points
 from .shading import phong
-from .surface import SurfaceRendering, spread, surface_values
+from .surface import SurfaceRendering, scattered, surface_values
 from .visibility_numba import rasterize
 from .visibility_torch import visibility_torch
 
@@ -45,11 +45,6 @@ class Rendering:
     def depth(self) -> Float[Tensor, "*batch cameras height width"]:
         """Depth of the visible surface [m], 0 for background; without gradient."""
         return torch.where(self.face_ids >= 0, 1.0 / self.inverse_depth, 0.0)
-
-    def arm_masks(self, arms: int) -> Bool[Tensor, "*batch cameras {arms} height width"]:
-        """The visible part of each arm."""
-        index = torch.arange(arms, device=self.face_ids.device)[:, None, None]
-        return self.arm_ids[..., None, :, :] == index
 
 
 class Renderer:
@@ -140,7 +135,7 @@ class Renderer:
         points = visible_points(self.geometry, face_ids, inverse_depth, views_T, views_K)
         position, normal = points.transformed(views_T)
         values = surface_values(self.geometry.face_parts[points.face], normal * _side(position, normal))
-        maps = spread(values, points.pixel, face_ids.shape)
+        maps = scattered(values, points.pixel, face_ids.shape)
         return maps.view(*Ts.shape[:-3], *maps.shape[1:])
 
     @torch.no_grad()
@@ -165,7 +160,7 @@ class Renderer:
         color = phong(colors, position, normal, self.scene.light)
         side = _side(position, normal)
         values = torch.cat([surface_values(self.geometry.face_parts[points.face], normal * side), color])
-        dense = spread(values, points.pixel, face_ids.shape)
+        dense = scattered(values, points.pixel, face_ids.shape)
         maps, image = dense[:, :SURFACE_CHANNELS].contiguous(), dense[:, SURFACE_CHANNELS:]
         if tangents is None:
             return SurfaceRendering(maps, image, ())

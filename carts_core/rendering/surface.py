@@ -31,7 +31,7 @@ def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Fl
     return values
 
 
-def spread(
+def scattered(
     values: Float[Tensor, "channels K"], pixel: Int[Tensor, " K"], shape: torch.Size
 ) -> Float[Tensor, "views channels height width"]:
     """Values of pixels, as indices into flattened images of a shape [views, height, width], in their places; 0 between

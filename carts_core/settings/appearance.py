@@ -15,7 +15,7 @@ class AppearanceRanges:
     """Ranges that the camera of an observed training image is drawn from.
 
     There is deliberately no smoke, no blood and no low light: robustness to those is to be shown, not trained.
-    Nothing red is ever drawn over an instrument, nothing veils a part of the image, and `brightness` has a floor.
+    Nothing red is ever drawn over an instrument, nothing hides a part of the image, and `brightness` has a floor.
     """
 
     brightness: Range = (0.65, 1.35)

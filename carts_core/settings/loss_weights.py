@@ -29,7 +29,7 @@ class SurfaceWeights:
     everywhere: float = 1.0
     """Cross-entropy of coverage, all pixels."""
     near: float = 1.0
-    """The same near instruments, where the optimizer looks."""
+    """The same near instruments, where the optimizer compares."""
     dice: float = 0.5
     """One minus soft Dice per image and part, so that small parts count as much as large ones."""
     normals: float = 1.0

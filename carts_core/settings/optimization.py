@@ -49,7 +49,7 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class SurfaceSolver:
-    """Surface maps that a network sees against those that are rendered, by Levenberg-Marquardt: the default."""
+    """Compares predicted surface maps with rendered ones, by Levenberg-Marquardt: the default."""
 
     stages: tuple[Stage, ...] = presets.FRAME
     """What runs, in this order."""
@@ -58,7 +58,7 @@ class SurfaceSolver:
     working_width: int = 320
     """Width of the working image [px]; stages say how many times larger their images are."""
     noise: float = 1.33
-    """Deviation of the surface map that the network sees, per pixel [1]; a small value trusts the image."""
+    """Deviation of the predicted surface map, per pixel [1]; a small value relies on the image."""
     mask_noise: float = 0.5
     """The same of given masks [1]."""
     parts_weight: float = 0.1
@@ -68,7 +68,7 @@ class SurfaceSolver:
     dehaze: float = 0.8
     """Share of smoke and haze that is taken off images [1]; 0 leaves images as they are."""
     outline_error: float = 0.5
-    """Expected error that all outlines seen in an image have in common, outwards or inwards [px of the working image].
+    """Expected error that all outlines in an image have in common, outwards or inwards [px of the working image].
     It widens the reported deviations of what moves an arm along the line of sight."""
     prior_deg: float = 2.5
     """Expected error of a joint position at the start [deg]; `length_scale` turns it into metres."""
@@ -104,12 +104,12 @@ class SurfaceSolver:
 
 @dataclass(frozen=True)
 class DescentSolver:
-    """The paper's way: features of the image against those of the mean background with the rendered arms."""
+    """Compares features of the image with those of the hybrid image (rendered arms over the mean background)."""
 
     loss: Loss = Loss.ACS
     """Which loss."""
     method: Method = "adam"
-    """How it is descended."""
+    """Optimizer that descends it."""
     stages: tuple[Stage, ...] = presets.FEATURES
     """What runs, in this order."""
     iterations: int = 60
@@ -123,7 +123,7 @@ class DescentSolver:
     length_scale: float = 0.15
     """Metres of translation that count as one radian [m]."""
     prior_weight: float = 0.02
-    """Weight of the prior that holds unknowns at their start [1/rad^2]; what the image cannot see stays measured."""
+    """Weight of the prior that holds unknowns at their start [1/rad^2]; what the image leaves open stays measured."""
     working_width: int = 320
     """Width of the images that are compared [px]."""
     tolerance: float = 0.0
@@ -197,7 +197,7 @@ class SolverName(StrEnum):
     SURFACE = "surface"
     """The default: `SurfaceSolver`."""
     OCCLUDED = "occluded"
-    """The same, run again without what probably lies over the arms."""
+    """The same, run again without pixels that probably show an occluder."""
     ACS = "acs"
     """Attentional cosine similarity, independent of the silhouette's size."""
     ACS_REFERENCE = "acs_reference"

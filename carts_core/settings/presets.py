@@ -47,13 +47,13 @@ OCCLUDED: tuple[Stage, ...] = (
     IgnoreOccluders(then=FRAME[:-3]),
     *FRAME[-3:],
 )
-"""One frame alone, run again without what probably lies over the arms."""
+"""One frame alone, run again without pixels that probably show an occluder."""
 
 NONE: tuple[Stage, ...] = (Observe(), Evaluate())
 """Nothing moves: the start is compared ("CaRTS without optimization")."""
 
 COLD: tuple[Stage, ...] = (*SEARCH, Observe(), FINEST)
-"""A frame of a sequence that nothing is known of but its measured kinematics; `WARM` follows."""
+"""A frame of a sequence of which only the measured kinematics are known; `WARM` follows."""
 
 _NEAR_FINEST = Observe(margin=27, attention=27)
 

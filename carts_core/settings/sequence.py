@@ -13,7 +13,7 @@ Direction = Literal["forward", "backward"]
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Model of the measurement error and the way through the frames (docs: explanation/sequences)."""
+    """Model of the measurement error, and how frames inform each other (docs: explanation/sequences)."""
 
     constant_deg: float = 2.0
     """Deviation of the constant part of the error [deg]; `length_scale` turns it into metres."""
@@ -37,11 +37,11 @@ class SequenceSettings:
     direction: Direction = "forward"
     """Where the first pass begins: at the first frame, or at the last one."""
     frame_seconds: float = 0.25
-    """Time between frames, where the sequence does not tell [s]."""
+    """Time between frames, where the sequence has no times [s]."""
     cold: tuple[Stage, ...] = presets.COLD
     """Stages from measured kinematics; `warm` follows."""
     warm: tuple[Stage, ...] = presets.WARM
-    """Stages from what the other frames let expect."""
+    """Stages from the correction that the other frames predict."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():

@@ -28,11 +28,11 @@ class Observe:
     given: Given = Given.ESTIMATE
     """The state that the network is conditioned on."""
     margin: int = 16
-    """What the network sees beyond the arms of that state [px]."""
+    """How far the network's input reaches beyond the arms of that state [px]."""
     attention: int = 8
     """Distance from the arms of that state beyond which nothing counts [px]."""
     haze: bool = True
-    """Whether what is seen through haze counts less. A search does better with all that there is."""
+    """Whether pixels under haze count less. A search does better with all pixels."""
 
     def __post_init__(self) -> None:
         require(0.1 <= self.scale <= 8, "Observe.scale", self.scale, "0.1 to 8")
@@ -75,7 +75,7 @@ class RandomRestart:
     """Loss from which a fit is bad [1]."""
     candidates: int = 64
     """Random states per arm [1]."""
-    spread: float = 1.8
+    deviation: float = 1.8
     """Their deviation, in expected errors [1]."""
     scale: float = 0.75
     """Of the whole image that they are compared with, as `Observe.scale` [1]."""
@@ -83,14 +83,14 @@ class RandomRestart:
     def __post_init__(self) -> None:
         require(0 <= self.if_loss <= 10, "RandomRestart.if_loss", self.if_loss, "0 to 10")
         require(1 <= self.candidates <= 10_000, "RandomRestart.candidates", self.candidates, "1 to 10000")
-        require(0 < self.spread <= 10, "RandomRestart.spread", self.spread, "above 0, at most 10")
+        require(0 < self.deviation <= 10, "RandomRestart.deviation", self.deviation, "above 0, at most 10")
 
 
 @dataclass(frozen=True)
 class ShaftSearch:
     """Where the fit is doubtful: move each arm along its shaft either way, observe again conditioned on that, and go
-    on from the best. A network that is conditioned on a shaft which ends too early may see it end there; given masks do
-    not, and skip this."""
+    on from the best. A network that is conditioned on a shaft which ends too early may confirm that it ends there;
+    given masks do not, and skip this."""
 
     then: tuple["Stage", ...]
     """What runs where another place was better. Places are compared as the first `Descend` of these compares them."""
@@ -106,7 +106,7 @@ class ShaftSearch:
 
 @dataclass(frozen=True)
 class AlignEdges:
-    """Draw the outlines of the arms to edges of the image, weighed against what the network saw. Skipped where given
+    """Move the outlines of the arms to edges of the image, weighed against the surface factor. Skipped where given
     masks are the target: they say where outlines are."""
 
     steps: int = 24
@@ -138,7 +138,7 @@ class PreferStart:
 
 @dataclass(frozen=True)
 class IgnoreOccluders:
-    """Propose what lies over the arms from what contradicts the fit, and run again without it."""
+    """Propose an ignore mask of occluders from what contradicts the fit, and run again without those pixels."""
 
     then: tuple["Stage", ...]
     """What runs from the start again, if anything was proposed."""

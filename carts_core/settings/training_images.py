@@ -1,4 +1,4 @@
-"""What the images look like that networks are trained on."""
+"""The images that networks are trained on."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +26,7 @@ class ImageSettings:
     same_background: float = 0.7
     """Share of pairs whose mean background is that of the observed image."""
     occluded: float = 0.4
-    """Share of observed images in which something lies over the arms; what is to be learnt is the arms below it."""
+    """Share of observed images in which something occludes the arms; the labels are those of the arms below it."""
     things: float = 0.35
     """Share of observed images with rods, plates, cables and the like behind the arms."""
     absent: float = 0.1

@@ -15,6 +15,7 @@ PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 _MARK = re.compile(r"<!-- not run: (.+?) -->")
 _FENCE = re.compile(r"^(`{3,})(\S*)")
 _PROGRAMS = ("carts ", "uvx ", "uv ", "pipx ", "docker ", "make", "python", "ssh ", "git ", ".venv/", "cd ")
+_IMPORTS = ("import ", "from ")
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Every block of a page: fenced ones, and indented ones that hold commands."""
+    """Every block of a page: fenced ones, and indented ones that hold commands or begin with imports."""
     lines, found, reason, number = page.read_text(encoding="utf-8").splitlines(), [], None, 0
     name = page.relative_to(ROOT).as_posix()
     while number < len(lines):
@@ -55,8 +56,9 @@ def blocks(page: Path) -> list[Block]:
             while number + 1 < len(lines) and lines[number + 1].startswith("    "):
                 number += 1
             text = "\n".join(indented[4:] for indented in lines[begin : number + 1])
-            if text.startswith(_PROGRAMS):
-                found.append(Block(name, begin + 1, "console", text, reason))
+            language = "console" if text.startswith(_PROGRAMS) else "python" if text.startswith(_IMPORTS) else None
+            if language is not None:
+                found.append(Block(name, begin + 1, language, text, reason))
         if line.strip():
             reason = mark[1] if mark else None
         number += 1

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import pytest
 from doc_blocks import ROOT, Block, all_blocks, blocks
@@ -49,16 +50,10 @@ def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, di
     return desk, kept | {"HOME": str(home), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in TO_RUN]
-)
-def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]) -> None:
+def run_blocks(todo: list[list[Any]], reader: tuple[Path, dict[str, str]]) -> subprocess.CompletedProcess[str]:
+    """Run blocks, each given as where it stands, its language, and its text or commands, in a process of their own."""
     desk, environment = reader
-    todo = [
-        [str(block), block.language, block.text if block.language == "python" else block.commands()]
-        for block in TO_RUN[page]
-    ]
-    finished = subprocess.run(
+    return subprocess.run(
         [sys.executable, str(ROOT / "tests" / "documentation" / "run_doc_blocks.py")],
         input=json.dumps(todo),
         cwd=desk,
@@ -68,6 +63,17 @@ def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]
         check=False,
         timeout=SECONDS,
     )
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in TO_RUN]
+)
+def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]) -> None:
+    todo = [
+        [str(block), block.language, block.text if block.language == "python" else block.commands()]
+        for block in TO_RUN[page]
+    ]
+    finished = run_blocks(todo, reader)
     assert finished.returncode == 0, f"{finished.stdout[-2000:]}\n{finished.stderr[-4000:]}"
     assert finished.stdout.count("--- ") == len(todo)
 
@@ -84,28 +90,20 @@ def test_a_mark_holds_for_the_next_block_only(tmp_path: Path, monkeypatch: pytes
     page = tmp_path / "page.md"
     page.write_text(
         "Text\n\n<!-- not run: needs a GPU -->\n    carts view \\\n        there  # a remark\n\n"
-        "Then\n\n    carts render it\n\n```python\nprint(1)\n```\n\n    no program\n"
+        "Then\n\n    carts render it\n\n```python\nprint(1)\n```\n\n    no program\n\n"
+        "In Python:\n\n    import math\n    print(math.pi)\n"
     )
     found = blocks(page)
     assert found == [
         Block("page.md", 4, "console", "carts view \\\n    there  # a remark", "needs a GPU"),
         Block("page.md", 9, "console", "carts render it", None),
         Block("page.md", 11, "python", "print(1)", None),
+        Block("page.md", 19, "python", "import math\nprint(math.pi)", None),
     ]
     assert found[0].commands() == ["carts view      there"]
 
 
 def test_a_block_that_fails_fails_the_test(reader: tuple[Path, dict[str, str]]) -> None:
-    desk, environment = reader
     for language, content in (("console", ["carts render missing.toml"]), ("python", "1 / 0")):
-        finished = subprocess.run(
-            [sys.executable, str(ROOT / "tests" / "documentation" / "run_doc_blocks.py")],
-            input=json.dumps([["page:1", language, content]]),
-            cwd=desk,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=SECONDS,
-        )
+        finished = run_blocks([["page:1", language, content]], reader)
         assert finished.returncode != 0 and ("missing.toml" in finished.stderr or "page:1" in finished.stderr)

@@ -32,7 +32,7 @@ class Bowl:
     def observe(self, stage: Observe, offsets: torch.Tensor) -> None:
         self.observed.append(stage)
 
-    def epoch(self, blur: float) -> tuple[int, float]:
+    def objective_key(self, blur: float) -> tuple[int, float]:
         return len(self.observed), blur
 
     def evaluate(self, offsets: torch.Tensor, stage: object, *, gradient: bool = True) -> Evaluation:
@@ -90,9 +90,9 @@ def test_a_descent_never_passes_a_joint_limit(variables: Variables) -> None:
 def test_the_end_has_the_deviation_of_the_descent_before_it(variables: Variables) -> None:
     fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
     *_, descended, end = run_stages((Descend(1.0), Evaluate()), fit)
-    assert end.epoch[-1] == "end"
+    assert end.objective_key[-1] == "end"
     assert fit.reached is not None and end.evaluation.gradient is fit.reached.evaluation.gradient
-    assert descended.epoch != end.epoch, "the end replaces the best point, whatever its loss"
+    assert descended.objective_key != end.objective_key, "the end replaces the best point, whatever its loss"
 
 
 def test_what_is_no_stage_is_refused(variables: Variables) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tiny import tiny_scene
 
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
@@ -23,3 +24,12 @@ def close_up(shipped_psm: Robot) -> tuple[Scene, SceneState]:
     camera = Camera("left", _WIDTH, _HEIGHT, K, T_camera_world)
     scene = Scene((Arm("PSM1", shipped_psm, np.eye(4)),), (camera,))
     return scene, scene.state({"PSM1": _JOINTS})
+
+
+@pytest.fixture(scope="session")
+def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
+    """One arm with its wrist bent, in a whole image of 640x480."""
+    tiny = tiny_scene(shipped_psm, 1, ("left",), 640, 480)
+    joint_positions = tiny.truth[0].copy()
+    joint_positions[3:] = [0.4, 0.3, -0.2, 0.5]
+    return tiny.scene, tiny.scene.state({"PSM1": joint_positions})

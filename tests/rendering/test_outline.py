@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
-from tiny import tiny_scene
 
-from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import APART, Variables
@@ -16,14 +14,6 @@ from carts_core.rendering import Outline, Renderer
 from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
-
-
-@pytest.fixture(scope="module")
-def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
-    tiny = tiny_scene(shipped_psm, 1, ("left",), WIDTH, HEIGHT)
-    joint_positions = tiny.truth[0].copy()
-    joint_positions[3:] = [0.4, 0.3, -0.2, 0.5]
-    return tiny.scene, tiny.scene.state({"PSM1": joint_positions})
 
 
 def outline(renderer: Renderer, parameters: Variables, offsets: torch.Tensor) -> Outline:

@@ -44,14 +44,6 @@ def _rigid(step: torch.Tensor) -> torch.Tensor:
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
-@pytest.fixture(scope="module")
-def scene_and_state(shipped_psm: Robot) -> tuple[Scene, SceneState]:
-    tiny = tiny_scene(shipped_psm, 1, ("left",), WIDTH, HEIGHT)
-    joint_positions = tiny.truth[0].copy()
-    joint_positions[3:] = [0.4, 0.3, -0.2, 0.5]
-    return tiny.scene, tiny.scene.state({"PSM1": joint_positions})
-
-
 def moved(state: SceneState, step: torch.Tensor) -> SceneState:
     """The state moved by a step in every parameter of `NAMES`."""
     step = step.float()
@@ -132,7 +124,7 @@ def test_the_segmentation_is_the_silhouette_of_the_rendering(scene_and_state: tu
     renderer = Renderer(scene)
     rendering = renderer(state)
     assert np.array_equal(renderer.segment(state) >= 0, rendering.silhouette.numpy() > 0.5)
-    assert torch.equal(rendering.arm_masks(1)[:, 0], rendering.silhouette > 0.5)
+    assert torch.equal(rendering.arm_ids == 0, rendering.silhouette > 0.5)
 
 
 def test_a_nearer_arm_hides_the_other(shipped_psm: Robot) -> None:

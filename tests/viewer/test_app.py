@@ -1,12 +1,10 @@
 """The running app over real sockets, without a browser."""
 
-import http.client
 import math
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from viewer_canvas import decoded
+from waiting import get, wait_for
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -34,19 +33,6 @@ from carts_viewer.storage import open_storage
 from tools.raw_tab import RawTab
 
 
-def _get(app: ViewerApp, path: str, **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection(app.url.removeprefix("http://"), timeout=20)
-    connection.request("GET", path, headers=headers)
-    return connection.getresponse()
-
-
-def _wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end, "it did not come true in 20 s"
-        time.sleep(0.02)
-
-
 def _picture(png: bytes) -> np.ndarray:
     return cv2.cvtColor(decoded(png), cv2.COLOR_BGRA2RGBA)
 
@@ -58,9 +44,9 @@ def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_vie
     with RawTab(app.url) as tab:
         for value in np.linspace(-5.0, 5.0, 100):
             tab.set(app.page.element_id(slider), float(value))
-        _wait_for(lambda: app.state.pose.scene.joint_positions[0][0] == pytest.approx(math.radians(5.0)))
+        wait_for(lambda: app.state.pose.scene.joint_positions[0][0] == pytest.approx(math.radians(5.0)))
         state = app.wait_until_shown()
-        _wait_for(lambda: tab.overlays[-1][1] == app.scene_view.sent(OVERLAY))
+        wait_for(lambda: tab.overlays[-1][1] == app.scene_view.sent(OVERLAY))
         fresh = OverlayRenderer(app.sequence).arm_ids(state.pose.scene, "left")
         assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
         assert 1 <= len(tab.overlays) < 100
@@ -81,8 +67,8 @@ def test_a_value_is_not_lost_to_a_panel_that_is_brought_up_to_date_at_that_momen
     slider._impl.sync_cb = write_meanwhile
     with RawTab(app.url) as tab:
         tab.set(app.page.element_id(slider), before + 2.0)
-        _wait_for(lambda: abs(math.degrees(app.state.pose.scene.joint_positions[0][0]) - before - 2.0) < 0.01)
-        _wait_for(lambda: abs(slider.value - before - 2.0) < 0.01)
+        wait_for(lambda: abs(math.degrees(app.state.pose.scene.joint_positions[0][0]) - before - 2.0) < 0.01)
+        wait_for(lambda: abs(slider.value - before - 2.0) < 0.01)
 
 
 @pytest.mark.parametrize("value", [float("nan"), 1e12, -1e12])
@@ -93,7 +79,7 @@ def test_a_raw_client_cannot_move_a_joint_out_of_its_limits(
     slider = app.joints.slider("PSM1", 0)
     with RawTab(app.url) as tab:
         tab.set(app.page.element_id(slider), value)
-        _wait_for(lambda: math.isfinite(slider.value) and abs(slider.value) < 1e6)
+        wait_for(lambda: math.isfinite(slider.value) and abs(slider.value) < 1e6)
         state = app.wait_until_shown()
     limits = app.scene.arms[0].robot.joint_limits[0]
     assert limits[0] - 1e-5 <= state.pose.scene.joint_positions[0][0] <= limits[1] + 1e-5
@@ -105,8 +91,8 @@ def test_a_choice_that_does_not_exist_is_put_right_in_every_tab(open_viewer: Cal
     dropdown = app.page.find("Camera")
     with RawTab(app.url) as rogue, RawTab(app.url) as other:
         rogue.set(app.page.element_id(dropdown), "no such camera")
-        _wait_for(lambda: dropdown.value == "left")
-        _wait_for(lambda: other.values.get(app.page.element_id(dropdown)) == "left")
+        wait_for(lambda: dropdown.value == "left")
+        wait_for(lambda: other.values.get(app.page.element_id(dropdown)) == "left")
     assert app.state.camera == "left" and app.state.error is None
 
 
@@ -115,7 +101,7 @@ def test_two_tabs_see_one_state(open_viewer: Callable[..., ViewerApp]) -> None:
     slider = app.page.element_id(app.page.find("Frame"))
     with RawTab(app.url) as first, RawTab(app.url) as second:
         first.set(slider, 3)
-        _wait_for(lambda: second.values.get(slider) == 3)
+        wait_for(lambda: second.values.get(slider) == 3)
         assert app.wait_until_shown().index == 2
 
 
@@ -130,7 +116,7 @@ def test_a_missing_image_is_an_error_in_the_page_and_the_server_stays_up(open_vi
     app.queue.put(intents.ShowFrame(11))
     state = app.wait_until_shown()
     assert state.index == 11 and state.error is None
-    assert _get(app, "/").status == 200
+    assert get(app.url, "/").status == 200
 
 
 def test_the_old_frame_stays_until_the_next_one_is_decoded(
@@ -210,12 +196,12 @@ def test_a_layer_that_cannot_be_computed_is_an_error_once_and_not_for_ever(
 
 def test_the_page_carries_our_script_style_and_title(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    response = _get(app, "/")
+    response = get(app.url, "/")
     page = response.read().decode()
     assert "<title>tiny · CaRTS</title>" in page and "/static/page.js" in page and "/static/page.css" in page
     assert response.headers["X-Frame-Options"] == "DENY"
     for name, kind in (("page.js", "javascript"), ("page.css", "text/css"), ("icon.svg", "svg")):
-        found = _get(app, f"/static/{name}")
+        found = get(app.url, f"/static/{name}")
         assert found.status == 200 and kind in found.headers["Content-Type"]
 
 
@@ -223,13 +209,13 @@ def test_the_page_carries_our_script_style_and_title(open_viewer: Callable[..., 
     "path", ["/static/", "/static/../pyproject.toml", "/static/..%2fpyproject.toml", "/static//etc/passwd", "/../x"]
 )
 def test_no_file_outside_the_static_folder_is_served(open_viewer: Callable[..., ViewerApp], path: str) -> None:
-    assert _get(open_viewer(), path).status == 404
+    assert get(open_viewer().url, path).status == 404
 
 
 def test_requests_for_another_host_or_from_another_site_are_refused(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    assert _get(app, "/", Host="evil.example").status == 403
-    assert _get(app, "/", Origin="http://evil.example").status == 403
+    assert get(app.url, "/", Host="evil.example").status == 403
+    assert get(app.url, "/", Origin="http://evil.example").status == 403
     protocol = [Subprotocol("viser-v1.1.1")]
     for options in ({"origin": "http://evil.example"}, {"additional_headers": {"Host": "evil.example"}}):
         with pytest.raises(InvalidStatus) as refused:
@@ -243,7 +229,7 @@ def test_a_busy_port_moves_up_and_the_url_says_so(open_viewer: Callable[..., Vie
     app = open_viewer()
     taken = int(app.url.rsplit(":", 1)[1])
     with ViewerApp.open(app.sequence.path, port=taken) as second:
-        assert second.url != app.url and _get(second, "/").status == 200
+        assert second.url != app.url and get(second.url, "/").status == 200
 
 
 def test_an_address_of_another_computer_is_refused_before_anything_is_opened() -> None:
@@ -321,7 +307,7 @@ def test_a_gesture_that_nobody_ends_is_saved_all_the_same(
     monkeypatch.setattr(editing, "LONGEST_DRAFT", 0.2)
     app = open_viewer()
     app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
-    _wait_for(lambda: len(app.project.state.steps) == 1 and not app.state.unsaved)
+    wait_for(lambda: len(app.project.state.steps) == 1 and not app.state.unsaved)
 
 
 def test_a_second_viewer_of_the_same_project_saves_nothing_and_says_so(open_viewer: Callable[..., ViewerApp]) -> None:

@@ -12,6 +12,14 @@ from carts_viewer import intents
 from carts_viewer.layers import Layer
 from carts_viewer.state import Phase
 
+ENDING_A_RUN = (
+    intents.SetJoint("PSM1", 0, 0.1),
+    intents.MoveFrame(1),
+    intents.SetSetting("iterations", 9),
+    intents.ShowDomain("smoke"),
+)
+"""Intents that change what a run works on."""
+
 
 def test_frames_beyond_the_ends_are_the_ends(desk: Desk) -> None:
     assert desk.do(intents.ShowFrame(99)).index == 2
@@ -93,17 +101,7 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     assert desk.saved.joints(0)["PSM1"].joint_positions == tuple(state.pose.scene.joint_positions[0].tolist())
 
 
-@pytest.mark.parametrize(
-    "intent",
-    [
-        intents.SetJoint("PSM1", 0, 0.1),
-        intents.MoveFrame(1),
-        intents.SetSetting("iterations", 9),
-        intents.ShowDomain("smoke"),
-        intents.SetFreeGroup("base_frames", True),
-        intents.Run(),
-    ],
-)
+@pytest.mark.parametrize("intent", [*ENDING_A_RUN, intents.SetFreeGroup("base_frames", True), intents.Run()])
 def test_a_suspicion_against_base_frames_lasts_until_something_changes(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: intents.Intent
 ) -> None:
@@ -154,15 +152,7 @@ def test_a_whole_run_is_one_step_of_undo(desk: Desk) -> None:
     assert desk.joint() == pytest.approx(start)
 
 
-@pytest.mark.parametrize(
-    "intent",
-    [
-        intents.SetJoint("PSM1", 0, 0.1),
-        intents.MoveFrame(1),
-        intents.SetSetting("iterations", 9),
-        intents.ShowDomain("smoke"),
-    ],
-)
+@pytest.mark.parametrize("intent", ENDING_A_RUN)
 def test_a_run_stops_when_what_it_works_on_changes(desk: Desk, intent: intents.Intent) -> None:
     desk.do(intents.Run())
     desk.controller.advance()

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import viser
+from waiting import get, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -20,19 +21,6 @@ from carts_viewer.transport.page import Page
 from tools.raw_tab import RawTab
 
 EVERYWHERE = ".".join("0000")
-
-
-def _get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection(url.removeprefix("http://").partition("/")[0], timeout=20)
-    connection.request("GET", path, headers=headers)
-    return connection.getresponse()
-
-
-def _wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end, "it did not come true in 20 s"
-        time.sleep(0.02)
 
 
 class Victims:
@@ -51,13 +39,13 @@ class Victims:
         self._value += 0.5
         value = self._value
         self.tab.set(self.app.page.element_id(self.slider), value)
-        _wait_for(lambda: abs(self.slider.value - value) < 1e-9)
+        wait_for(lambda: abs(self.slider.value - value) < 1e-9)
         self.app.wait_until_shown()
-        _wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
-        assert _get(self.app.url).status == 200
+        wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
+        assert get(self.app.url).status == 200
         # Whoever comes now gets all that the server has kept for newcomers.
         with RawTab(self.app.url) as late:
-            _wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
+            wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
 
 
 @pytest.fixture
@@ -77,7 +65,7 @@ def _taken(rogue: RawTab, app: ViewerApp) -> None:
     text = f"rogue {time.perf_counter()}"
     note = app.page.find("Note")
     rogue.set(app.page.element_id(note), text)
-    _wait_for(lambda: note.value == text)
+    wait_for(lambda: note.value == text)
     app.wait_until_shown()
 
 
@@ -169,7 +157,7 @@ def test_a_text_that_is_too_long_is_cut_off(victims: Victims) -> None:
     app = victims.app
     with RawTab(app.url) as rogue:
         rogue.set(app.page.element_id(app.page.find("Note")), "x" * 900_000)
-        _wait_for(lambda: bool(app.state.review.note))
+        wait_for(lambda: bool(app.state.review.note))
         app.queue.put(intents.Released())
         app.wait_until_shown()
     assert 0 < len(app.state.review.note) < 20_000
@@ -198,13 +186,13 @@ def test_another_sites_page_gets_no_connection(victims: Victims) -> None:
     ],
 )
 def test_no_path_leads_out_of_what_is_served(victims: Victims, path: str) -> None:
-    assert _get(victims.app.url, path).status == 404
+    assert get(victims.app.url, path).status == 404
 
 
 def test_the_page_may_connect_to_its_own_server_only(victims: Victims) -> None:
     # viser's client would connect to any server that `?websocket=` names, and run what that one sends.
     address = victims.app.url.removeprefix("http://")
-    policy = _get(victims.app.url).headers["Content-Security-Policy"]
+    policy = get(victims.app.url).headers["Content-Security-Policy"]
     assert policy == f"connect-src 'self' ws://{address} data: blob:"
 
 
@@ -231,13 +219,13 @@ def test_where_others_can_reach_it_pages_files_and_websockets_need_the_token(sha
     url = f"http://127.0.0.1:{shared_page.server.get_port()}"
     token = shared_page.url.partition("?")[2]
     for query in ("", "?token=", f"?{token}x", f"?{token[:-1]}", "?token=%00"):
-        assert _get(url, "/" + query).status == _connect(shared_page, "/" + query) == 403
-        assert _get(url, "/static/page.js" + query).status == 403
-    answer = _get(url, "/?" + token)
+        assert get(url, "/" + query).status == _connect(shared_page, "/" + query) == 403
+        assert get(url, "/static/page.js" + query).status == 403
+    answer = get(url, "/?" + token)
     assert answer.status == 200 and "delete('token')" in answer.read().decode()
     cookie = answer.headers["Set-Cookie"].partition(";")[0]
     for path in ("/", "/static/page.js", "/index.html"):
-        assert _get(url, path, Cookie=cookie).status == 200
+        assert get(url, path, Cookie=cookie).status == 200
     assert _connect(shared_page, Cookie=cookie) == _connect(shared_page, "/?" + token) == 101
     assert _connect(shared_page, Cookie=cookie + "x") == 403
     assert _connect(shared_page, Cookie=cookie, Origin="http://evil.example") == 403
@@ -260,9 +248,9 @@ def test_a_program_that_has_the_address_gets_in_with_it(shared_page: Page) -> No
 
 def test_a_huge_cookie_or_query_is_refused_and_the_server_stays_up(shared_page: Page) -> None:
     url = f"http://127.0.0.1:{shared_page.server.get_port()}"
-    for send in (lambda: _get(url, Cookie="a=" + "x" * 200_000), lambda: _get(url, "/?token=" + "x" * 200_000)):
+    for send in (lambda: get(url, Cookie="a=" + "x" * 200_000), lambda: get(url, "/?token=" + "x" * 200_000)):
         try:
             assert send().status >= 400
         except (OSError, http.client.HTTPException):
             pass  # Hung up on, which is as good.
-    assert _get(url, "/?" + shared_page.url.partition("?")[2]).status == 200
+    assert get(url, "/?" + shared_page.url.partition("?")[2]).status == 200

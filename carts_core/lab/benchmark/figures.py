@@ -35,7 +35,7 @@ def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
             "convergence",
             "Convergence on the synthetic frames, from the measured kinematics: best iterate so far, mean and "
             "quartiles over frames of all domains. A run that has ended keeps its value. Losses are of runs in which "
-            "they fell; ours compare through one look at the image only and are left out.",
+            "they fell; ours compare within one observation only and are left out.",
             _convergence,
         ),
         ("errors", "Dice and joint error after optimization, by the error at the start (regular domain).", _errors),

@@ -44,7 +44,7 @@ _SHARE = (0.3, 1.0, 1.0)
 """How much a pixel of the outline counts, per part. Along a straight shaft the errors of many pixels are the same."""
 
 _RENDERED_ANEW = 1.0
-"""Outlines that have moved by more than this are rendered anew; up to there they move as they say they do [px]."""
+"""Outlines that have moved by more than this are rendered again; up to there they move by their Jacobian [px]."""
 
 
 class EdgeFactor:
@@ -140,7 +140,7 @@ class EdgeFactor:
 class LocalEdgeFactor:
     """Edges near a point. Implements `Factor.linearize`.
 
-    Outlines that move little are moved as they say they do; rendering them anew is what costs time.
+    Outlines that move little are moved by their Jacobian; rendering them again is what costs time.
     """
 
     def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:

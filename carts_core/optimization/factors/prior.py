@@ -1,4 +1,4 @@
-"""What is known of the unknowns before the image is looked at."""
+"""What is known of the unknowns before the image is used."""
 
 from dataclasses import dataclass
 

@@ -8,14 +8,17 @@ from typing import Any
 import av
 import cv2
 import numpy as np
+import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from carts_core.errors import CartsError
 from carts_core.export.dvrk import T_DVRK_OPENCV
 from carts_core.model.psm_kinematics import forward
+from carts_core.recording.importing.importer import import_recording
 
 SIZE = (96, 72)
 START = 1_700_000_000_000_000_000
@@ -197,3 +200,10 @@ def write_video(path: Path, pictures: list[np.ndarray], rate: int = 25, codec: s
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
         container.mux(stream.encode())
     return path
+
+
+def assert_refused(path: Path, message: str) -> None:
+    """Importing the only thing in a folder is an error whose text matches, and leaves nothing in the folder."""
+    with pytest.raises(CartsError, match=message):
+        import_recording(path, path.parent / "out")
+    assert list(path.parent.iterdir()) == [path]
