@@ -13,6 +13,8 @@ from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
 from .counterfactual import Backgrounds as Backgrounds
+from .factors import Factor as Factor
+from .factors import Linearization as Linearization
 from .fit import StopReason as StopReason
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
@@ -43,12 +45,14 @@ __all__ = [
     "CalibrationResult",
     "DescentSolver",
     "Evidence",
+    "Factor",
     "FrameEstimate",
     "FrameOptimizer",
     "FramePredictor",
     "FreeParameters",
     "ImagePredictor",
     "Iterate",
+    "Linearization",
     "MaskPredictor",
     "NetworkPredictor",
     "Origin",

@@ -15,11 +15,12 @@ class Evaluation:
     value: float
     """What is descended: the sum of all factors, the prior included."""
     loss: float
-    """Without the prior, per pixel of the arms. Comparable among evaluations of one observation if somebody watches,
-    else of one observation under one blur."""
+    """Without the prior, per pixel of the arms. Comparable among evaluations of one observation, and unless
+    the problem is live under one blur."""
     stage_loss: float
     """The same under the blur that is descended in."""
     prior: float
+    """Cost of the prior, and of further factors [1]."""
     gradient: Float[Tensor, " n"]
     """Of `value`; zero if it was not asked for."""
     hessian: Float[Tensor, "n n"] | None

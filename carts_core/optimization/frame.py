@@ -1,7 +1,7 @@
 """One frame, optimized step by step. Command line, viewer, batch runs and tests all drive this object."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..settings.stages import FINEST, Evaluate
 from .base_frame_gain import base_frame_gain
 from .counterfactual import Backgrounds
 from .evaluation import Evaluation
+from .factors import Factor
 from .feature_problem import FeatureProblem
 from .fit import Fit, Point, StopReason
 from .frame_problem import FrameProblem
@@ -90,12 +91,14 @@ class FrameOptimizer:
         start: arm name -> joint positions to start from, the measured ones by default.
         settings: the solver, `SurfaceSolver()` by default.
         free: what is unknown.
+        factors: makes further factors over the unknowns, which a `SurfaceSolver` adds to its objective.
         cameras: names of the cameras that take part, all by default.
         live: whether iterates are displayed. If not, a `SurfaceSolver` saves a third of its time: iterates of coarse
             stages are rendered and rated as coarsely as they are compared. The end is the same.
 
     Raises:
-        SettingsError: an image or background is missing or of the wrong size, or nothing is free.
+        SettingsError: an image or background is missing or of the wrong size, nothing is free, or factors are
+            given to a `DescentSolver`.
         RobotError: `start` lacks an arm or has the wrong number of joint positions.
     """
 
@@ -110,6 +113,7 @@ class FrameOptimizer:
         start: Mapping[str, ArrayLike] | None = None,
         settings: SolverSettings | None = None,
         free: FreeParameters | None = None,
+        factors: Callable[[Variables], Sequence[Factor]] = lambda variables: (),
         cameras: Sequence[str] | None = None,
         live: bool = True,
     ) -> None:
@@ -121,12 +125,23 @@ class FrameOptimizer:
         self._free = free or FreeParameters()
         self._variables = Variables(scene, state, self._free, settings.length_scale)
         known = backgrounds if isinstance(backgrounds, Backgrounds) else Backgrounds(backgrounds)
+        further = tuple(factors(self._variables))
         self._problem: FrameProblem | FeatureProblem
         if isinstance(settings, SurfaceSolver):
             predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
             self._problem = FrameProblem(
-                scene, frame.images, predictor, self._variables, settings, ignore or {}, backgrounds=known, live=live
+                scene,
+                frame.images,
+                predictor,
+                self._variables,
+                settings,
+                ignore or {},
+                factors=further,
+                backgrounds=known,
+                live=live,
             )
+        elif further:
+            raise SettingsError(f"the loss {settings.loss} takes no further factors. Use the solver `surface`.")
         elif isinstance(networks, FeatureExtractor):
             self._problem = FeatureProblem(scene, frame.images, known.images, networks, self._variables, settings)
         else:

@@ -1,6 +1,6 @@
 """One frame as an optimization problem: its images, the unknowns, a prior, and what was observed last."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from ..threads import total
 from .counterfactual import Backgrounds
 from .edge_alignment import align_edges
 from .evaluation import Evaluation
-from .factors import Linearization, Prior
+from .factors import Factor, Linearization, Prior
 from .factors.edges import EdgeFactor
 from .factors.surface import SurfaceFactor
 from .frame_images import FrameImages
@@ -27,11 +27,11 @@ from .variables import Variables
 from .verdict import Evidence, evidence
 
 _SHOWN_BLUR = 1.6
-"""Iterates that somebody watches are compared under a blur of at most this [px of the working image]."""
+"""Iterates that are displayed are compared under a blur of at most this [px of the working image]."""
 
 
 class FrameProblem:
-    """The sum of the surface factor of the last observation and of the prior.
+    """The sum of the surface factor of the last observation, the prior, and further factors.
 
     Args:
         scene: with the cameras that take part.
@@ -41,6 +41,7 @@ class FrameProblem:
         settings: noise, weights, working size.
         ignore: camera name -> pixels that show an occluder.
         prior: of the unknowns; as the settings expect by default.
+        factors: further ones over the same unknowns.
         backgrounds: of the cameras; what is predicted in them as well counts as a false positive.
         live: whether coarse stages are also compared under a fine blur, for a display. It takes a third
             more time and changes no step.
@@ -64,11 +65,12 @@ class FrameProblem:
         ignore: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
         *,
         prior: Prior | None = None,
+        factors: Sequence[Factor] = (),
         backgrounds: Backgrounds | None = None,
         live: bool = True,
     ) -> None:
         self.scene, self.variables, self.settings = scene, variables, settings
-        self.prior = prior or variables.prior(settings)
+        self.prior, self._further = prior or variables.prior(settings), tuple(factors)
         self.predictor, self._backgrounds, self._live = predictor, backgrounds, live
         self._given: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]] = images, ignore or {}
         self._ignore = ignore or {}
@@ -148,17 +150,22 @@ class FrameProblem:
     @torch.no_grad()
     def costs(self, offsets: Float[Tensor, "batch n"], stage: Descend) -> Float[Tensor, " batch"]:
         """The objective at each of a batch of points, as a stage compares it."""
-        return self.factor(stage).costs(offsets) + self.prior.costs(offsets)
+        costs = self.factor(stage).costs(offsets) + self.prior.costs(offsets)
+        for factor in self._further:
+            costs = costs + factor.costs(offsets)
+        return costs
 
     @torch.no_grad()
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:
         """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
         factor = self.factor(stage)
-        prior = self.prior.linearize(offsets)
+        given = self.prior.linearize(offsets)
+        for further in self._further:
+            given = given + further.linearize(offsets)
         slope, hessian, known = torch.zeros_like(offsets), None, None
         if gradient:
             surface = factor.linearize(offsets)
-            compared, total = surface.comparison, prior + surface
+            compared, total = surface.comparison, given + surface
             slope, hessian = total.gradient, total.hessian
             if self.prior.informs_all:
                 known = uncertainty(
@@ -178,10 +185,10 @@ class FrameProblem:
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(
-            value=compared.pixels / factor.noise**2 + prior.cost,
+            value=compared.pixels / factor.noise**2 + given.cost,
             loss=self._loss(shown, final),
             stage_loss=self._loss(factor, compared),
-            prior=prior.cost,
+            prior=given.cost,
             gradient=slope,
             hessian=hessian,
             uncertainty=known,

@@ -55,9 +55,10 @@ NONE: tuple[Stage, ...] = (Observe(), Evaluate())
 COLD: tuple[Stage, ...] = (*SEARCH, Observe(), FINEST)
 """A frame of a sequence of which only the measured kinematics are known; `WARM` follows."""
 
-_NEAR_FINEST = Observe(margin=27, attention=27)
+_WIDE = Observe(margin=27, attention=27)
+"""An observation with more room around the arms."""
 
-WARM: tuple[Stage, ...] = (_NEAR_FINEST, Descend(blur=0.8, steps=2), AlignEdges())
+WARM: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
 """A frame of a sequence whose neighbours are known."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())

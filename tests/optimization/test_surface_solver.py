@@ -10,12 +10,14 @@ import torch
 from perfect_predictor import PerfectPredictor, with_stage, without
 from torch.nn import functional
 
+from carts_core.errors import SettingsError
 from carts_core.evaluation import dice, start_positions
 from carts_core.imaging.window import Window
 from carts_core.model.scene import Scene
 from carts_core.model.surface import COVERAGE
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, SurfaceSolver
+from carts_core.optimization import BASE_FRAME_GAIN, DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
+from carts_core.optimization.factors import Prior
 from carts_core.optimization.factors.surface import SurfaceFactor
 from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.frame_problem import FrameProblem
@@ -264,6 +266,46 @@ def test_the_gradient_agrees_with_finite_differences(sequence: Sequence, predict
         behind[index] -= step
         values = [problem.evaluate(offsets, stage, gradient=False).value for offsets in (ahead, behind)]
         assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.35)
+
+
+def test_further_factors_are_added_to_the_objective(sequence: Sequence, predictor: PerfectPredictor) -> None:
+    known, frame = 0.05, sequence.frame(0)
+
+    def roll_is_known(variables: Variables) -> list[Prior]:
+        precision = torch.zeros(len(variables))
+        precision[variables.names.index("PSM1/roll")] = 1e7
+        return [Prior(torch.full((len(variables),), known), torch.diag(precision))]
+
+    roll = sequence.scene.arms[0].robot.joint_names.index("roll")
+    start = {"PSM1": (frame.truth or {})["PSM1"]}
+    found = []
+    for factors in (lambda variables: (), roll_is_known):
+        optimizer = FrameOptimizer(
+            sequence.scene,
+            frame,
+            {},
+            predictor,
+            start=start,
+            settings=without(PreferStart),
+            factors=factors,
+            live=False,
+        )
+        list(optimizer)
+        assert optimizer.best is not None
+        found.append(optimizer.best.joint_positions()["PSM1"][roll] - start["PSM1"][roll])
+    assert abs(found[0]) < 0.02 and found[1] == pytest.approx(known, abs=2e-3)
+
+
+def test_a_descent_of_features_refuses_further_factors(sequence: Sequence, predictor: PerfectPredictor) -> None:
+    with pytest.raises(SettingsError, match="takes no further factors"):
+        FrameOptimizer(
+            sequence.scene,
+            sequence.frame(0),
+            {},
+            predictor,
+            settings=DescentSolver(),
+            factors=lambda variables: [Prior.around_start(torch.ones(len(variables)))],
+        )
 
 
 def test_images_are_enlarged_up_to_the_cameras_and_weigh_the_same(

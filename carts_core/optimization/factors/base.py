@@ -23,7 +23,7 @@ class Linearization:
 
 
 class Factor(Protocol):
-    """A part of an objective. To add one, implement this and add it to the sum in `FrameProblem`."""
+    """A summand of an objective. `FrameOptimizer(factors=...)` adds one to a frame's; `Prior` is a short example."""
 
     def costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
         """Cost of each of a batch of points [1]."""
