@@ -184,7 +184,7 @@ class CalibrationOptimizer:
             self.assessment = assess_calibration(before)
         self._fit.offsets = start
         self._fit.stop_reason = StopReason.FAILED if failed else StopReason.START_KEPT
-        yield replace(self._fit.evaluate(problem.present), epoch=(*last.epoch, "start"))
+        yield replace(self._fit.evaluate(problem.present), objective_key=(*last.objective_key, "start"))
 
     def __iter__(self) -> Iterator[CalibrationIterate]:
         """Step until the optimization stops."""
