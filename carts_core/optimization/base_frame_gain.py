@@ -1,6 +1,5 @@
 """Whether base frames are probably wrong: what free ones would explain of the residual that joints leave."""
 
-import math
 from dataclasses import replace
 
 import torch
@@ -50,7 +49,6 @@ def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: F
             total.hessian.double()[part][:, part],
             wider.lower[part],
             wider.upper[part],
-            math.inf,
         )
         explained.append(-float(gradient @ step + 0.5 * step @ hessian @ step))
     return (explained[0] - explained[1]) / max(surface.cost, 1e-12)

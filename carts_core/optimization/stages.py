@@ -65,10 +65,10 @@ def _(stage: Descend, fit: Fit) -> Iterator[Point]:
         known = best.evaluation
         assert known.hessian is not None
         step = fit.solver.step(best.offsets, known.gradient, known.hessian)
-        stuck = rejections >= REJECTIONS
-        converged = stuck or step.reduction < tolerance * known.value
+        converged = rejections >= REJECTIONS or step.reduction < tolerance * known.value
         fit.reached = best
-        fit.offsets = best.offsets if stuck else fit.problem.variables.clamp(best.offsets + step.change)
+        # After rejections, too: the step is short then, and a next stage compares under another blur.
+        fit.offsets = fit.problem.variables.clamp(best.offsets + step.change)
         fit.stop_reason = StopReason.CONVERGED if converged else StopReason.ITERATIONS
         yield point
         if converged or fit.exhausted or taken == stage.steps:
@@ -97,6 +97,7 @@ def _(stage: ShaftSearch, fit: Fit) -> Iterator[Point]:
 def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     assert fit.reached is not None, "AlignEdges follows a Descend"
     if _one_frame(fit).predictor.masked:
+        fit.offsets = fit.reached.offsets
         return
     fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
     yield from ()

@@ -51,7 +51,7 @@ class LevenbergMarquardt:
         """The step from a point with this quadratic model."""
         slope, curvature = gradient.double(), hessian.double()
         damped = curvature + self._damping * torch.diag(curvature.diagonal().clamp(min=1e-9))
-        change = bounded_step(offsets, slope, damped, self._lower, self._upper, _LONGEST_STEP)
+        change = shortened(bounded_step(offsets, slope, damped, self._lower, self._upper), _LONGEST_STEP)
         reduction = -float(slope @ change + 0.5 * change @ (curvature @ change))
         return Step(change.to(gradient), reduction)
 
@@ -62,21 +62,23 @@ def bounded_step(
     hessian: Float[Tensor, "n n"],
     lower: Float[Tensor, " n"],
     upper: Float[Tensor, " n"],
-    longest: float,
 ) -> Float[Tensor, " n"]:
-    """Where the quadratic model is lowest among the unknowns that may move; no unknown changes by more than `longest`.
+    """Where the quadratic model is lowest among the unknowns that may move.
 
     Args:
         offsets: the present point [rad].
         gradient, hessian: of the model there.
         lower, upper: bounds; an unknown at a bound that would leave it stays.
-        longest: [rad]; infinity for no limit.
     """
     free = may_move(offsets, gradient, lower, upper)
     step = torch.zeros_like(gradient, dtype=torch.float64)
     step[free] = torch.linalg.solve(hessian.double()[free][:, free], -gradient.double()[free])
-    largest = float(step.abs().max()) if len(step) else 0.0
-    return step * min(1.0, longest / max(largest, 1e-12))
+    return step
+
+
+def shortened(step: Float[Tensor, " n"], longest: float) -> Float[Tensor, " n"]:
+    """The step, or as much of it as changes no unknown by more than `longest`."""
+    return step * min(1.0, longest / float(step.abs().max().clamp(min=1e-12)))
 
 
 def may_move(
