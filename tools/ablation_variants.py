@@ -15,7 +15,6 @@ from carts_core.settings.stages import (
     Observe,
     PreferStart,
     RandomRestart,
-    ShaftSearch,
     Stage,
 )
 
@@ -78,7 +77,7 @@ def _places(kind: type[Stage]) -> list[int]:
 
 
 _OBSERVE, _DESCEND, _EDGES = _places(Observe), _places(Descend), _places(AlignEdges)
-(_RESTART,), (_SHAFTS,), (_START,) = _places(RandomRestart), _places(ShaftSearch), _places(PreferStart)
+(_RESTART,), (_START,) = _places(RandomRestart), _places(PreferStart)
 
 
 def _tolerance(solver: SurfaceSolver) -> SurfaceSolver:
@@ -95,7 +94,6 @@ VARIANTS = (
     Variant("first image at 1.5", _at(_OBSERVE[0], scale=1.5)),
     Variant("second image conditioned on the estimate", _at(_OBSERVE[1], given=Given.ESTIMATE)),
     Variant("no second image", _without(_OBSERVE[1], _DESCEND[1])),
-    Variant("robust 0.5 at first", _at(_DESCEND[0], robust=Descend.robust)),
     Variant("tolerance 0.01 everywhere", _tolerance),
     Variant("no Descend(3) on the third image", _without(_DESCEND[2])),
     Variant("no Descend(1.6) on the third image", _without(_DESCEND[3])),
@@ -108,7 +106,6 @@ VARIANTS = (
     Variant("arms are never lost", constants={"optimization.stages.arm_is_lost": lambda *_: False}),
     Variant("_SUPPORT 0", constants={"optimization.search._SUPPORT": 0.0}),
     Variant("_LEFT 0", constants={"optimization.search._LEFT": 0.0}),
-    Variant("no ShaftSearch", _without(_SHAFTS)),
     Variant("no AlignEdges between", _without(_EDGES[0])),
     Variant("no AlignEdges at the end", _without(_EDGES[1])),
     Variant("no AlignEdges", _without(*_EDGES)),
@@ -133,10 +130,8 @@ VARIANTS = (
     Variant("_SHARE 1", constants={"optimization.factors.edges._SHARE": (1.0, 1.0, 1.0)}),
     Variant("_LIKELY off", constants={"optimization.factors.edges._LIKELY": math.inf}),
     Variant("_BLUR 0", constants={"optimization.factors.edges._BLUR": 0.0}),
-    Variant("_NEAR off", constants={"optimization.factors.edges._NEAR": 500}),
     Variant("_RENDERED_ANEW off", constants={"optimization.factors.edges._RENDERED_ANEW": math.inf}),
     Variant("_ROBUST of edges off", constants={"optimization.factors.edges._ROBUST": math.inf}),
-    Variant("longest step of edges off", constants={"optimization.edge_alignment._LONGEST_STEP": math.inf}),
     Variant("_STILL 0", constants={"optimization.edge_alignment._STILL": 0.0}),
     Variant(
         "longest step of descents off", constants={"optimization.solvers.levenberg_marquardt._LONGEST_STEP": math.inf}

@@ -7,10 +7,7 @@ from torch import Tensor
 from ..settings.stages import AlignEdges
 from .factors import Linearization
 from .factors.edges import EdgeFactor
-from .solvers import bounded_step, shortened
-
-_LONGEST_STEP = 0.05
-"""Largest change of an unknown in one step [rad]; edges are near, so a longer one is a mistake."""
+from .solvers import bounded_step
 
 _STILL = 0.03
 """Outlines that move by no more than this have arrived [px]."""
@@ -44,7 +41,7 @@ def align_edges(
         gradient = known.gradient + known.hessian @ (before - origin) + found.gradient
         hessian = known.hessian + found.hessian
         step = bounded_step(before, gradient, hessian, variables.lower, variables.upper).to(offsets)
-        offsets = variables.clamp(before + shortened(step, _LONGEST_STEP))
+        offsets = variables.clamp(before + step)
         step = offsets - before
         if factor.moved_by(step) < _STILL:
             break

@@ -1,10 +1,10 @@
-"""Searches that a descent cannot do: random starts, along the shafts, and back at the start."""
+"""Searches that a descent cannot do: random starts, and back at the start."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..settings.stages import FINEST, Given, Observe, PreferStart, RandomRestart, ShaftSearch, first_descend
+from ..settings.stages import FINEST, Given, Observe, PreferStart, RandomRestart, first_descend
 from ..threads import total
 from .frame_problem import FrameProblem
 
@@ -54,31 +54,6 @@ def best_random_start(
         trials[1, columns] = 0.0
         trials = problem.variables.clamp(trials)
         best = trials[problem.costs(trials, first_descend(stage.then)).argmin()]
-    return best
-
-
-@torch.no_grad()
-def best_along_shafts(
-    problem: FrameProblem, offsets: Float[Tensor, " n"], stage: ShaftSearch
-) -> Float[Tensor, " n"] | None:
-    """The best place of an arm moved along its shaft, each observed conditioned on itself; None if the present one is.
-
-    The observation at the best place becomes the problem's.
-    """
-
-    def cost(trial: Tensor) -> float:
-        problem.observe(Observe(), trial)
-        return float(problem.costs(trial[None], first_descend(stage.then)))
-
-    best, lowest = None, cost(offsets)
-    for index in problem.variables.prismatic:
-        for distance in (-stage.step, stage.step):
-            trial = offsets.clone()
-            trial[index] += distance / float(problem.variables.scales[index])
-            trial = problem.variables.clamp(trial)
-            if (found := cost(trial)) < lowest:
-                best, lowest = trial, found
-    problem.observe(Observe(), offsets if best is None else best)
     return best
 
 

@@ -17,13 +17,12 @@ from ..settings.stages import (
     Observe,
     PreferStart,
     RandomRestart,
-    ShaftSearch,
     Stage,
 )
 from .feature_problem import FeatureProblem
 from .fit import Fit, Point, StopReason
 from .frame_problem import FrameProblem
-from .search import arm_is_lost, best_along_shafts, best_random_start, start_explains_as_well
+from .search import arm_is_lost, best_random_start, start_explains_as_well
 from .solvers import FirstOrderDescent
 from .solvers.levenberg_marquardt import REJECTIONS
 
@@ -80,16 +79,6 @@ def _(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
     problem = _one_frame(fit)
     if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
         fit.restart(best_random_start(problem, fit.offsets, stage))
-        yield from run_stages(stage.then, fit)
-
-
-@run_stage.register
-def _(stage: ShaftSearch, fit: Fit) -> Iterator[Point]:
-    if fit.loss < stage.if_loss or _one_frame(fit).predictor.masked:
-        return
-    found = best_along_shafts(_one_frame(fit), fit.offsets, stage)
-    if found is not None:
-        fit.restart(found)
         yield from run_stages(stage.then, fit)
 
 

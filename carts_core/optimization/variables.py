@@ -58,7 +58,6 @@ class Variables:
     def __init__(self, scene: Scene, start: SceneState, free: FreeParameters, length_scale: float) -> None:
         self.start = start
         self._length_scale = length_scale
-        self._joint_types = [arm.robot.joint_types for arm in scene.arms]
         self.names: list[str] = []
         self._blocks: list[_Block] = []
         self._joint_scales: dict[int, Tensor] = {}
@@ -165,16 +164,6 @@ class Variables:
     def moves_calibration(self) -> bool:
         """Whether base frames, cameras or intrinsics are unknown."""
         return any(block.kind != "joints" for block in self._blocks)
-
-    @property
-    def prismatic(self) -> list[int]:
-        """Unknowns that are prismatic joints."""
-        return [
-            block.start + place
-            for block in self._blocks
-            for place, column in enumerate(block.columns)
-            if self._joint_types[block.index][column] == "prismatic"
-        ]
 
     @property
     def scales(self) -> Float[Tensor, " n"]:

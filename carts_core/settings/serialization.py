@@ -95,6 +95,5 @@ def _stage(table: Mapping[str, Any], where: str) -> Stage:
 _EXAMPLES: dict[str, Any] = {
     "Descend": _STAGES["Descend"](blur=1.0),
     "RandomRestart": _STAGES["RandomRestart"](then=()),
-    "ShaftSearch": _STAGES["ShaftSearch"](then=()),
     "IgnoreOccluders": _STAGES["IgnoreOccluders"](then=()),
 }

@@ -87,24 +87,6 @@ class RandomRestart:
 
 
 @dataclass(frozen=True)
-class ShaftSearch:
-    """Where the fit is doubtful: move each arm along its shaft either way, observe again conditioned on that, and go
-    on from the best. A network that is conditioned on a shaft which ends too early may confirm that it ends there;
-    given masks do not, and skip this."""
-
-    then: tuple["Stage", ...]
-    """What runs where another place was better. Places are compared as the first `Descend` of these compares them."""
-    if_loss: float = 0.03
-    """Loss from which a fit is doubtful [1]."""
-    step: float = 5e-3
-    """How far arms are moved [m]."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.if_loss <= 10, "ShaftSearch.if_loss", self.if_loss, "0 to 10")
-        require(0 < self.step <= 0.1, "ShaftSearch.step", self.step, "above 0, at most 0.1 m")
-
-
-@dataclass(frozen=True)
 class AlignEdges:
     """Move the outlines of the arms to edges of the image, weighed against the surface factor. Skipped where given
     masks are the target: they say where outlines are."""
@@ -166,9 +148,7 @@ class FirstOrder:
         require(0 <= self.blur <= 20, "FirstOrder.blur", self.blur, "0 to 20 px")
 
 
-Stage = (
-    Observe | Descend | RandomRestart | ShaftSearch | AlignEdges | PreferStart | IgnoreOccluders | Evaluate | FirstOrder
-)
+Stage = Observe | Descend | RandomRestart | AlignEdges | PreferStart | IgnoreOccluders | Evaluate | FirstOrder
 
 
 def first_descend(stages: tuple[Stage, ...]) -> Descend:
