@@ -1,59 +1,23 @@
-"""Links and special files at every path that the commands write: none is followed, nothing outside is changed."""
+"""Links and special files at every path that commands write or read: none is followed, nothing outside is changed."""
 
-import os
 import random
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from planted import PLANTED, PRECIOUS, contents, plant, treasure
-from tracing import places, traced
+from commands_at_work import COMMANDS, FOLLOWED
+from dvrk_tree import write_model
+from planted import PLANTED, PRECIOUS, SPECIAL, contents, plant, treasure
+from tracing import places, read_places, traced
 
-from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.cli.command_line import BAD_INPUT
 from carts_core.errors import CartsError
-from carts_core.lab.training.training import train
-from carts_core.settings import Architecture, ImageSettings, TrainingConfig
 
-QUICK = ["--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"]
-
-
-def _train(work: Path) -> None:
-    images = ImageSettings(width=64, height=48, field_width=80, things=0.0, absent=0.0)
-    architecture = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
-    config = TrainingConfig(
-        steps=1, batch_size=1, validation_samples=1, workers=0, threads=1, architecture=architecture, images=images
-    )
-    train(config, work / "out")
-
-
-def _command(*words: str) -> Callable[[Path], None]:
-    def run(work: Path) -> None:
-        before = Path.cwd()
-        os.chdir(work)
-        try:
-            main([words[0], "recording/sequence.toml", *words[1:]])
-        finally:
-            os.chdir(before)
-
-    return run
-
-
-COMMANDS: dict[str, Callable[[Path], None]] = {
-    "render": _command("render", "--frames", "0"),
-    "render to a folder": _command("render", "--frames", "0", "--output", "out", "--style", "mask"),
-    "optimize": _command("optimize", "--solver", "none", "--frames", "0"),
-    "optimize to a folder": _command("optimize", "--solver", "none", "--overwrite", "--output", "out"),
-    "export masks": _command("export", "exports/out", "--format", "masks", "--overwrite"),
-    "export csv": _command("export", "exports/out.csv", "--format", "csv", "--overwrite"),
-    "export video": _command("export", "exports/out", "--format", "video"),
-    "calibrate": _command("calibrate", *QUICK),
-    "evaluate": _command("evaluate", "--solver", "none", "--frames", "0", "--json", "scores/out.json"),
-    "train": _train,
-}
-FOLLOWED = {"render to a folder": ["out"], "optimize to a folder": ["out"], "train": ["out"], "evaluate": ["scores"]}
-"""What a person named, links on the way to which are followed: with `export`, the folder that the output lies in."""
-FOLLOWED |= {name: ["exports"] for name in COMMANDS if name.startswith("export")}
+INPUTS = ("recording", "source", "model")
+SECONDS = 120
+"""No command waits for a pipe, or reads a device without end."""
 
 
 @pytest.fixture
@@ -62,9 +26,25 @@ def recording(tiny_sequence: Callable[..., Path]) -> Path:
 
 
 def _fresh(recording: Path, folder: Path) -> tuple[Path, Path]:
-    """A folder with the recording in it, and somebody's own files elsewhere."""
-    shutil.copytree(recording, folder / "work" / "recording")
-    return folder / "work", treasure(folder / "home")
+    """A folder with all inputs in it, and somebody's own files elsewhere."""
+    work = folder / "work"
+    shutil.copytree(recording, work / "recording")
+    shutil.copytree(recording, work / "source", ignore=shutil.ignore_patterns("sequence.toml", "truth.csv", "masks"))
+    write_model(work / "model")
+    return work, treasure(folder / "home")
+
+
+def _refused_or_done(name: str, work: Path, what: object) -> None:
+    """Run a command to its end, or until it says in words why it does not go on."""
+    signal.alarm(SECONDS)
+    try:
+        COMMANDS[name](work)
+    except SystemExit as stop:
+        assert stop.code == BAD_INPUT, what
+    except CartsError:
+        pass
+    finally:
+        signal.alarm(0)
 
 
 def _attack(name: str, recording: Path, folder: Path, sample: int | None) -> int:
@@ -72,7 +52,7 @@ def _attack(name: str, recording: Path, folder: Path, sample: int | None) -> int
     work, _ = _fresh(recording, folder / "trace")
     with traced() as trace:
         COMMANDS[name](work)
-    found = [place for place in places(trace, work) if str(place) not in FOLLOWED.get(name, [])]
+    found = [place for place in places(trace.written, work) if str(place) not in FOLLOWED.get(name, [])]
     assert found, "nothing was written"
     attacks = [(place, kind) for place in found for kind in PLANTED]
     if sample is not None:
@@ -80,25 +60,48 @@ def _attack(name: str, recording: Path, folder: Path, sample: int | None) -> int
     for number, (place, kind) in enumerate(attacks):
         work, home = _fresh(recording, folder / str(number))
         plant(kind, work / place, home)
-        before, images = contents(home), contents(work / "recording")
-        try:
-            COMMANDS[name](work)
-        except SystemExit as stop:
-            assert stop.code == BAD_INPUT, (place, kind)
-        except CartsError:
-            pass
+        before, inputs = contents(home), [contents(work / given) for given in INPUTS]
+        _refused_or_done(name, work, (place, kind))
         assert contents(home) == before, (place, kind)
-        assert contents(work / "recording") == images, (place, kind)
+        assert [contents(work / given) for given in INPUTS] == inputs, (place, kind)
         if kind == "folder":
             assert (work / place / "own.txt").read_text() == PRECIOUS, (place, kind)
         shutil.rmtree(folder / str(number))
-    print(f"{name}: {len(found)} places, {len(attacks)} runs")
+    print(f"{name}: written: {len(found)} places, {len(attacks)} runs: {', '.join(map(str, found))}")
     return len(attacks)
 
 
-@pytest.mark.parametrize("name", ["render", "optimize", "export masks"])
+def _attack_inputs(name: str, recording: Path, folder: Path, sample: int | None) -> int:
+    """Plant each kind of special file at each place that a command reads, and run it; the number of runs."""
+    work, _ = _fresh(recording, folder / "trace")
+    with traced() as trace:
+        COMMANDS[name](work)
+    found = [place for place in read_places(trace, work) if place.parts[0] in INPUTS]
+    attacks = [(place, kind) for place in found for kind in SPECIAL]
+    if sample is not None:
+        attacks = random.Random(name).sample(attacks, min(sample, len(attacks)))
+    for number, (place, kind) in enumerate(attacks):
+        work, home = _fresh(recording, folder / str(number))
+        plant(kind, work / place, home)
+        before, inputs = contents(home), [contents(work / given) for given in INPUTS]
+        _refused_or_done(name, work, (place, kind))
+        assert contents(home) == before, (place, kind)
+        assert [contents(work / given) for given in INPUTS] == inputs, (place, kind)
+        shutil.rmtree(folder / str(number))
+    print(f"{name}: read: {len(found)} places, {len(attacks)} runs: {', '.join(map(str, found))}")
+    return len(attacks)
+
+
+@pytest.mark.parametrize("name", ["render", "optimize", "export masks", "import", "robot"])
 def test_nothing_planted_is_followed(name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=3) == 3
+    assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=2) == 2
+
+
+@pytest.mark.parametrize("name", ["render", "import", "robot"])
+def test_special_files_among_the_inputs_are_refused(
+    name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    assert _attack_inputs(name, recording, tmp_path_factory.mktemp("attacks"), sample=2) == 2
 
 
 @pytest.mark.slow
@@ -108,3 +111,12 @@ def test_nothing_planted_anywhere_is_followed(
     name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=None) >= len(PLANTED)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("train", "synthesize", "bench")])
+def test_special_files_anywhere_among_the_inputs_are_refused(
+    name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    assert _attack_inputs(name, recording, tmp_path_factory.mktemp("attacks"), sample=None) >= len(SPECIAL)

@@ -50,6 +50,13 @@ PLANTED: dict[str, Callable[[Path, Path], None]] = {
 }
 """Kind -> lays it at a place; links lead into the home folder."""
 
+SPECIAL = ("pipe", "folder", "dangling link", "link to a folder", "link to a device", "link to itself")
+"""What no input can be."""
+PLANTED_INPUTS: dict[str, Callable[[Path, Path], None]] = {
+    "link to a device": lambda place, home: place.symlink_to("/dev/zero"),
+    "link to itself": lambda place, home: place.symlink_to(place.name),
+}
+
 
 def plant(kind: str, place: Path, home: Path) -> None:
     """Lay something at a place, in place of what lies there."""
@@ -58,4 +65,4 @@ def plant(kind: str, place: Path, home: Path) -> None:
     else:
         place.unlink(missing_ok=True)
     place.parent.mkdir(parents=True, exist_ok=True)
-    PLANTED[kind](place, home)
+    (PLANTED | PLANTED_INPUTS)[kind](place, home)

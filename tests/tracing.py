@@ -1,16 +1,29 @@
-"""Which paths a piece of code writes to, as the interpreter's own audit events tell."""
+"""Which paths a piece of code writes and reads, as the interpreter's own audit events tell."""
 
 import os
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _REMOVING = {"os.remove", "os.rmdir", "os.mkdir", "os.truncate", "shutil.rmtree"}
-_traces: list[set[Path]] = []
+
+
+@dataclass
+class Trace:
+    """Paths that a piece of code has used."""
+
+    written: set[Path] = field(default_factory=set)
+    """Opened for writing, made, renamed, linked or removed."""
+    read: set[Path] = field(default_factory=set)
+    """Opened for reading."""
+
+
+_traces: list[Trace] = []
 _folder = threading.local()
 _open = os.open
 
@@ -35,29 +48,38 @@ def _hook(event: str, arguments: tuple) -> None:
     if not _traces:
         return
     found: list[Path | None] = []
-    if event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING:
-        found = [_below(arguments[0], getattr(_folder, "path", None))]
+    if event == "open":
+        path = _below(arguments[0], getattr(_folder, "path", None))
+        writes = isinstance(arguments[2], int) and arguments[2] & _WRITING
+        for trace in _traces:
+            (trace.written if writes else trace.read).update([path] if path else [])
     elif event in ("os.rename", "os.link"):
         found = [_below(arguments[0], arguments[2]), _below(arguments[1], arguments[3])]
     elif event in _REMOVING:
         found = [_below(arguments[0], arguments[-1])]
     for trace in _traces:
-        trace.update(path for path in found if path is not None)
+        trace.written.update(path for path in found if path is not None)
 
 
 sys.addaudithook(_hook)
 
 
 @contextmanager
-def traced() -> Iterator[set[Path]]:
-    """Every path that is opened for writing, made, renamed, linked or removed in the block."""
-    trace: set[Path] = set()
+def traced() -> Iterator[Trace]:
+    """Every path that is used in the block."""
+    trace = Trace()
     with mock.patch("os.open", _opened):
         _traces.append(trace)
         try:
             yield trace
         finally:
             _traces.remove(trace)
+
+
+def read_places(trace: Trace, folder: Path) -> list[Path]:
+    """Files below a folder that code reads and does not write."""
+    found = {path for path in trace.read - trace.written if path.is_relative_to(folder) and path.is_file()}
+    return sorted(path.relative_to(folder) for path in found)
 
 
 def places(trace: set[Path], folder: Path) -> list[Path]:

@@ -1,0 +1,121 @@
+"""Commands as they are run with something planted: small inputs, and what takes long is computed once and kept."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from carts_core.cli import calibrate
+from carts_core.cli.command_line import main
+from carts_core.lab.benchmark import Measurement, Run, Score, runner, stages
+from carts_core.lab.synthesis import synthesize
+from carts_core.lab.synthesis.synthesize import _Painter
+from carts_core.lab.training.training import train
+from carts_core.settings import Architecture, ImageSettings, SynthesisConfig, TrainingConfig
+
+Command = Callable[[Path], None]
+"""Does its work in a folder that holds `recording`, `source` (which has no sequence file) and `model`."""
+
+SPARE = ["--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"]
+TRAINING = TrainingConfig(
+    steps=1,
+    batch_size=1,
+    validation_samples=1,
+    workers=0,
+    threads=1,
+    architecture=Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1)),
+    images=ImageSettings(width=64, height=48, field_width=80, things=0.0, absent=0.0),
+)
+SYNTHESIS = SynthesisConfig(domains=("regular",))
+SYNTHESIS = replace(
+    SYNTHESIS,
+    endoscope=replace(SYNTHESIS.endoscope, width=64, height=48, stereo=False),
+    motion=replace(SYNTHESIS.motion, frames=2),
+    render=replace(SYNTHESIS.render, samples=1, robot_faces=4000, tissue_resolution=64, texture_resolution=64),
+)
+
+
+def _command(*words: str) -> Command:
+    def run(work: Path) -> None:
+        before = Path.cwd()
+        os.chdir(work)
+        try:
+            main(list(words))
+        finally:
+            os.chdir(before)
+
+    return run
+
+
+_kept: dict[Any, Any] = {}
+
+
+def _once(function: Callable[..., Any], key: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which computes once what has a key."""
+
+    def kept(*arguments: Any) -> Any:
+        entry = function, key(*arguments)
+        if entry not in _kept:
+            _kept[entry] = function(*arguments)
+        return _kept[entry]
+
+    return kept
+
+
+def _calibrate(work: Path) -> None:
+    with mock.patch.object(calibrate, "_optimized", _once(calibrate._optimized, lambda *_: None)):
+        _command("calibrate", "recording/sequence.toml", *SPARE)(work)
+
+
+def _train(work: Path) -> None:
+    train(TRAINING, work / "out")
+
+
+def _synthesize(work: Path) -> None:
+    with mock.patch.object(_Painter, "_view", _once(_Painter._view, lambda _, frame, camera: (frame, camera))):
+        synthesize(SYNTHESIS, work / "out")
+
+
+def _bench(work: Path) -> None:
+    def measured(bench: Any, runs: list[Run], scope: Any, extractor: Any) -> list[Measurement]:
+        score = Score(0.5, 0.9, 0.9, 0.5, None, None, 1.0)
+        return [Measurement(run, score, (score,), (0,), "converged", "a machine") for run in runs]
+
+    with (
+        mock.patch.object(runner._Bench, "measure", measured),
+        mock.patch.object(stages, "render_figures", lambda *_: {"a": 1.0}),
+        mock.patch.object(stages, "network_figures", lambda *_: {"b": 1.0}),
+        mock.patch.object(stages, "optimizer_figures", lambda *_: {"c": 1.0}),
+    ):
+        _command("bench", "--quick")(work)
+
+
+WITH_SEQUENCE = {
+    "render": ["render", "--frames", "0"],
+    "render to a folder": ["render", "--frames", "0", "--output", "out", "--style", "mask"],
+    "optimize": ["optimize", "--solver", "none", "--frames", "0"],
+    "optimize to a folder": ["optimize", "--solver", "none", "--overwrite", "--output", "out"],
+    "export masks": ["export", "exports/out", "--format", "masks", "--overwrite"],
+    "export csv": ["export", "exports/out.csv", "--format", "csv", "--overwrite"],
+    "export video": ["export", "exports/out", "--format", "video"],
+    "evaluate": ["evaluate", "--solver", "none", "--frames", "0", "--json", "scores/out.json"],
+}
+COMMANDS: dict[str, Command] = {
+    **{name: _command(words[0], "recording/sequence.toml", *words[1:]) for name, words in WITH_SEQUENCE.items()},
+    "calibrate": _calibrate,
+    "train": _train,
+    "synthesize": _synthesize,
+    "bench": _bench,
+    "import": _command("import", "source", "--output", "imported/out", "--overwrite"),
+    "robot": _command("robot", "model", "--instrument", "400093", "--output", "robots/out.urdf", "--overwrite"),
+}
+FOLLOWED = {
+    **{name: ["out"] for name in ("render to a folder", "optimize to a folder", "train")},
+    **{name: ["exports"] for name in COMMANDS if name.startswith("export")},
+    "evaluate": ["scores"],
+    "import": ["imported"],
+    "robot": ["robots"],
+}
+"""What a person named, links on the way to which are followed: with `export`, the folder that the output lies in."""
