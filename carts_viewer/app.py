@@ -117,7 +117,10 @@ class ViewerApp:
         report(f"Opening {path}")
         sequence = Sequence.open(path, progress=report)
         storage = open_storage(sequence, project)
-        report(f"Project {storage.project.path}" if storage.notice is None else storage.notice)
+        if storage.reason is None:
+            report(f"Project {storage.project.path}")
+        if storage.notice is not None:
+            report(storage.notice)
         try:
             return cls(sequence, storage, host=host, port=port, device=device, weights=weights, report=report)
         except BaseException:
@@ -137,7 +140,7 @@ class ViewerApp:
 
     @property
     def notice(self) -> str | None:
-        """Why corrections are not kept, or in which other file they are; None if they are kept in the project."""
+        """What people must know of where corrections are kept, see `Storage.notice`; None if nothing."""
         return self._storage.notice
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carts_core.errors import ProjectError
-from carts_core.project import DamagedProject, Project, default_path
+from carts_core.project import DamagedProject, Project, default_path, rescued_copies
 from carts_core.recording import Sequence
 
 
@@ -18,6 +18,8 @@ class Storage:
     """Why what people do is not kept; None if it is."""
     scratch: tempfile.TemporaryDirectory | None = None
     """The folder of a project that ends with the viewer."""
+    hint: str | None = None
+    """Of what else there is of the project."""
 
     @property
     def kept(self) -> bool:
@@ -26,8 +28,9 @@ class Storage:
 
     @property
     def notice(self) -> str | None:
-        """What people must know: why what they do is not kept, or that it is kept in another file; None if nothing."""
-        return self.project.incident or self.reason
+        """What people must know: why what they do is not kept, or that it is kept in another file, or that another one
+        holds more; None if nothing."""
+        return self.project.incident or self.reason or self.hint
 
     def close(self) -> None:
         """Let others write.
@@ -68,4 +71,16 @@ def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
         scratch = tempfile.TemporaryDirectory(prefix="carts-")
         project = Project.open(sequence, Path(scratch.name) / "scratch.carts")
         return Storage(project, f"Nothing is kept after the viewer is closed: {error}", scratch)
-    return Storage(project, None if project.writable else f"Read-only: {project.read_only_reason}")
+    reason = None if project.writable else f"Read-only: {project.read_only_reason}"
+    return Storage(project, reason, hint=_rescued_hint(project.path))
+
+
+def _rescued_hint(path: Path) -> str | None:
+    copies = rescued_copies(path)
+    if not copies:
+        return None
+    newest, others = copies[0], f" (and {len(copies) - 1} earlier)" if len(copies) > 1 else ""
+    return (
+        f"What was rescued when {path.name} was lost or damaged is in {newest}{others}. It may hold corrections that "
+        f"are not in {path.name}: open it with --project '{newest}', or remove it when nothing of it is needed."
+    )

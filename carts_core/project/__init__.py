@@ -9,6 +9,7 @@ from .keys import Kind as Kind
 from .layers import IgnoreRegion as IgnoreRegion
 from .layers import MaskCorrection as MaskCorrection
 from .place import default_path as default_path
+from .place import rescued_copies as rescued_copies
 from .project import Project as Project
 from .queries import between_kept as between_kept
 from .queries import frames_in as frames_in

@@ -14,9 +14,10 @@ from .companions import check_files
 from .file import LostFile, ProjectFile
 from .identity import SequenceIdentity
 from .lock import holder
+from .place import rescue_paths
 from .rescue import UNREADABLE, rescue
 from .state import ProjectState
-from .store import Store, file_content, rescue_paths
+from .store import Store, file_content
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 import logging
 import sqlite3
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import CartsError, ProjectError
@@ -12,7 +11,7 @@ from ..files import write_new
 from . import database, digests
 from .file import LostFile, ProjectFile, SealRow
 from .journal import Script
-from .place import data_dir
+from .place import data_dir, rescue_paths
 
 _log = logging.getLogger(__name__)
 
@@ -27,15 +26,6 @@ def file_content(memory: sqlite3.Connection) -> bytes:
     content = bytearray(memory.serialize())
     content[_WRITE_VERSION] = _LOG
     return bytes(content)
-
-
-def rescue_paths(path: Path, when: float) -> Iterator[Path]:
-    """Where to put what is rescued of a project: beside it, else among the user's data, else among temporary files."""
-    stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(when))
-    for folder in (path.parent, data_dir(), Path(tempfile.gettempdir())):
-        for number in range(1, 20):
-            again = "" if number == 1 else f"-{number}"
-            yield folder / f"{path.stem}.rescued-{stamp}{again}{path.suffix}"
 
 
 class Store:

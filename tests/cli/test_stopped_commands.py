@@ -117,7 +117,7 @@ class Campaign:
 
 def campaigns(sequence: Path, folder: Path) -> dict[str, Campaign]:
     optimize = ["optimize", str(sequence), "--settings", "iterations=8", "--output"]
-    few = ["--frames", "spread:2", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "2"]
+    few = ["--frames", "spread:2", "--settings", "iterations=2"]
     made = {
         "frame": [*optimize, str(folder / "frame")],
         "sequence": [*optimize, str(folder / "sequence"), "--mode", "sequence"],

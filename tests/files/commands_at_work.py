@@ -18,7 +18,7 @@ from carts_core.settings import Architecture, ImageSettings, SynthesisConfig, Tr
 Command = Callable[[Path], None]
 """Does its work in a folder that holds `recording`, `source` (which has no sequence file) and `model`."""
 
-SPARE = ["--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"]
+SPARE = ["--frames", "0", "--settings", "iterations=1"]
 TRAINING = TrainingConfig(
     steps=1,
     batch_size=1,

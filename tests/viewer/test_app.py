@@ -27,6 +27,7 @@ from carts_viewer.app import ViewerApp
 from carts_viewer.layers import Layer, mask
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.browse import BrowsePanel
+from carts_viewer.panels.project import SavedPanel
 from carts_viewer.scene_view import FRAME, OVERLAY
 from carts_viewer.serving import serve
 from carts_viewer.storage import open_storage
@@ -341,6 +342,27 @@ def test_without_a_place_for_a_project_nothing_is_kept_and_the_page_says_so(
     path = storage.project.path
     storage.close()
     assert not path.parent.exists()
+
+
+def test_a_copy_that_was_rescued_is_said_when_its_project_is_opened(open_viewer: Callable[..., ViewerApp]) -> None:
+    def rescued(folder: Path) -> None:
+        for name in ("sequence.rescued-20260101-120000.carts", "sequence.rescued-20260102-120000-2.carts"):
+            (folder / name).touch()
+        # Neither is one: another project's, a folder, a copy that somebody named themselves.
+        (folder / "other.rescued-20260101-120000.carts").touch()
+        (folder / "sequence.rescued-20260103-120000.carts").mkdir()
+        (folder / "sequence.rescued-mine.carts").touch()
+
+    app = open_viewer(frames=1, prepare=rescued)
+    newest = app.project.path.with_name("sequence.rescued-20260102-120000-2.carts")
+    assert f"when sequence.carts was lost or damaged is in {newest} (and 1 earlier)" in (app.notice or "")
+    assert f"--project '{newest}'" in (app.notice or "")
+    app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
+    app.queue.put(intents.Released())
+    assert not app.wait_until_shown().unsaved
+    (saved,) = (panel for panel in app.display._panels if isinstance(panel, SavedPanel))
+    assert saved._notice.visible and newest.name in saved._notice.content
+    assert "<b>Saved</b> in sequence.carts" in saved._text.content
 
 
 def test_a_project_of_another_sequence_is_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
