@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 from ..errors import CartsError
 
 MIB = 2**20
+GIB = 2**30
 LARGEST_DEPTH = 32
 """How deeply tables and lists may be nested in TOML and JSON."""
 LARGEST_NAME = 255
@@ -44,6 +45,7 @@ SETTINGS = Kind("settings file", MIB)
 ROBOT = Kind("URDF", 16 * MIB)
 MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
+BAG = Kind("ROS bag", 1024 * GIB)
 CACHED = Kind("cached mesh", 256 * MIB)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from ..errors import SequenceError
 from ..extras import needs_extra
 from ..files.image_size import size_problem
+from .bag_limits import check_bag, limit_expansion
 from .images import ImageSource, find_damage
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -114,6 +115,8 @@ def open_bag(path: Path) -> Any:
 
     if not path.exists():
         raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
+    check_bag(path)
+    limit_expansion()
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     try:
         reader.open()

@@ -25,7 +25,8 @@ COMMANDS: dict[str, list[str]] = {
     "export masks": ["export", "out/masks", "--format", "masks"],
     "export csv": ["export", "out/table.csv", "--format", "csv"],
     "evaluate": ["evaluate", "--frames", "0", "--solver", "none", "--json", "out/scores.json"],
-    "calibrate": ["calibrate", "--frames", "0", "--blurs", "0.8", "--looks", "1", "--stage-iterations", "1"],
+    "calibrate": ["calibrate", "--frames", "0", "--settings", "iterations=1"],
+    "import": ["import", "--output", "out/imported", "--overwrite"],
 }
 OUTPUTS = ("runs", "out")
 """Where commands write: the default, and what the command lines above name."""

@@ -13,6 +13,7 @@ from ...errors import SequenceError
 from ...files.reading import CALIBRATION, VALUES, is_regular, parse_json, read_text
 from ...settings.importing import ImportOptions
 from .found import FoundCamera, Note
+from .matlab_files import read_matlab
 from .yaml_files import parse_yaml
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
@@ -240,9 +241,7 @@ def _from_ini(camera: FoundCamera, path: Path) -> FoundCamera:
 
 def _from_matlab(camera: FoundCamera, path: Path) -> FoundCamera:
     """Stereo parameters as a struct of MATLAB: K or IntrinsicMatrix (transposed), radial and tangential distortion."""
-    from scipy.io import loadmat  # noqa: PLC0415
-
-    content = {key: value for key, value in loadmat(path, simplify_cells=True).items() if not key.startswith("__")}
+    content: Any = read_matlab(path)
     while len(content) == 1 and isinstance(only := next(iter(content.values())), dict):
         content = only
     right = side_of(camera.name) == "right"

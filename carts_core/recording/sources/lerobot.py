@@ -14,7 +14,7 @@ from ...settings.importing import ImportOptions
 from ..importing.assembling import by_rows
 from ..importing.cameras import calibration_of, side_of
 from ..importing.columns import arm_log, guess_columns
-from ..importing.foreign_tables import ForeignTable
+from ..importing.foreign_tables import ForeignTable, read_parquet
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import arm_from_log
 from ..importing.media import find_images
@@ -122,12 +122,9 @@ def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index:
 
 
 def _parquet(path: Path) -> Any:
-    import pyarrow  # noqa: PLC0415
-    import pyarrow.parquet  # noqa: PLC0415
-
     try:
-        return pyarrow.parquet.read_table(path)
-    except (OSError, pyarrow.ArrowException) as error:
+        return read_parquet(path)
+    except (OSError, ValueError) as error:
         raise SequenceError(
             f"table {path} cannot be read ({error}). Copy it again; Git LFS pointers need a pull."
         ) from error
