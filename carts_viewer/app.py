@@ -8,6 +8,7 @@ from pathlib import Path
 from carts_core.errors import CartsError
 from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
+from carts_core.settings.inference import Inference
 from carts_viewer import intents
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
@@ -54,6 +55,7 @@ class ViewerApp:
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
+        inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
     ) -> None:
@@ -68,7 +70,7 @@ class ViewerApp:
         self._renderer = OverlayRenderer(sequence, device)
         state = self._first_state()
         self.queue = IntentQueue()
-        self._optimizers = OptimizerFactory(weights=weights, device=device, report=self._say)
+        self._optimizers = OptimizerFactory(weights=weights, device=device, inference=inference, report=self._say)
         self._controller = Controller(state, self._session, self._renderer, self._optimizers, self._deliver)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")
@@ -96,6 +98,7 @@ class ViewerApp:
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
+        inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
     ) -> "ViewerApp":
@@ -107,6 +110,7 @@ class ViewerApp:
             host: The address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: Where to render and optimize, say `cpu` or `cuda`.
+            inference: Who runs the surface network.
             weights: Weights files; a network that none is given of is the shipped one.
             report: Called with a line about what takes long.
 
@@ -122,7 +126,16 @@ class ViewerApp:
         if storage.notice is not None:
             report(storage.notice)
         try:
-            return cls(sequence, storage, host=host, port=port, device=device, weights=weights, report=report)
+            return cls(
+                sequence,
+                storage,
+                host=host,
+                port=port,
+                device=device,
+                inference=inference,
+                weights=weights,
+                report=report,
+            )
         except BaseException:
             storage.close()
             raise

@@ -29,6 +29,7 @@ from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.recording import Sequence as Recording
 from carts_core.settings import Direction
+from carts_core.settings.inference import Inference
 from carts_core.settings.serialization import to_plain
 from carts_viewer.state import Pose
 
@@ -58,15 +59,24 @@ class Optimizer(Protocol):
 class OptimizerFactory:
     """Makes optimizers; loads the networks once, when they are first needed."""
 
-    def __init__(self, *, weights: Sequence[Path] = (), device: str = "cpu", report: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        *,
+        weights: Sequence[Path] = (),
+        device: str = "cpu",
+        inference: Inference = "auto",
+        report: Callable[[str], None],
+    ) -> None:
         """
         Args:
             weights: Weights files; a network that none is given of is the shipped one.
             device: Where to compute.
+            inference: Who runs the surface network.
             report: Called with a line for people about what takes long.
         """
         self._weights = weights
         self._device = device
+        self._inference: Inference = inference
         self._report = report
         self._extractor: FeatureExtractor | None = None
 
@@ -78,7 +88,7 @@ class OptimizerFactory:
         """
         if self._extractor is None:
             self._report("Loading the networks")
-            self._extractor = FeatureExtractor.load(*self._weights, device=self._device)
+            self._extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
         return self._extractor
 
     def provenance(self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters) -> Provenance:
@@ -88,7 +98,7 @@ class OptimizerFactory:
             WeightsError: the networks cannot be loaded.
         """
         used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras)}
-        return Provenance.made_by_optimizer(used, self.prepare().sha256)
+        return Provenance.made_by_optimizer(used, self.prepare().fingerprint)
 
     def make(
         self,
@@ -179,7 +189,7 @@ class OptimizerFactory:
             "frames": [frames[0], frames[-1]],
             "keyframes": sorted(keyframes),
         }
-        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.sha256, Source.PROPAGATED))
+        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.fingerprint, Source.PROPAGATED))
 
 
 class SequenceRun:

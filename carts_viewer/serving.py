@@ -9,6 +9,7 @@ from typing import TextIO
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
+from carts_core.settings.inference import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.ending import EndRequest
 from carts_viewer.opening import opened_in_browser
@@ -21,6 +22,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     device: str = "cpu",
+    inference: Inference = "auto",
     weights: tuple[Path, ...] = (),
     open_browser: bool = False,
 ) -> None:
@@ -32,6 +34,7 @@ def serve(
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
+        inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
         open_browser: Open the page in the default browser.
 
@@ -44,7 +47,14 @@ def serve(
     with EndRequest() as end:
         try:
             app = ViewerApp.open(
-                sequence_path, project=project, host=host, port=port, device=device, weights=weights, report=_say_doing
+                sequence_path,
+                project=project,
+                host=host,
+                port=port,
+                device=device,
+                inference=inference,
+                weights=weights,
+                report=_say_doing,
             )
         except CartsError as error:
             print(f"error: {visible(str(error))}", file=sys.stderr)

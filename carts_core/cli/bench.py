@@ -52,7 +52,9 @@ class Bench:
             raise CartsError("--rooms was given without --real. Say which real frames are to be put into these rooms.")
         folder = output_folder(self.output, "bench", name)
         seed = TEST_SEED if self.seed is None else self.seed
-        extractor = FeatureExtractor.load(*self.network.weights, device=self.network.device)
+        extractor = FeatureExtractor.load(
+            *self.network.weights, device=self.network.device, inference=self.network.inference
+        )
         sources = [synthetic_source(scope, seed)]
         if self.real is not None:
             sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
@@ -75,7 +77,7 @@ class Bench:
             scope=name,
             planned=len(runs),
             sources={source.name: source.description for source in sources},
-            weights=extractor.sha256,
+            weights=extractor.fingerprint,
             code=code_fingerprint(),
             version=version("carts"),
         )

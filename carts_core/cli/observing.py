@@ -18,7 +18,7 @@ class Observer:
 
     predictor: "FeatureExtractor | MaskPredictor"
     weights: str
-    """Fingerprint of the networks; empty without any."""
+    """Fingerprint of the networks and of who runs them; empty without any."""
     masked: bool
     """Whether masks of the sequence are fitted."""
 
@@ -50,10 +50,10 @@ class Observing(Network):
 
         if self.observe == "masks":
             return Observer(MaskPredictor(device=self.device), "", masked=True)
-        extractor = FeatureExtractor.load(*self.weights, device=self.device)
+        extractor = FeatureExtractor.load(*self.weights, device=self.device, inference=self.inference)
         if self.observe == "both":
-            return Observer(MaskPredictor(NetworkPredictor(extractor)), extractor.sha256, masked=True)
-        return Observer(extractor, extractor.sha256, masked=False)
+            return Observer(MaskPredictor(NetworkPredictor(extractor)), extractor.fingerprint, masked=True)
+        return Observer(extractor, extractor.fingerprint, masked=False)
 
     @property
     def caution(self) -> str | None:

@@ -9,6 +9,7 @@ import tyro
 
 from ..errors import SettingsError
 from ..files import OutputPath, output_path
+from ..settings.inference import Inference
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -119,6 +120,9 @@ class Network:
     """Weights files; a network that none is given of is the shipped one."""
     device: str = "cpu"
     """`cpu`, or a CUDA device such as `cuda` or `cuda:1`."""
+    inference: Inference = "auto"
+    """Who runs the surface network: `torch`, `onnx` (ONNX Runtime, on a CPU; the same to 1e-4), or whichever was faster
+    when it was measured on this machine, once."""
 
     def __post_init__(self) -> None:
         check_device(self.device)

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ..errors import WeightsError
 from ..resources import shipped_weights
+from ..settings.inference import Inference
+from .inference import surface_engine
 from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
 from .weights import Weights, read_weights
@@ -26,9 +28,12 @@ class FeatureExtractor:
         stride: width and height of an input must be multiples of this [px].
         channels: number of feature channels.
         device: where the networks live.
+        engine: who runs the surface network: "torch" or "onnx".
     """
 
-    def __init__(self, features: Weights, surface: Weights, device: str | torch.device) -> None:
+    def __init__(
+        self, features: Weights, surface: Weights, device: str | torch.device, inference: Inference = "torch"
+    ) -> None:
         self.device = torch.device(device)
         self.weights = {"feature": features, "surface": surface}
         feature_network, surface_network = features.network, surface.network
@@ -36,6 +41,7 @@ class FeatureExtractor:
         self._features = feature_network.to(self.device).folded()
         self._surface = surface_network.to(self.device).folded()
         self.sha256 = hashlib.sha256((features.sha256 + surface.sha256).encode()).hexdigest()
+        self.engine, self._faster = surface_engine(self._surface, surface.sha256, self.device, inference)
         self.working_size = features.working_size
         self.stride = max(network.architecture.stride for network in (self._features, self._surface))
         self.channels = self._features.architecture.widths[0]
@@ -43,11 +49,24 @@ class FeatureExtractor:
     def __repr__(self) -> str:
         return f"FeatureExtractor({self.channels} channels, {self.sha256[:8]})"
 
+    @property
+    def fingerprint(self) -> str:
+        """Of the networks, and of who runs the surface network: engines differ in the last digits."""
+        return self.sha256 if self.engine == "torch" else f"{self.sha256} {self.engine}"
+
     @staticmethod
-    def load(*weights: Path | str, device: str | torch.device = "cpu") -> "FeatureExtractor":
+    def load(
+        *weights: Path | str, device: str | torch.device = "cpu", inference: Inference = "torch"
+    ) -> "FeatureExtractor":
         """Read weights files; a network that none is given of is the shipped one.
 
+        Args:
+            weights: files.
+            device: where the networks live.
+            inference: who runs the surface network; `auto` measures once on each machine who is faster.
+
         Raises:
+            SettingsError: `onnx` was asked for and is not possible.
             WeightsError: a file is missing, is not safetensors, or holds no network, or two hold the same kind.
         """
         read: dict[str, tuple[Path, Weights]] = {}
@@ -63,7 +82,7 @@ class FeatureExtractor:
         for network, path in zip(kinds, shipped_weights(), strict=True):
             if network.kind not in read:
                 read[network.kind] = (path, read_weights(path))
-        return FeatureExtractor(read["feature"][1], read["surface"][1], device)
+        return FeatureExtractor(read["feature"][1], read["surface"][1], device, inference)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
         """Features of the last layer before the head (F_I and F_Î of the paper), not negative.
@@ -88,4 +107,7 @@ class FeatureExtractor:
 
         Arguments and errors as `SurfaceNetwork.forward`.
         """
+        if self._faster is not None:
+            self._surface.check_input(images, 3)
+            return self._faster(images, given)
         return self._surface(images.contiguous(memory_format=torch.channels_last), given).map()

@@ -52,7 +52,7 @@ class UNet(nn.Module):
         Raises:
             SettingsError: another number of channels, or a size that is no multiple of `architecture.stride`.
         """
-        self._check(x, self.inputs)
+        self.check_input(x, self.inputs)
         skips: list[Tensor] = []
         for level, encode in enumerate(self.encoder):
             x = encode(functional.max_pool2d(x, 2) if level else x)
@@ -66,11 +66,16 @@ class UNet(nn.Module):
 
     def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
         """Images as the first convolution gets them; see `standardize`."""
-        self._check(images, 3)
+        self.check_input(images, 3)
         block = self.architecture.stride if self.architecture.local_mean else None
         return standardize(images, block, self.architecture.local_contrast)
 
-    def _check(self, x: Tensor, channels: int) -> None:
+    def check_input(self, x: Tensor, channels: int) -> None:
+        """See that a tensor has so many channels, and a size that the levels can halve.
+
+        Raises:
+            SettingsError: it has not.
+        """
         stride = self.architecture.stride
         if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
             raise SettingsError(

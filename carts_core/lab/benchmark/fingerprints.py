@@ -47,5 +47,5 @@ def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source:
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
     company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
-    parts = (settings, company, extractor.sha256, str(extractor.device), source, TOLERANCE, code_fingerprint())
+    parts = (settings, company, extractor.fingerprint, str(extractor.device), source, TOLERANCE, code_fingerprint())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

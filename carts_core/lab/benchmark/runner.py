@@ -82,7 +82,7 @@ class Benchmark:
                 description = f"{run.source}, {run.domain}, {which}: {run.method}{error}"
                 bar.update(task, description=description)
                 for measurement in bench[run.source].measure(group, self.scope, self.extractor):
-                    facts = {"weights": self.extractor.sha256, "code": code_fingerprint()}
+                    facts = {"weights": self.extractor.fingerprint, "code": code_fingerprint()}
                     self.results.append(measurement, self.runs[measurement.run], **facts)
                     bar.advance(task, todo.pop(measurement.run, None) is not None)
                 _log(console, f"{len(self.runs) - len(todo)} of {len(self.runs)}: {description}")

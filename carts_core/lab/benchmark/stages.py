@@ -67,4 +67,4 @@ def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, floa
 
 
 def _of(extractor: FeatureExtractor) -> list[str]:
-    return [machine(extractor.device), extractor.sha256, code_fingerprint()]
+    return [machine(extractor.device), extractor.fingerprint, code_fingerprint()]

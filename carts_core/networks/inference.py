@@ -1,0 +1,138 @@
+"""Who runs the surface network here: measured once for each machine and network, and remembered."""
+
+import json
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ..errors import OutputError, SettingsError
+from ..files import output_path, write_new
+from ..files.reading import VALUES, parse_json, read_bytes
+from ..fingerprints import fingerprint
+from ..model.mesh_cache import cache_dir
+from ..model.surface import SURFACE_CHANNELS
+from ..settings.inference import Engine, Inference
+from .surface_network import SurfaceNetwork
+
+if TYPE_CHECKING:
+    from .onnx_surface import OnnxSurface
+
+TOLERANCE = 1e-4
+"""Largest difference of two surface maps that count as the same [1]."""
+_GAIN = 0.9
+"""Share of torch's time below which another engine is taken [1]."""
+_ROUNDS = 5
+_PROBE = 7, 13
+"""Height and width of the image that is measured, in strides of the network: a window around an arm."""
+
+Surface = Callable[[Tensor, Tensor], Tensor]
+
+
+def surface_engine(
+    network: SurfaceNetwork, sha256: str, device: torch.device, wanted: Inference
+) -> "tuple[Engine, OnnxSurface | None]":
+    """Who runs the network; nothing more is needed for torch.
+
+    Args:
+        network: folded.
+        sha256: fingerprint of its weights.
+        device: where torch runs it.
+        wanted: who is to run it.
+
+    Raises:
+        SettingsError: `onnx` was asked for and does not do.
+    """
+    if wanted == "torch":
+        return "torch", None
+    if fault := _missing(device):
+        return _without(wanted, fault)
+    try:
+        from .onnx_surface import OnnxSurface  # noqa: PLC0415  not everybody has ONNX Runtime
+
+        found = OnnxSurface(network, sha256)
+        difference = _difference(network, found)
+    except (RuntimeError, ImportError) as error:
+        return _without(wanted, f"ONNX Runtime cannot run the network: {error}")
+    if not difference <= TOLERANCE:
+        return _without(wanted, f"its surface maps differ by {difference:.1e}, more than {TOLERANCE:.0e}")
+    if wanted == "auto" and _remembered(network, sha256, found) == "torch":
+        return "torch", None
+    return "onnx", found
+
+
+def _missing(device: torch.device) -> str | None:
+    """Why ONNX Runtime cannot be used at all; None if it can."""
+    if device.type != "cpu":
+        return f"it runs on a CPU only, and the device is {device}"
+    absent = [name for name in ("onnxruntime", "onnx") if find_spec(name) is None]
+    return f"{' and '.join(absent)} is not installed" if absent else None
+
+
+def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
+    if wanted == "onnx":
+        raise SettingsError(f"--inference onnx is not possible: {fault}. Give auto or torch.")
+    return "torch", None
+
+
+def _probe(network: SurfaceNetwork) -> tuple[Tensor, Tensor]:
+    """An image and a given surface map, always the same."""
+    height, width = (strides * network.architecture.stride for strides in _PROBE)
+    chance = torch.Generator().manual_seed(0)
+    images = torch.rand(1, 3, height, width, generator=chance)
+    return images, torch.rand(1, SURFACE_CHANNELS, height, width, generator=chance)
+
+
+@torch.no_grad()
+def _difference(network: SurfaceNetwork, other: Surface) -> float:
+    images, given = _probe(network)
+    return float((network(images, given).map() - other(images, given)).abs().max())
+
+
+def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
+    """The faster one, as it was measured the first time on this machine."""
+    versions = [version(name) for name in ("torch", "onnxruntime")]
+    key = fingerprint(sha256, platform.node(), platform.processor(), versions, torch.get_num_threads())[:32]
+    path = cache_dir() / f"inference-{key}.json"
+    if (known := _read(path)) is not None:
+        return known
+    seconds = _times(network, other)
+    engine: Engine = "onnx" if seconds["onnx"] < _GAIN * seconds["torch"] else "torch"
+    try:
+        # Of several processes that measure at the same time, all take what the first one found.
+        write_new(output_path(path.parent, path.name), json.dumps({"engine": engine, "seconds": seconds}).encode())
+    except OutputError:
+        return engine
+    return _read(path) or engine
+
+
+def _read(path: Path) -> Engine | None:
+    try:
+        engine = parse_json(read_bytes(path, VALUES))["engine"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return engine if engine in ("torch", "onnx") else None
+
+
+@torch.no_grad()
+def _times(network: SurfaceNetwork, other: Surface) -> dict[Engine, float]:
+    """Seconds for the probe, each the median of some rounds in turn."""
+    images, given = _probe(network)
+    engines: dict[Engine, Callable[[], Tensor]] = {
+        "torch": lambda: network(images.contiguous(memory_format=torch.channels_last), given).map(),
+        "onnx": lambda: other(images, given),
+    }
+    seconds: dict[Engine, list[float]] = {"torch": [], "onnx": []}
+    for _ in range(_ROUNDS):
+        for name, run in engines.items():
+            began = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - began)
+    return {name: median(values) for name, values in seconds.items()}

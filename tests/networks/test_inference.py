@@ -1,0 +1,130 @@
+"""ONNX Runtime runs the surface network as torch does, or not at all."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from carts_core.errors import SettingsError
+from carts_core.networks import FeatureExtractor, inference
+from carts_core.networks.onnx_surface import OnnxSurface
+from carts_core.networks.surface_network import SurfaceNetwork
+from carts_core.networks.weights import save_weights
+from carts_core.settings import Architecture
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def weights(small_architecture: Architecture, tmp_path: Path) -> Path:
+    torch.manual_seed(3)
+    network = SurfaceNetwork(small_architecture)
+    with torch.no_grad():
+        for _ in range(5):
+            network(torch.rand(4, 3, 32, 48), torch.rand(4, 6, 32, 48))
+    path = tmp_path / "surface.safetensors"
+    save_weights(network.eval(), path, {}, (320, 240))
+    return path
+
+
+@pytest.mark.parametrize("size", [(16, 16), (112, 208), (240, 320)])
+@pytest.mark.parametrize("shipped", [False, True])
+def test_onnx_predicts_what_torch_predicts(weights: Path, size: tuple[int, int], shipped: bool) -> None:
+    files = [] if shipped else [weights]
+    one, other = FeatureExtractor.load(*files), FeatureExtractor.load(*files, inference="onnx")
+    assert (one.engine, other.engine) == ("torch", "onnx")
+    assert one.sha256 == other.sha256 == one.fingerprint != other.fingerprint
+    images, given = torch.rand(2, 3, *size), torch.rand(2, 6, *size)
+    expected, found = one.surface(images, given), other.surface(images, given)
+    assert float((expected - found).abs().max()) < inference.TOLERANCE and float(expected.std()) > 1e-3
+    # A part of a larger tensor, which is not contiguous.
+    window = images[..., : size[0] // 2 // 16 * 16 or 16, :]
+    torch.testing.assert_close(
+        other.surface(window, given[..., : window.shape[2], :]),
+        one.surface(window, given[..., : window.shape[2], :]),
+        atol=1e-4,
+        rtol=0,
+    )
+
+
+def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
+    images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
+    before, found = torch.get_num_threads(), []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            found.append(FeatureExtractor.load(inference="onnx").surface(images, given))
+        finally:
+            torch.set_num_threads(before)
+    assert torch.equal(*found)
+
+
+def test_a_wrong_size_is_the_same_error_whoever_runs_the_network(weights: Path) -> None:
+    for engine in ("torch", "onnx"):
+        extractor = FeatureExtractor.load(weights, inference=engine)
+        with pytest.raises(SettingsError, match="multiples of"):
+            extractor.surface(torch.rand(1, 3, 33, 48), torch.rand(1, 6, 33, 48))
+
+
+def test_the_graph_is_exported_once_and_again_where_it_was_damaged(
+    weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    FeatureExtractor.load(weights, inference="onnx")
+    (graph,) = cache.glob("surface-*.onnx")
+    whole = graph.read_bytes()
+    monkeypatch.setattr("carts_core.networks.onnx_surface._exported", lambda network: pytest.fail("exported again"))
+    assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
+    monkeypatch.undo()
+    monkeypatch.setenv("CARTS_CACHE", str(cache))
+    graph.write_bytes(whole[:1000])
+    assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx" and len(graph.read_bytes()) == len(whole)
+
+
+def test_another_networks_graph_is_not_used(weights: Path, cache: Path) -> None:
+    FeatureExtractor.load(inference="onnx")
+    (other,) = cache.glob("surface-*.onnx")
+    content = other.read_bytes()
+    FeatureExtractor.load(weights, inference="onnx")
+    (own,) = set(cache.glob("surface-*.onnx")) - {other}
+    own.write_bytes(content)
+    assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
+    with pytest.raises(SettingsError, match="--inference onnx is not possible: its surface maps differ by"):
+        FeatureExtractor.load(weights, inference="onnx")
+
+
+@pytest.mark.parametrize(("seconds", "engine"), [(0.5, "onnx"), (0.95, "torch"), (2.0, "torch")])
+def test_the_faster_engine_is_measured_once_and_remembered(
+    weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, seconds: float, engine: str
+) -> None:
+    monkeypatch.setattr(inference, "_times", lambda network, other: {"torch": 1.0, "onnx": seconds})
+    assert FeatureExtractor.load(weights, inference="auto").engine == engine
+    (remembered,) = cache.glob("inference-*.json")
+    assert json.loads(remembered.read_text())["engine"] == engine
+    monkeypatch.setattr(inference, "_times", lambda network, other: pytest.fail("measured again"))
+    assert FeatureExtractor.load(weights, inference="auto").engine == engine
+
+
+def test_times_are_measured(weights: Path) -> None:
+    extractor = FeatureExtractor.load(weights)
+    network = extractor._surface
+    times = inference._times(network, OnnxSurface(network, extractor.weights["surface"].sha256))
+    assert set(times) == {"torch", "onnx"} and all(0 < value < 10 for value in times.values())
+
+
+def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inference, "find_spec", lambda name: None)
+    assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
+    with pytest.raises(SettingsError, match="onnxruntime and onnx is not installed"):
+        FeatureExtractor.load(weights, inference="onnx")
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(weights: Path, cache: Path) -> None:
+    cache.write_text("a file where the folder should be")
+    assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
