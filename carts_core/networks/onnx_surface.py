@@ -61,9 +61,16 @@ class OnnxSurface:
     def __call__(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
-        """The same as `SurfaceNetwork.forward(images, given).map()`, but for rounding."""
+        """The same as `SurfaceNetwork.forward(images, given).map()`, but for rounding.
+
+        Raises:
+            RuntimeError: ONNX Runtime cannot run the graph.
+        """
         inputs = {"images": images.contiguous().numpy(), "given": given.contiguous().numpy()}
-        (maps,) = self._session.run(["maps"], inputs)
+        try:
+            (maps,) = self._session.run(["maps"], inputs)
+        except Exception as error:  # Its errors have no base class but this.
+            raise RuntimeError(f"ONNX Runtime cannot run the graph: {error}") from error
         assert isinstance(maps, np.ndarray)
         return torch.from_numpy(maps)
 
