@@ -19,6 +19,7 @@ from .evaluate import Evaluate
 from .export import Export
 from .hand_eye import HandEye
 from .import_ import Import
+from .live import Live
 from .optimize import Optimize
 from .render import Render
 from .robot import RobotCommand
@@ -41,6 +42,7 @@ Command = (
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[HandEye, tyro.conf.subcommand("hand-eye")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
+    | Annotated[Live, tyro.conf.subcommand("live")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Render, tyro.conf.subcommand("render")]

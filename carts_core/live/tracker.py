@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
@@ -100,9 +101,12 @@ class LiveTracker:
         self.settings, self.live, self.verdict = settings or SurfaceSolver(), live or LiveSettings(), LiveVerdict.LOST
         self._scene, self._predictor = scene.with_cameras(cameras), predictor_of(networks)
         self._model, self._free = model or SequenceSettings(), free or FreeParameters()
-        self._backgrounds = backgrounds
-        self._small = self._solver(self.live.small)
-        self._full = self._solver(self.live.full)
+        self._solvers = {
+            (effort, moving): self._solver(stages, None if moving else backgrounds)
+            for effort, stages in ((Effort.SMALL, self.live.small), (Effort.FULL, self.live.full))
+            for moving in (False, True)
+        }
+        self._moving = False
         self._errors: ErrorModel | None = None
         self._filtered: Gaussian | None = None
         """Of the parts of the error, after the last good frame."""
@@ -111,14 +115,20 @@ class LiveTracker:
         self._searched = -math.inf
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
 
-    def track(self, frame: Frame) -> LiveEstimate:
+    def track(self, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> LiveEstimate:
         """The estimate of a frame that is newer than those before.
+
+        Args:
+            frame: images, measured joint positions, and when they were taken.
+            camera_poses: camera name -> T_camera_world [m], where it is not that of the scene. What cameras that move
+                see without arms is not known, so backgrounds are left out then.
 
         Raises:
             SettingsError: an image is missing or of another size than its camera.
         """
         began = time.perf_counter()
-        variables = self._variables(frame)
+        variables = self._variables(frame, camera_poses or {})
+        self._moving = bool(camera_poses)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
         state, gap = errors.initial(), math.inf
         if self._filtered is not None:
@@ -154,18 +164,19 @@ class LiveTracker:
         self, frame: Frame, variables: Variables, expected: Gaussian, now: float
     ) -> tuple[Effort, Measurement]:
         """With no more effort than it takes."""
+        small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         if self._filtered is not None:
-            found = self._small.warm(frame, variables, expected, expected.mean)
+            found = small.warm(frame, variables, expected, expected.mean)
             if not (self._bad(found) or _contradicts(found, expected)):
                 return Effort.SMALL, found
             if self.verdict is not LiveVerdict.LOST:
-                return Effort.FULL, self._full.warm(frame, variables, expected, expected.mean)
+                return Effort.FULL, full.warm(frame, variables, expected, expected.mean)
             if now - self._searched < self.live.search_seconds:
                 return Effort.SMALL, found
         self._searched = now
         errors = self._error_model(variables)
         prior = errors.correction(errors.initial())
-        return Effort.SEARCH, self._full.cold(frame, variables, prior)
+        return Effort.SEARCH, full.cold(frame, variables, prior)
 
     def _bad(self, measurement: Measurement) -> bool:
         usual = statistics.median(self._losses) if self._losses else math.inf
@@ -182,13 +193,16 @@ class LiveTracker:
         self._seen = now
         self._losses.append(measurement.loss)
 
-    def _solver(self, warm: tuple[Stage, ...]) -> FrameSolver:
+    def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> FrameSolver:
         model = replace(self._model, warm=warm, cold=self.live.search)
         settings = replace(self.settings, stages=warm)
-        return FrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, self._backgrounds)
+        return FrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, backgrounds)
 
-    def _variables(self, frame: Frame) -> Variables:
+    def _variables(self, frame: Frame, camera_poses: Mapping[str, np.ndarray]) -> Variables:
         state = self._scene.state(frame.measured, self._predictor.device)
+        if camera_poses:
+            poses = np.stack([camera_poses.get(camera.name, camera.T_camera_world) for camera in self._scene.cameras])
+            state = replace(state, T_camera_world=torch.from_numpy(poses).to(state.T_camera_world))
         return Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _error_model(self, variables: Variables) -> ErrorModel:

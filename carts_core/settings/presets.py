@@ -59,8 +59,12 @@ _WIDE = Observe(margin=27, attention=27)
 WARM: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
 """A frame of a sequence whose neighbours are known."""
 
-LIVE: tuple[Stage, ...] = (Observe(scale=1.0, margin=12, attention=12), Descend(blur=1.2, steps=2))
-"""A frame of a live stream, near where it is expected: one small observation, two steps at most."""
+LIVE: tuple[Stage, ...] = (
+    Observe(scale=1.0, margin=12, attention=12),
+    Descend(blur=1.2, steps=2, tolerance=0.06),
+    AlignEdges(steps=8),
+)
+"""A frame of a live stream, near where it is expected: one small observation, two steps at most, and the outlines."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
 """How well a given state fits a frame, in a smaller image."""

@@ -13,6 +13,7 @@ HEAVY = {"torch", "numba", "cv2", "kornia", "scipy", "trimesh", "matplotlib", "v
 COMMANDS = (
     *("view", "optimize", "evaluate", "calibrate", "hand-eye", "render", "export", "synthesize", "train", "bench"),
     "batch",
+    "live",
 )
 
 

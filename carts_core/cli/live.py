@@ -1,0 +1,155 @@
+"""`carts live`: follow the arms while they move."""
+
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from ..console import Terminal
+from ..errors import SettingsError
+from .selection import Network, Selection, SequencePath, check_writable
+from .solver_options import FreeInFrames
+
+if TYPE_CHECKING:
+    from ..live import Source, Tracked
+    from ..recording import Sequence
+
+_SOURCES = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
+
+
+@dataclass(frozen=True)
+class Live:
+    """Follow the arms in a stream of images and joints, frame by frame; late frames are dropped. Ctrl-C ends it."""
+
+    sequence: SequencePath
+    """Sequence file: its arms and cameras, and for a replay its images and joints."""
+    source: str = "replay"
+    """Where frames come from: `replay` (at the speed of the clock), `camera:0`, `video:FILE`, `folder:PATH` that fills,
+    or `socket:PORT` of 127.0.0.1 (docs/reference/live.md)."""
+    joints: int | None = None
+    """With `camera` and `video`: port of 127.0.0.1 where joints come from, and where results go."""
+    rate: float | None = None
+    """Replay: frames a second; by default those of the recording."""
+    loops: int = 1
+    """Replay: how often."""
+    output: Path | None = None
+    """Write results to this file, a line of JSON each; by default they go to the standard output. With a socket they
+    also go to all its clients."""
+    quiet: bool = False
+    """No results on the standard output."""
+    masks: bool = False
+    """Results have masks, too."""
+    record: Path | None = None
+    """Keep what is seen as a sequence in this new folder, with the corrections as its project."""
+    camera: tuple[str, ...] = Selection.camera
+    """Cameras, by name."""
+    domain: str | None = None
+    """Replay: domain, by name; the sequence's first one if none is named."""
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def __post_init__(self) -> None:
+        kind, _, rest = self.source.partition(":")
+        needs = {"replay": not rest, "camera": rest.isdecimal(), "video": bool(rest), "folder": bool(rest)}
+        needs["socket"] = rest.isdecimal() and int(rest) < 2**16
+        if not needs.get(kind, False):
+            raise SettingsError(f"--source {self.source!r} is not known. Give {_SOURCES}.")
+        if kind in ("camera", "video") and self.joints is None:
+            raise SettingsError(f"--source {self.source} has no joints. Say with --joints on which port they come.")
+        if self.rate is not None and not 0 < self.rate <= 1000:
+            raise SettingsError(f"--rate is {self.rate:g}; allowed is above 0, at most 1000.")
+        if self.loops < 1:
+            raise SettingsError(f"--loops is {self.loops}; allowed is 1 or more.")
+        if self.output is not None:
+            check_writable(self.output.parent)
+
+    def run(self) -> None:
+        """Follow until the stream ends or somebody ends it."""
+        from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow
+        from ..networks.extractor import FeatureExtractor
+        from ..optimization import Backgrounds
+        from ..project import Provenance
+        from ..recording import Sequence
+
+        console = Terminal(stderr=True)
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        cameras = tuple(Selection(camera=self.camera).camera_names(sequence.scene))
+        domain = Selection(domain=(self.domain,) if self.domain else ()).domain_names(sequence)[0]
+        extractor = FeatureExtractor.load(
+            *self.network.weights, device=self.network.device, inference=self.network.inference
+        )
+        known = Backgrounds.of(sequence, cameras, domain) if self.source == "replay" else None
+        tracker = LiveTracker(sequence.scene, extractor, free=self.free, backgrounds=known, cameras=cameras)
+        results = Results(sequence.scene.with_cameras(cameras), masks=self.masks)
+        with ExitStack() as held:
+            source, clients = self._source(sequence, cameras, domain, held, console)
+            lines = self._lines(held)
+            recorder = None
+            if self.record is not None:
+                made_by = Provenance.made_by_optimizer({"live": True}, extractor.fingerprint)
+                recorder = Recorder(sequence, cameras, self.record, made_by)
+
+            def show(tracked: "Tracked") -> None:
+                message = results.message(tracked)
+                for send in (*lines, *clients):
+                    send(message)
+
+            sinks = [show, *([recorder] if recorder is not None else [])]
+            statistics = LiveStatistics()
+            try:
+                # A stream may have no end but this.
+                with suppress(KeyboardInterrupt):
+                    follow(source, tracker, sinks, statistics)
+            finally:
+                console.print(str(statistics))
+                if recorder is not None and (path := recorder.close()) is not None:
+                    console.print(f"wrote {path}. Look at it: carts view {path}")
+
+    def _source(
+        self, sequence: "Sequence", cameras: tuple[str, ...], domain: str, held: ExitStack, console: Terminal
+    ) -> "tuple[Source, list[Callable]]":
+        """Where frames come from, and further places where results go."""
+        from ..live import Assembler, Camera, Folder, Replay, StreamServer
+
+        kind, _, rest = self.source.partition(":")
+        assembler = Assembler(sequence, cameras)
+        clients = []
+        port = int(rest) if kind == "socket" else self.joints
+        if port is not None and kind != "replay":
+            server = StreamServer(assembler, port)
+            held.callback(server.close)
+            console.print(f"listening on 127.0.0.1:{server.port}")
+            clients.append(server.send)
+            if kind == "socket":
+                return server, clients
+        match kind:
+            case "replay":
+                return Replay(sequence, cameras, domain, rate=self.rate, loops=self.loops), clients
+            case "folder":
+                return Folder(assembler, cameras, Path(rest)), clients
+        return Camera(assembler, cameras[0], int(rest) if kind == "camera" else rest), clients
+
+    def _lines(self, held: ExitStack) -> "list[Callable]":
+        """Where results go as lines of JSON."""
+        import sys
+
+        import msgspec
+
+        from ..files import output_stream
+
+        encoder = msgspec.json.Encoder()
+        if self.output is not None:
+            stream = held.enter_context(output_stream(self.output))
+        elif not self.quiet:
+            stream = sys.stdout.buffer
+        else:
+            return []
+
+        def write(message: object) -> None:
+            stream.write(encoder.encode(message) + b"\n")
+            stream.flush()
+
+        return [write]

@@ -1,0 +1,138 @@
+"""From a source through a tracker to whoever wants results, always with the newest frame."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..model.scene import Scene
+from ..rendering import Renderer
+from .messages import ResultMessage, encoded_masks
+from .moments import Moment, Newest, Source
+from .tracker import LiveEstimate, LiveTracker, LiveVerdict
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame, what came of it, and how old it was then."""
+
+    moment: Moment
+    estimate: LiveEstimate
+    age: float
+    """Since its arrival [s]."""
+
+
+Sink = Callable[[Tracked], None]
+"""Gets every result, on the tracker's thread."""
+
+
+@dataclass
+class LiveStatistics:
+    """How a stream went."""
+
+    arrived: int = 0
+    dropped: int = 0
+    verdicts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LiveVerdict, 0))
+    ages: list[float] = field(default_factory=list)
+    """Of the last results that were not lost [s]."""
+    began: float = field(default_factory=time.monotonic)
+    ended: float = 0.0
+
+    _KEPT = 100_000
+
+    def add(self, tracked: Tracked) -> None:
+        """Count a result."""
+        self.verdicts[tracked.estimate.verdict] += 1
+        if tracked.estimate.verdict is not LiveVerdict.LOST:
+            self.ages.append(tracked.age)
+            del self.ages[: -self._KEPT]
+
+    @property
+    def tracked(self) -> int:
+        """Frames with a result."""
+        return sum(self.verdicts.values())
+
+    def __str__(self) -> str:
+        seconds = max((self.ended or time.monotonic()) - self.began, 1e-9)
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdicts.items())
+        text = (
+            f"{self.tracked} of {self.arrived} frames ({self.dropped} dropped), {self.tracked / seconds:.1f} a second: "
+        )
+        if not self.ages:
+            return text + verdicts
+        middle, late = (1000.0 * float(np.percentile(self.ages, share)) for share in (50, 95))
+        return f"{text}. Age of results: median {middle:.0f} ms, 95 % within {late:.0f} ms"
+
+
+def follow(
+    source: Source, tracker: LiveTracker, sinks: Sequence[Sink], statistics: LiveStatistics | None = None
+) -> LiveStatistics:
+    """Track a stream until it ends; the source is closed then, also where the caller is interrupted.
+
+    Args:
+        source: of frames.
+        tracker: of the arms.
+        sinks: get every result.
+        statistics: to go on with.
+
+    Raises:
+        CartsError: what ended the stream, or a frame that does not fit the scene.
+    """
+    statistics = statistics or LiveStatistics()
+    newest = Newest(source, tracker.live.oldest_seconds)
+    try:
+        while (moment := newest.take()) is not None:
+            estimate = tracker.track(moment.frame, moment.camera_poses)
+            tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
+            statistics.add(tracked)
+            for sink in sinks:
+                sink(tracked)
+    finally:
+        newest.close()
+        statistics.ended = time.monotonic()
+        statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
+    return statistics
+
+
+class Results:
+    """Makes messages of results.
+
+    Args:
+        scene: with the cameras that take part.
+        masks: whether messages have masks; rendering them takes about 10 ms a camera.
+    """
+
+    def __init__(self, scene: Scene, *, masks: bool = False) -> None:
+        self._scene = scene
+        self._renderers = {camera.name: Renderer(scene, cameras=[camera.name]) for camera in scene.cameras if masks}
+
+    def message(self, tracked: Tracked) -> ResultMessage:
+        """The message of a result."""
+        estimate, joints, frames = tracked.estimate, {}, {}
+        T_world_base, T_camera_world = (
+            values.double().cpu().numpy() for values in (estimate.state.T_world_base, estimate.state.T_camera_world)
+        )
+        for index, arm in enumerate(self._scene.arms):
+            known = zip(estimate.joint_positions[arm.name], estimate.joint_std[arm.name], strict=True)
+            values = [(float(value), float(std) if np.isfinite(std) else None) for value, std in known]
+            joints[arm.name] = dict(zip(arm.robot.joint_names, values, strict=True))
+            frames[arm.name] = {
+                camera.name: (T_camera_world[number] @ T_world_base[index]).tolist()
+                for number, camera in enumerate(self._scene.cameras)
+            }
+        found = {name: self._mask(name, estimate) for name in self._renderers}
+        return ResultMessage(
+            id=estimate.frame_id,
+            time=estimate.time,
+            age=tracked.age,
+            verdict=estimate.verdict.value,
+            effort=estimate.effort.value,
+            loss=estimate.loss,
+            joints=joints,
+            base_frames=frames,
+            masks=encoded_masks(found),
+        )
+
+    def _mask(self, name: str, estimate: LiveEstimate) -> np.ndarray:
+        return self._renderers[name].segment(estimate.state.to("cpu"))[0] >= 0

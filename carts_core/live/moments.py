@@ -1,0 +1,190 @@
+"""What sources of a stream hand on, and the desk where the newest waits."""
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from ..recording import Frame, Sequence
+from .messages import FrameMessage, StreamError, decoded
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A frame of a stream."""
+
+    frame: Frame
+    camera_poses: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Camera -> T_camera_world [4 x 4, m], where it is not that of the scene."""
+    arrived: float = field(default_factory=time.monotonic)
+    """On this machine's clock [s]."""
+
+
+class Source(Protocol):
+    """Where frames come from. Iterated on a thread of its own."""
+
+    def __iter__(self) -> Iterator[Moment]:
+        """Frames as they come; ends with the stream, or soon after `close`.
+
+        Raises:
+            CartsError: the stream is not usable.
+        """
+        ...
+
+    def close(self) -> None:
+        """End it; may be called from any thread, more than once."""
+        ...
+
+
+class Assembler:
+    """Makes frames of the messages of a stream: joints and camera poses stay until they are replaced.
+
+    Args:
+        sequence: whose arms and cameras these are.
+        cameras: that every frame needs an image of.
+    """
+
+    def __init__(self, sequence: Sequence, cameras: tuple[str, ...]) -> None:
+        self._sequence, self._cameras = sequence, cameras
+        self._joints = {arm: rows[0].copy() for arm, rows in sequence.measured.items()}
+        self._known: set[str] = set()
+        self._poses: dict[str, np.ndarray] = {}
+        self._count = 0
+        self._changing = threading.Lock()
+
+    def moment(self, message: FrameMessage) -> Moment | None:
+        """The frame that a message completes; None for one without images, or before every arm's joints are known.
+
+        Raises:
+            StreamError: it has an unknown arm, joint or camera, lacks an image, or one is not usable.
+        """
+        with self._changing:
+            self._take_joints(message)
+            self._take_poses(message)
+            if not message.images or self._known < set(self._joints):
+                return None
+            self._count += 1
+            frame = Frame(
+                index=self._count - 1,
+                frame_id=message.id or f"{self._count:06d}",
+                domain=self._sequence.domains[0],
+                images={name: self._image(name, message) for name in self._cameras},
+                measured={arm: values.copy() for arm, values in self._joints.items()},
+                truth=None,
+                masks=None,
+                timestamp=message.time,
+            )
+            return Moment(frame, dict(self._poses))
+
+    def _take_joints(self, message: FrameMessage) -> None:
+        for name, joints in message.joints.items():
+            if name not in self._joints:
+                raise StreamError(f"there is no arm {name!r}; the arms are {', '.join(self._joints)}.")
+            names = self._sequence.scene.arm(name).robot.joint_names
+            for joint, value in joints.items():
+                if joint not in names or not np.isfinite(value):
+                    raise StreamError(
+                        f"{name}: joint {joint!r} at {value}; its joints are {', '.join(names)}, in rad or m."
+                    )
+                self._joints[name][names.index(joint)] = value
+            self._known.add(name)
+
+    def _take_poses(self, message: FrameMessage) -> None:
+        known = [camera.name for camera in self._sequence.scene.cameras]
+        for name, rows in message.camera_poses.items():
+            pose = (
+                np.array(rows, np.float64) if {len(row) for row in rows} == {4} and len(rows) == 4 else np.zeros((4, 4))
+            )
+            rigid = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) and np.all(np.isfinite(pose))
+            if name not in known or not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):
+                raise StreamError(f"camera_poses of {name!r}: give a rigid 4 x 4 matrix for one of {', '.join(known)}.")
+            self._poses[name] = pose
+
+    def _image(self, name: str, message: FrameMessage) -> np.ndarray:
+        if name not in message.images:
+            raise StreamError(f"a frame has no image of camera {name!r}. Send one of each: {', '.join(self._cameras)}.")
+        return self.undistorted(name, decoded(name, message.images[name]))
+
+    def undistorted(self, name: str, image: np.ndarray) -> np.ndarray:
+        """An image as the scene's camera sees it.
+
+        Raises:
+            StreamError: it is of another size than the camera's images.
+        """
+        camera = self._sequence.recorded_camera(name)
+        if image.shape[:2] != (camera.height, camera.width):
+            height, width = image.shape[:2]
+            raise StreamError(
+                f"image of {name} is {width} x {height} px; the camera has {camera.width} x {camera.height}."
+            )
+        return camera.undistort(image)
+
+
+def _is_rigid(pose: np.ndarray) -> bool:
+    """Whether a 4 x 4 matrix turns and moves, and does nothing else."""
+    if not np.isfinite(pose).all() or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        return False
+    rotation = pose[:3, :3]
+    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
+
+
+class Newest:
+    """Takes frames from a source on a thread of its own; who asks gets the newest, and those before it are dropped.
+
+    Args:
+        source: that is read and, in the end, closed.
+        oldest: a frame that has waited longer is dropped, too [s].
+
+    Attributes:
+        arrived, dropped: how many frames.
+    """
+
+    def __init__(self, source: Source, oldest: float) -> None:
+        self._source, self._oldest = source, oldest
+        self._moment: Moment | None = None
+        self._ended, self._error = False, None
+        self._changed = threading.Condition()
+        self.arrived = self.dropped = 0
+        self._thread = threading.Thread(target=self._read, name="carts-live-source", daemon=True)
+        self._thread.start()
+
+    def take(self) -> Moment | None:
+        """The newest frame, waited for; None at the end.
+
+        Raises:
+            CartsError: what ended the source.
+        """
+        with self._changed:
+            while True:
+                moment, self._moment = self._moment, None
+                if moment is not None and (self._ended or time.monotonic() - moment.arrived <= self._oldest):
+                    return moment
+                self.dropped += moment is not None
+                if self._ended:
+                    if self._error is not None:
+                        raise self._error
+                    return None
+                self._changed.wait(0.5)
+
+    def close(self) -> None:
+        """End the source and wait for its thread."""
+        self._source.close()
+        self._thread.join(5.0)
+
+    def _read(self) -> None:
+        error = None
+        try:
+            for moment in self._source:
+                with self._changed:
+                    self.arrived += 1
+                    self.dropped += self._moment is not None
+                    self._moment = moment
+                    self._changed.notify()
+        except Exception as found:  # Whoever takes frames gets it.
+            error = found
+        with self._changed:
+            self._ended, self._error = True, error
+            self._changed.notify()

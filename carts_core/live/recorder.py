@@ -1,0 +1,155 @@
+"""A stream on disk: a sequence like any other, with the corrections as its project."""
+
+import json
+import queue
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..errors import OutputError
+from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
+from ..files import append_line, file_name, output_path, write_bytes, write_text
+from ..model.scene import Scene
+from ..project import Edits, JointCorrection, Key, Project, Provenance
+from ..recording import Sequence
+from ..resources import shipped_robot
+from .loop import Tracked
+from .tracker import LiveVerdict
+
+_WAITING = 32
+"""Frames that wait for the disk; further ones are not recorded."""
+
+
+class Recorder:
+    """Writes what was tracked, on a thread of its own.
+
+    The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
+    corrected ones, `sequence.toml`, and at the end the project `sequence.carts`. Each frame is on disk with its row.
+
+    Args:
+        sequence: whose arms and cameras these are.
+        cameras: that are tracked.
+        folder: to make; it may not be there yet, or has to be empty.
+        provenance: of the corrections.
+
+    Attributes:
+        missed: how many frames were not recorded, since the disk was too slow.
+
+    Raises:
+        OutputError: the folder holds something, or cannot be written.
+    """
+
+    def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, provenance: Provenance) -> None:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutputError(f"--record {folder} is there already. Name a new folder.")
+        self._scene, self._provenance, self._folder = sequence.scene.with_cameras(cameras), provenance, folder
+        self._output = output_path(folder)
+        write_text(self._output / "sequence.toml", _sequence_file(sequence, self._scene))
+        self._waiting: queue.Queue[Tracked | None] = queue.Queue(_WAITING)
+        self._edits: list[dict[Key, JointCorrection]] = []
+        self._error: Exception | None = None
+        self.missed = 0
+        self._thread = threading.Thread(target=self._write, name="carts-live-recorder", daemon=True)
+        self._thread.start()
+
+    def __call__(self, tracked: Tracked) -> None:
+        """Record a result, soon."""
+        try:
+            self._waiting.put_nowait(tracked)
+        except queue.Full:
+            self.missed += 1
+
+    def close(self) -> Path | None:
+        """Finish writing; the sequence file, or None where there was no frame.
+
+        Raises:
+            CartsError: something could not be written.
+        """
+        self._waiting.put(None)
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        if not self._edits:
+            return None
+        path = (self._output / "sequence.toml").path
+        project = Project.open(Sequence.open(path), path.with_suffix(".carts"))
+        try:
+            merged: Edits = {key: value for edits in self._edits for key, value in edits.items()}
+            project.apply("Live", merged)
+        finally:
+            project.close()
+        return path
+
+    def _write(self) -> None:
+        while (tracked := self._waiting.get()) is not None:
+            if self._error is None:
+                try:
+                    self._write_one(tracked)
+                except Exception as error:  # Told at the end; the stream goes on.
+                    self._error = error
+
+    def _write_one(self, tracked: Tracked) -> None:
+        number, frame, estimate = len(self._edits), tracked.moment.frame, tracked.estimate
+        name = f"{number:06d}"
+        for camera, image in frame.images.items():
+            content = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+            write_bytes(self._output / "images" / file_name(camera) / f"{name}.png", content)
+        row = KinematicsRow(name, "optimized", estimate.joint_positions, estimate.joint_std, estimate.verdict.value)
+        lines = kinematics_csv(self._scene, [row]).splitlines()
+        measured = position_values(self._scene, KinematicsRow(name, "measured", frame.measured))
+        if number == 0:
+            columns = ",".join(["frame", "time", *joint_columns(self._scene)])
+            append_line(self._output / "kinematics.csv", columns.encode())
+            append_line(self._output / "corrected.csv", lines[0].encode())
+        values = ",".join([name, f"{estimate.time:.6f}", *(f"{value:.9f}" for value in measured)])
+        append_line(self._output / "kinematics.csv", values.encode())
+        append_line(self._output / "corrected.csv", lines[1].encode())
+        edits = {}
+        if estimate.verdict is not LiveVerdict.LOST:
+            for arm in self._scene.arms:
+                std = tuple(float(value) for value in estimate.joint_std[arm.name])
+                joints = tuple(float(value) for value in estimate.joint_positions[arm.name])
+                edits[Key.joints(number, arm.name)] = JointCorrection(joints, self._provenance, std)
+        self._edits.append(edits)
+
+
+def _sequence_file(sequence: Sequence, scene: Scene) -> str:
+    """The description of what is recorded; images have no distortion any more."""
+    lines = [
+        "# Recorded by carts live.",
+        'format = "carts-sequence/1"',
+        f"name = {json.dumps(f'{sequence.name} live')}",
+        "",
+        "[kinematics]",
+        'table = "kinematics.csv"',
+        'frame_id = "{frame}"',
+        'timestamp = "time"',
+    ]
+    for arm in scene.arms:
+        urdf = arm.robot.urdf
+        robot = "builtin:psm_lnd" if urdf == shipped_robot().absolute() else str(urdf)
+        lines += [
+            "",
+            "[[arms]]",
+            f"name = {json.dumps(arm.name)}",
+            f"robot = {json.dumps(robot)}",
+            f"T_world_base = {np.asarray(arm.T_world_base).tolist()}",
+            "",
+            "[arms.joints]",
+            *(f"{json.dumps(name)} = {json.dumps(f'{arm.name}.{name}')}" for name in arm.robot.joint_names),
+        ]
+    for camera in scene.cameras:
+        fx, fy, cx, cy = camera.intrinsics
+        lines += [
+            "",
+            "[[cameras]]",
+            f"name = {json.dumps(camera.name)}",
+            f"size = [{camera.width}, {camera.height}]",
+            f"K = {{ fx = {fx!r}, fy = {fy!r}, cx = {cx!r}, cy = {cy!r} }}",
+            "pixel_center = 0.5",
+            f"T_camera_world = {np.asarray(camera.T_camera_world).tolist()}",
+            f"images = {json.dumps(f'images/{file_name(camera.name)}/' + '{frame}.png')}",
+        ]
+    return "\n".join(lines) + "\n"
