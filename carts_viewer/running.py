@@ -98,7 +98,7 @@ class OptimizerFactory:
             WeightsError: the networks cannot be loaded.
         """
         used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras)}
-        return Provenance.made_by_optimizer(used, self.prepare().fingerprint)
+        return Provenance.made_by_optimizer(used, self.prepare().sha256)
 
     def make(
         self,
@@ -189,7 +189,7 @@ class OptimizerFactory:
             "frames": [frames[0], frames[-1]],
             "keyframes": sorted(keyframes),
         }
-        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.fingerprint, Source.PROPAGATED))
+        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.sha256, Source.PROPAGATED))
 
 
 class SequenceRun:

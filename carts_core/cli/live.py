@@ -29,7 +29,7 @@ class Live:
     source: str = "replay"
     """Where frames come from: `replay` (at the speed of the clock), `camera:0`, `video:FILE`, `folder:PATH` that fills,
     or `socket:PORT` of 127.0.0.1 (docs/reference/live.md)."""
-    joints: int | None = None
+    joints_port: int | None = None
     """With `camera` and `video`: port of 127.0.0.1 where joints come from, and where results go."""
     rate: float | None = None
     """Replay: frames a second; by default those of the recording."""
@@ -57,8 +57,10 @@ class Live:
         needs["socket"] = rest.isdecimal() and int(rest) < 2**16
         if not needs.get(kind, False):
             raise SettingsError(f"--source {self.source!r} is not known. Give {_SOURCES}.")
-        if kind in ("camera", "video") and self.joints is None:
-            raise SettingsError(f"--source {self.source} has no joints. Say with --joints on which port they come.")
+        if kind in ("camera", "video") and self.joints_port is None:
+            raise SettingsError(
+                f"--source {self.source} has no joints. Say with --joints-port on which port they come."
+            )
         if self.rate is not None and not 0 < self.rate <= 1000:
             raise SettingsError(f"--rate is {self.rate:g}; allowed is above 0, at most 1000.")
         if self.loops < 1:
@@ -89,7 +91,7 @@ class Live:
             lines = self._lines(held)
             recorder = None
             if self.record is not None:
-                made_by = Provenance.made_by_optimizer({"live": True}, extractor.fingerprint)
+                made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
                 recorder = Recorder(sequence, cameras, self.record, made_by)
 
             def show(tracked: "Tracked") -> None:
@@ -117,7 +119,7 @@ class Live:
         kind, _, rest = self.source.partition(":")
         assembler = Assembler(sequence, cameras)
         clients = []
-        port = int(rest) if kind == "socket" else self.joints
+        port = int(rest) if kind == "socket" else self.joints_port
         if port is not None and kind != "replay":
             server = StreamServer(assembler, port)
             held.callback(server.close)

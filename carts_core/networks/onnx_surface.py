@@ -91,21 +91,21 @@ def _exported(network: SurfaceNetwork) -> bytes:
     """The network as an ONNX graph for images of any size."""
     side = 2 * network.architecture.stride
     example = torch.rand(1, 3, side, side), torch.rand(1, network.inputs - 3, side, side)
-    graph, names = io.BytesIO(), ["images", "given", "maps"]
+    stream, names = io.BytesIO(), ["images", "given", "maps"]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Sizes are checked in Python, which the graph need not know of.
         torch.onnx.export(
             _Maps(network).eval(),
             example,
-            graph,  # pyright: ignore[reportArgumentType]  files are taken where `dynamo` is false
+            stream,  # pyright: ignore[reportArgumentType]  files are taken where `dynamo` is false
             input_names=names[:2],
             output_names=names[2:],
             dynamic_axes={name: _AXES for name in names},
             opset_version=_OPSET,
             dynamo=False,
         )
-    return graph.getvalue()
+    return stream.getvalue()
 
 
 def _keep(path: Path, graph: bytes) -> None:

@@ -87,6 +87,8 @@ def _opens_for_writing(call: ast.Call, streams: set[str]) -> bool:
 def _is_harmless(call: ast.Call, name: str, method: bool, streams: set[str]) -> bool:
     if name in INTO_MEMORY and call.args and _name(call.args[0]) in streams:
         return True
+    if name == "export" and any(_name(argument) in streams for argument in call.args):
+        return True  # torch.onnx.export
     if name not in OWN_METHODS:
         return False
     if name == "save" and method:

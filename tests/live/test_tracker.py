@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
 from carts_core.live import Effort, LiveTracker, LiveVerdict
 from carts_core.model.scene import SceneState
@@ -46,20 +47,39 @@ class Stream:
     def __init__(self, path: Path) -> None:
         self.sequence = Sequence.open(path)
         self.predictor = Seeing(self.sequence)
+        self.renderer = Renderer(self.sequence.scene, width=640, height=512)
+        self.camera = Renderer(self.sequence.scene)
         self.tracker = LiveTracker(self.sequence.scene, self.predictor)
         self.count, self.slip = 0, 0.0
 
+    def picture(self) -> np.ndarray:
+        """What the camera sees, before a grey wall."""
+        wall = np.full((128, 160, 3), 140, np.uint8)
+        if self.predictor.hidden:
+            return wall
+        with torch.no_grad():
+            rendering = self.camera(self.truth)
+        cover = rendering.silhouette[0].numpy()[..., None]
+        image = 255.0 * rendering.image[0].permute(1, 2, 0).numpy() + (1.0 - cover) * wall
+        return np.rint(image.clip(0, 255)).astype(np.uint8)
+
+    def overlap(self) -> float:
+        """Dice of the last estimate and the truth."""
+        return dice(*(self.renderer.segment(state)[0] >= 0 for state in (self.estimate.state, self.truth)))
+
     def next(self, seconds: float = SECONDS) -> tuple[LiveVerdict, Effort, float]:
-        """Track the next frame: verdict, effort, and the largest error of a visible revolute joint [deg]."""
+        """Track the next frame: verdict, effort, and the largest error of yaw and pitch [deg]."""
         self.count += 1
         frame = self.sequence.frame(self.count % 2)
         assert frame.truth is not None
         truth = {name: values.copy() for name, values in frame.truth.items()}
         truth["PSM1"][:2] += self.slip
-        self.predictor.look(self.sequence.scene.state(truth))
+        self.truth = self.sequence.scene.state(truth)
+        self.predictor.look(self.truth)
         self.time = getattr(self, "time", 0.0) + seconds
         measured = {name: values.copy() for name, values in frame.measured.items()}
-        found = self.tracker.track(replace(frame, measured=measured, timestamp=self.time))
+        images = {"left": self.picture()}
+        found = self.tracker.track(replace(frame, images=images, measured=measured, timestamp=self.time))
         self.estimate = found
         error = np.abs(found.joint_positions["PSM1"] - truth["PSM1"])[[0, 1]].max()
         return found.verdict, found.effort, float(np.rad2deg(error))
@@ -74,9 +94,9 @@ def test_the_first_frame_is_searched_and_later_ones_take_little(stream: Stream) 
     found = [stream.next() for _ in range(6)]
     assert [verdict for verdict, _, _ in found] == [LiveVerdict.GOOD] * 6
     assert [effort for _, effort, _ in found] == [Effort.SEARCH] + [Effort.SMALL] * 5
-    assert max(error for _, _, error in found) < 0.3 < np.rad2deg(ERROR)
+    assert max(error for _, _, error in found) < 0.4 < np.rad2deg(ERROR)
     std = stream.estimate.joint_std["PSM1"]
-    assert np.isfinite(std).all() and (std[:2] < np.deg2rad(1.0)).all()
+    assert np.isfinite(std).all() and (std[:2] < np.deg2rad(2.0)).all(), "less than before any image"
 
 
 def test_a_hidden_arm_is_lost_and_found_again_where_it_was(stream: Stream) -> None:
@@ -100,7 +120,7 @@ def test_after_an_error_that_jumps_the_arm_is_found_within_a_second(stream: Stre
         stream.next()
     stream.predictor.hidden, stream.slip = False, float(np.deg2rad(4.0))
     found = [stream.next() for _ in range(10)]
-    assert found[-1][0] is LiveVerdict.GOOD and found[-1][2] < 0.5
+    assert found[-1][0] is LiveVerdict.GOOD and stream.overlap() > 0.97
     assert any(effort is Effort.SEARCH for _, effort, _ in found)
 
 

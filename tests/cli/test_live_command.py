@@ -1,0 +1,77 @@
+"""`carts live`: a replay on the command line, and what it leaves."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.cli import main
+from carts_core.project import Key, Project
+from carts_core.recording import Sequence
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Path:
+    return tiny_sequence(frames=3, width=160, height=128)
+
+
+def test_a_replay_gives_a_line_for_each_frame_and_a_recording_that_can_be_reviewed(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, folder = tmp_path / "results.jsonl", tmp_path / "recorded"
+    main(["live", str(sequence), "--rate", "0.5", "--output", str(results), "--masks", "--record", str(folder)])
+    said = re.sub(r"\s+", " ", capsys.readouterr().err)
+    lines = [json.loads(line) for line in results.read_text().splitlines()]
+    assert 1 <= len(lines) <= 3 and f"{len(lines)} of " in said and "frames a second" not in said
+    assert {line["type"] for line in lines} == {"result"} and all(line["masks"]["left"] for line in lines)
+    original, recorded = Sequence.open(sequence), Sequence.open(folder / "sequence.toml")
+    assert len(recorded) == len(lines)
+    assert [arm.name for arm in recorded.scene.arms] == ["PSM1"]
+    for number, line in enumerate(lines):
+        index = original.frame_ids.index(line["id"])
+        one, other = recorded.frame(number), original.frame(index)
+        np.testing.assert_array_equal(one.images["left"], other.images["left"])
+        np.testing.assert_allclose(one.measured["PSM1"], other.measured["PSM1"], atol=1e-8)
+    camera, kept = original.scene.cameras[0], recorded.scene.cameras[0]
+    np.testing.assert_allclose(kept.T_camera_world, camera.T_camera_world, atol=1e-9)
+    assert kept.intrinsics == pytest.approx(camera.intrinsics)
+    if found := [number for number, line in enumerate(lines) if line["verdict"] != "lost"]:
+        project = Project.open(recorded, folder / "sequence.carts", read_only=True)
+        value = project.state.get(Key.joints(found[0], "PSM1"))
+        assert value is not None
+        shown = [position for position, _ in lines[found[0]]["joints"]["PSM1"].values()]
+        np.testing.assert_allclose(value.joint_positions, shown, atol=1e-9)
+        project.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "replay:3"], "--source 'replay:3' is not known"),
+        (["--source", "socket:port"], "folder:PATH or socket:PORT"),
+        (["--source", "socket:70000"], "is not known"),
+        (["--source", "camera:0"], "has no joints. Say with --joints-port"),
+        (["--rate", "0"], "--rate is 0; allowed is above 0"),
+        (["--loops", "0"], "--loops is 0; allowed is 1 or more"),
+    ],
+)
+def test_a_wrong_option_is_reported(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], sequence: Path
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["live", str(sequence), *arguments])
+    assert ended.value.code == 2 and message in re.sub(r"[\s│]+", " ", capsys.readouterr().err)
+
+
+def test_a_folder_that_holds_something_is_not_recorded_into(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note.txt").write_text("mine")
+    with pytest.raises(SystemExit):
+        main(["live", str(sequence), "--quiet", "--record", str(tmp_path / "full")])
+    assert "is there already. Name a new folder" in re.sub(r"\s+", " ", capsys.readouterr().err)
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["note.txt"]
