@@ -116,6 +116,18 @@ class Scene:
         wanted = {self.arm(name).name for name in names}
         return replace(self, arms=tuple(arm for arm in self.arms if arm.name in wanted))
 
+    def distance(self, state: SceneState) -> float:
+        """Median distance of the middles of all links from the cameras [m], at one state (no batch)."""
+        found = []
+        for arm, joints, T_world_base in zip(self.arms, state.joint_positions, state.T_world_base, strict=True):
+            Ts = state.T_camera_world[:, None] @ (T_world_base @ arm.robot.forward_kinematics(joints))
+            middles = [
+                Ts[:, mesh.link, :3, :3] @ torch.tensor(mesh.vertices.mean(0)).to(Ts) + Ts[:, mesh.link, :3, 3]
+                for mesh in arm.robot.meshes
+            ]
+            found += [middle.norm(dim=-1) for middle in middles]
+        return float(torch.cat(found).median())
+
     def state(self, joint_positions: Mapping[str, ArrayLike], device: str | torch.device = "cpu") -> SceneState:
         """The scene's state at the given joint positions, with the calibration as given.
 

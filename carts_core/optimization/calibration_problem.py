@@ -18,12 +18,13 @@ from ..model.scene import Scene
 from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
-from ..settings.stages import Descend, Observe
+from ..settings.stages import Descend, Observe, SilhouetteSearch
 from .elimination import Eliminated, eliminate
 from .evaluation import Evaluation
 from .factors import Prior
 from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
+from .silhouettes import search_silhouettes
 from .variables import Variables
 from .verdict import Evidence
 
@@ -34,8 +35,8 @@ _GOOD = 1.5
 """A frame whose loss is at most this many times the median counts in full, and less beyond it [1]."""
 
 
-_ASSESSED = 12
-"""Most frames that a calibration is assessed by."""
+_ASSESSED, _COMPARED = 12, 4
+"""Most frames that a calibration is assessed by, and that a search compares."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,10 @@ class _FramePart:
         self.problem = problem
         self.own = torch.zeros(own, device=problem.variables.lower.device)
         self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
+
+    def at(self, shared: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+        """All unknowns of the frame at a calibration, or a batch of them, with joints as measured."""
+        return torch.cat([shared.new_zeros(*shared.shape[:-1], len(self.own)), shared], -1)
 
     def follow(self, shared: Float[Tensor, " n"]) -> None:
         """Move the own unknowns to where the anchor's model has them for a calibration."""
@@ -177,12 +182,40 @@ class CalibrationProblem:
         ]
         return np.array([evaluation.loss for evaluation in at_measured])
 
+    @property
+    def masked(self) -> bool:
+        """Whether given masks are the target."""
+        return all(part.problem.masked for part in self._parts)
+
+    def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
+        """Mean overlap of silhouettes and masks (Dice), with joints as measured."""
+        parts = self._some(_COMPARED)
+        return float(np.mean([part.problem.silhouette_overlap(part.at(offsets), scale) for part in parts]))
+
+    def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
+        """Where silhouettes of some frames are nearest to their masks. What was expected of the start is void then."""
+        parts = self._some(_COMPARED)
+        compared = [(part, part.problem.silhouettes(stage.scale)) for part in parts]
+        distance = float(np.mean([part.problem.distance for part in parts]))
+
+        def distances(trials: Tensor) -> np.ndarray:
+            found = [one.distances(part.problem.variables.state(part.at(trials))) for part, one in compared]
+            return np.mean(found, axis=0)
+
+        deviation = self.variables.spread(stage.joints_deg, stage.frames_deg, distance)
+        found, _ = search_silhouettes(distances, deviation, self.variables.clamp, stage)
+        self.prior = replace(self.prior, mean=found)
+        return found
+
+    def _some(self, count: int) -> list[_FramePart]:
+        """Frames evenly spread."""
+        return [self._parts[index] for index in spread(len(self._parts), count)]
+
     def evidence(self, offsets: Float[Tensor, " n"]) -> list[Evidence]:
         """What the images of some frames, evenly spread, say of a calibration with joints as measured."""
-        losses = self.frame_losses(offsets)
-        chosen = spread(len(self._parts), _ASSESSED)
-        parts = [(self._parts[index], float(losses[index])) for index in chosen]
-        return [part.problem.evidence(torch.cat([torch.zeros_like(part.own), offsets]), loss) for part, loss in parts]
+        losses = [float(loss) for loss in self.frame_losses(offsets)[spread(len(self._parts), _ASSESSED)]]
+        parts = zip(self._some(_ASSESSED), losses, strict=True)
+        return [part.problem.evidence(part.at(offsets), loss) for part, loss in parts]
 
     def _combined(
         self, offsets: Tensor, evaluations: list[Evaluation], models: list[Eliminated]

@@ -111,3 +111,28 @@ class Fit:
         """Go on from elsewhere, with more care than before."""
         self.offsets, self.restarts = offsets, self.restarts + 1
         self.solver.reset()
+
+    def begin_again(self, start: Float[Tensor, " n"]) -> None:
+        """Forget what was found."""
+        self.offsets, self.restarts, self.used = start, 0, 0
+        self.reached, self.edges = None, None
+        self.solver.reset()
+
+    def found(self) -> "Found":
+        """What was found so far."""
+        return Found(self.offsets, self.reached, self.edges, self.stop_reason)
+
+    def recall(self, found: "Found") -> None:
+        """Go back to what was found before."""
+        self.offsets, self.reached, self.edges = found.offsets, found.reached, found.edges
+        self.stop_reason = found.stop_reason
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a run has come to."""
+
+    offsets: Float[Tensor, " n"]
+    reached: Point | None
+    edges: Linearization | None
+    stop_reason: StopReason

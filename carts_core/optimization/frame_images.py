@@ -37,6 +37,11 @@ class FrameImages:
     renderer: Renderer
     """Of the whole image."""
 
+    @property
+    def replaced(self) -> bool:
+        """Whether the empty background was replaced in the images."""
+        return self.changed is not None and self.explained is None
+
     @staticmethod
     def of(
         scene: Scene,
@@ -48,6 +53,7 @@ class FrameImages:
         dehaze: float,
         predictor: FramePredictor,
         backgrounds: Backgrounds | None = None,
+        replaced: bool | None = None,
     ) -> "FrameImages":
         """Images at `scale` times the working size, as far as the predictor's stride allows.
 
@@ -60,6 +66,8 @@ class FrameImages:
             dehaze: share of smoke and haze that is taken off [1].
             predictor: sizes are multiples of its stride; it also sees the backgrounds, once.
             backgrounds: of the cameras, where they are known.
+            replaced: whether what has not changed against them is replaced before the predictor sees it; else what it
+                also sees in them is taken off. By default it is where they would deceive it.
 
         Raises:
             SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -73,7 +81,7 @@ class FrameImages:
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, dehaze, predictor)
             changed = background.changed(stacked, size[0] / unit)
-            if background.deceptive:
+            if background.deceptive if replaced is None else replaced:
                 stacked, through = without_background(stacked, changed), torch.ones_like(through)
             else:
                 explained = background.seen * (1.0 - changed)

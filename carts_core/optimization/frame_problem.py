@@ -1,6 +1,7 @@
 """One frame as an optimization problem: its images, the unknowns, a prior, and what was observed last."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from ..model.scene import Scene
 from ..model.surface import COVERAGE
 from ..settings import SurfaceSolver
-from ..settings.stages import AlignEdges, Descend, Given, Observe, first_observe
+from ..settings.stages import FINEST, AlignEdges, Descend, Given, Observe, SilhouetteSearch, first_observe
 from ..threads import total
 from .counterfactual import Backgrounds
 from .edge_alignment import align_edges
@@ -23,6 +24,7 @@ from .ignore import propose_ignore
 from .observability import uncertainty
 from .observation import Observation, observe
 from .predictor import FramePredictor
+from .silhouettes import SilhouetteComparison, search_silhouettes
 from .variables import Variables
 from .verdict import Evidence, evidence
 
@@ -75,6 +77,8 @@ class FrameProblem:
         self._given: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]] = images, ignore or {}
         self._ignore = ignore or {}
         self._images: dict[float, FrameImages] = {}
+        self._replaced: bool | None = None
+        self._evidence: tuple[Tensor, Evidence] | None = None
         self._edges: EdgeFactor | None = None
         self._factors: dict[tuple[float, float], SurfaceFactor] = {}
         self._observation: Observation | None = None
@@ -109,13 +113,20 @@ class FrameProblem:
                 dehaze=self.settings.dehaze,
                 predictor=self.predictor,
                 backgrounds=self._backgrounds,
+                replaced=self._replaced,
             )
         return self._images[scale]
 
+    def treat_background_otherwise(self) -> None:
+        """Replace the empty background where it was taken off the predictions so far, or the other way round."""
+        self._replaced = not self.images(1.0).replaced
+        self._images, self._evidence = {}, None
+
     def reset(self) -> None:
-        """Drop the observation and the proposed ignore mask."""
-        if self.proposed:
+        """Drop the observation, the proposed ignore mask and the other treatment of the background."""
+        if self.proposed or self._replaced is not None:
             self._given, self._images, self._edges = (self._given[0], self._ignore), {}, None
+        self._replaced = self._evidence = None
         self._observation, self._factors, self.observations, self.proposed = None, {}, 0, {}
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"], *, whole: bool = False) -> None:
@@ -132,6 +143,7 @@ class FrameProblem:
             images, given = self._given
             masks = {name: mask | given.get(name, False) for name, mask in self.proposed.items()}
             self._given, self._images, self._edges = (images, {**given, **masks}), {}, None
+            self._evidence = None
         return bool(self.proposed)
 
     def factor(self, stage: Descend) -> SurfaceFactor:
@@ -200,8 +212,41 @@ class FrameProblem:
 
     def evidence(self, offsets: Float[Tensor, " n"], loss: float) -> Evidence:
         """What the images say for and against a point whose loss is known."""
-        start, end = (self.variables.state(at) for at in (self.start, offsets))
-        return evidence(self.images(1.0), start, end, self.predictor, loss)
+        if self._evidence is None or not torch.equal(self._evidence[0], offsets):
+            start, end = (self.variables.state(at) for at in (self.start, offsets))
+            self._evidence = offsets.clone(), evidence(self.images(1.0), start, end, self.predictor, loss)
+        return replace(self._evidence[1], loss=loss)
+
+    def evidence_at(self, offsets: Float[Tensor, " n"]) -> Evidence:
+        """What the images say for and against a point, under the last observation."""
+        return self.evidence(offsets, self.evaluate(offsets, FINEST, gradient=False).loss)
+
+    @property
+    def distance(self) -> float:
+        """Of the arms from the cameras at the start [m]."""
+        return self.scene.distance(self.variables.start)
+
+    @property
+    def masked(self) -> bool:
+        """Whether given masks are the target."""
+        return self.predictor.masked
+
+    def silhouettes(self, scale: float) -> SilhouetteComparison:
+        """Silhouettes against the given masks, in images of a scale."""
+        return SilhouetteComparison(self.images(scale), self.predictor)
+
+    def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
+        """Overlap of silhouettes and masks (Dice)."""
+        return self.silhouettes(scale).overlap(self.variables.state(offsets))
+
+    def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
+        """Where silhouettes are nearest to the masks."""
+        compared, variables = self.silhouettes(stage.scale), self.variables
+        deviation = variables.spread(stage.joints_deg, stage.frames_deg, self.distance)
+        found, _ = search_silhouettes(
+            lambda trials: compared.distances(variables.state(trials)), deviation, variables.clamp, stage
+        )
+        return found
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
         """The cost per pixel of the arms, as rendered and as observed.

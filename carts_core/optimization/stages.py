@@ -15,16 +15,20 @@ from ..settings.stages import (
     FirstOrder,
     IgnoreOccluders,
     Observe,
+    OtherBackground,
     PreferStart,
     RandomRestart,
+    SilhouetteSearch,
     Stage,
 )
+from .calibration_problem import CalibrationProblem
 from .feature_problem import FeatureProblem
 from .fit import Fit, Point, StopReason
 from .frame_problem import FrameProblem
 from .search import arm_is_lost, best_random_start, start_explains_as_well
 from .solvers import FirstOrderDescent
 from .solvers.levenberg_marquardt import REJECTIONS
+from .verdict import Verdict, assess
 
 
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
@@ -83,6 +87,15 @@ def _(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
+def _(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
+    problem = fit.problem
+    assert isinstance(problem, FrameProblem | CalibrationProblem), "a stage of the surface solver"
+    if problem.masked and problem.silhouette_overlap(fit.offsets, stage.scale) < stage.if_overlap:
+        fit.restart(problem.search_silhouettes(stage))
+    yield from ()
+
+
+@run_stage.register
 def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     assert fit.reached is not None, "AlignEdges follows a Descend"
     if _one_frame(fit).predictor.masked:
@@ -113,11 +126,28 @@ def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
+def _(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
+    problem = _one_frame(fit)
+    before = problem.evidence_at(fit.offsets)
+    if before.overlap_with_change is None or assess(before).verdict is Verdict.GOOD:
+        return
+    kept, observation = fit.found(), problem.observation
+    problem.treat_background_otherwise()
+    fit.begin_again(problem.start)
+    yield from run_stages(stage.then, fit)
+    after = problem.evidence_at(fit.offsets).overlap_with_change
+    assert after is not None
+    if after <= before.overlap_with_change:
+        problem.treat_background_otherwise()
+        problem.observation = observation
+        fit.recall(kept)
+
+
+@run_stage.register
 def _(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
     problem = _one_frame(fit)
     if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
-        fit.offsets, fit.restarts, fit.used = problem.start, 0, 0
-        fit.solver.reset()
+        fit.begin_again(problem.start)
         yield from run_stages(stage.then, fit)
 
 

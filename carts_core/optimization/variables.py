@@ -192,6 +192,20 @@ class Variables:
                 expected[block.start : block.start + block.size] = math.radians(degrees)
         return expected
 
+    def spread(self, joints_deg: float, frames_deg: float, distance: float) -> Float[Tensor, " n"]:
+        """Deviations to search with [rad]; intrinsics stay where they are.
+
+        Args:
+            joints_deg: of joint positions [deg]; `length_scale` makes it metres.
+            frames_deg: of base frames and camera extrinsics [deg]; their places deviate by half of it times `distance`.
+            distance: of the arms from the cameras [m].
+        """
+        deviation = self.expected(joints_deg, frames_deg, 0.0)
+        for block in self._blocks:
+            if block.kind in ("base_frame", "extrinsics"):
+                deviation[block.start + 3 : block.start + 6] *= 0.5 * distance / self._length_scale
+        return deviation
+
     def prior(self, settings: SurfaceSolver) -> Prior:
         """Independent errors around the start, as large as the settings expect."""
         expected = self.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)

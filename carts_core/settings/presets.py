@@ -11,8 +11,10 @@ from .stages import (
     Given,
     IgnoreOccluders,
     Observe,
+    OtherBackground,
     PreferStart,
     RandomRestart,
+    SilhouetteSearch,
     Stage,
 )
 
@@ -24,6 +26,7 @@ _MEDIUM = Descend(blur=3.0, tolerance=0.06)
 _FINE = Descend(blur=1.6, tolerance=0.06)
 
 SEARCH: tuple[Stage, ...] = (
+    SilhouetteSearch(),
     # A small image first: a good estimate is there soon.
     Observe(scale=0.75, margin=27, attention=27, haze=False),
     _COARSE,
@@ -37,14 +40,13 @@ SEARCH: tuple[Stage, ...] = (
 )
 """From measured kinematics to a fine estimate."""
 
-FRAME: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST, AlignEdges(), PreferStart(), Evaluate())
+_FITTED: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST)
+_ALONE: tuple[Stage, ...] = (*_FITTED, AlignEdges(), PreferStart())
+
+FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate())
 """One frame alone: the default."""
 
-OCCLUDED: tuple[Stage, ...] = (
-    *FRAME[:-3],
-    IgnoreOccluders(then=FRAME[:-3]),
-    *FRAME[-3:],
-)
+OCCLUDED: tuple[Stage, ...] = (*_FITTED, IgnoreOccluders(then=_FITTED), AlignEdges(), PreferStart(), Evaluate())
 """One frame alone, run again without pixels that probably show an occluder."""
 
 NONE: tuple[Stage, ...] = (Observe(), Evaluate())
@@ -70,6 +72,7 @@ COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Eval
 """How well a given state fits a frame, in a smaller image."""
 
 CALIBRATION: tuple[Stage, ...] = (
+    SilhouetteSearch(),
     _FAR,
     Descend(blur=8.0),
     Descend(blur=3.0),

@@ -87,6 +87,40 @@ class RandomRestart:
 
 
 @dataclass(frozen=True)
+class SilhouetteSearch:
+    """Where given masks are the target and the start is far from them: draw states, compare their silhouettes with the
+    masks by distance, which needs no overlap, and go on from the nearest. Skipped where a network says where arms are.
+    """
+
+    if_overlap: float = 0.8
+    """Overlap of silhouettes and masks at the start (Dice) from which nothing is searched [1]."""
+    starts: int = 4
+    """Largest number of searches [1]."""
+    rounds: int = 10
+    """Rounds of each; every round draws around the best of the one before [1]."""
+    candidates: int = 48
+    """States per round; the first has more [1]."""
+    joints_deg: float = 6.0
+    """Deviation of joints in the first round [deg]; `length_scale` turns it into metres."""
+    frames_deg: float = 15.0
+    """Deviation of base frames and cameras in the first round [deg]; places deviate by what half of this angle is at
+    the distance of the arms from the camera."""
+    enough: float = 1.5
+    """Distance of silhouettes and masks at which no further search begins [px of the compared images]."""
+    scale: float = 0.5
+    """Of the compared images, as `Observe.scale` [1]."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.if_overlap <= 1, "SilhouetteSearch.if_overlap", self.if_overlap, "0 to 1")
+        require(1 <= self.starts <= 100, "SilhouetteSearch.starts", self.starts, "1 to 100")
+        require(1 <= self.rounds <= 1000, "SilhouetteSearch.rounds", self.rounds, "1 to 1000")
+        require(20 <= self.candidates <= 10_000, "SilhouetteSearch.candidates", self.candidates, "20 to 10000")
+        require(0 < self.joints_deg <= 90, "SilhouetteSearch.joints_deg", self.joints_deg, "above 0, at most 90 deg")
+        require(0 < self.frames_deg <= 90, "SilhouetteSearch.frames_deg", self.frames_deg, "above 0, at most 90 deg")
+        require(0.1 <= self.scale <= 8, "SilhouetteSearch.scale", self.scale, "0.1 to 8")
+
+
+@dataclass(frozen=True)
 class AlignEdges:
     """Move the outlines of the arms to edges of the image, weighed against the surface factor. Skipped where given
     masks are the target: they say where outlines are."""
@@ -119,6 +153,16 @@ class PreferStart:
 
 
 @dataclass(frozen=True)
+class OtherBackground:
+    """Where the verdict is not good and the empty background is known: run again with that background treated the other
+    way (replaced in the image, or taken off what the network predicts). Kept is the run whose arms overlap more with
+    what differs from the background, which false detections cannot help."""
+
+    then: tuple["Stage", ...]
+    """What runs from the start again."""
+
+
+@dataclass(frozen=True)
 class IgnoreOccluders:
     """Propose an ignore mask of occluders from what contradicts the fit, and run again without those pixels."""
 
@@ -148,7 +192,18 @@ class FirstOrder:
         require(0 <= self.blur <= 20, "FirstOrder.blur", self.blur, "0 to 20 px")
 
 
-Stage = Observe | Descend | RandomRestart | AlignEdges | PreferStart | IgnoreOccluders | Evaluate | FirstOrder
+Stage = (
+    Observe
+    | Descend
+    | RandomRestart
+    | SilhouetteSearch
+    | AlignEdges
+    | PreferStart
+    | OtherBackground
+    | IgnoreOccluders
+    | Evaluate
+    | FirstOrder
+)
 
 
 def first_descend(stages: tuple[Stage, ...]) -> Descend:
