@@ -95,5 +95,6 @@ def _stage(table: Mapping[str, Any], where: str) -> Stage:
 _EXAMPLES: dict[str, Any] = {
     "Descend": _STAGES["Descend"](blur=1.0),
     "RandomRestart": _STAGES["RandomRestart"](then=()),
+    "OtherBackground": _STAGES["OtherBackground"](then=()),
     "IgnoreOccluders": _STAGES["IgnoreOccluders"](then=()),
 }
