@@ -41,6 +41,11 @@ def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, di
     shutil.copytree(recording, tmp_path / "desk", ignore=shutil.ignore_patterns("desk", "home"))
     desk = tmp_path / "desk"
     shutil.copytree(ROOT / "sample_data", desk / "sample_data")
+    foreign = desk / "session"
+    shutil.copytree(ROOT / "sample_data" / "sequence" / "images" / "regular" / "left", foreign / "left")
+    rows = (ROOT / "sample_data" / "sequence" / "kinematics.csv").read_text().replace("psm1.", "").splitlines()
+    columns = [",".join([*row.split(",")[:1], *row.split(",")[2:9]]) for row in rows]
+    (foreign / "joints.csv").write_text("\n".join(columns) + "\n")
     (desk / "path").mkdir()
     (desk / "path" / "to").symlink_to(desk)
     home = tmp_path / "home"
