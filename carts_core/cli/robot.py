@@ -47,4 +47,5 @@ class RobotCommand:
             robot = Robot.load(trial, progress=console.print)
         write_text(output, dvrk_urdf(self.model, self.instrument, output.absolute().parent))
         console.print(f"wrote {output}: joints {', '.join(robot.joint_names)}")
+        console.print(f"meshes: {robot.decimation}")
         console.print(f'In a sequence file: robot = "{output.name}", as a path from that file.', markup=False)

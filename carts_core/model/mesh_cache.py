@@ -12,9 +12,9 @@ import numpy as np
 from ..errors import OutputError
 from ..files import output_path, output_stream
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
-from .meshes import LinkMesh
+from .meshes import Decimation, LinkMesh
 
-_VERSION = 1
+_VERSION = 2
 
 
 def cache_dir() -> Path:
@@ -33,14 +33,14 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
     return digest.hexdigest()[:32]
 
 
-def read(key: str) -> tuple[LinkMesh, ...] | None:
-    """Meshes stored under `key`, or None when there are none (or the file is damaged)."""
+def read(key: str) -> tuple[tuple[LinkMesh, ...], Decimation] | None:
+    """Meshes stored under `key` and what became of them, or None when there are none (or the file is damaged)."""
     try:
         with (
             open_regular(cache_dir() / f"{key}.npz", CACHED) as file,
             np.load(file, allow_pickle=False) as stored,
         ):
-            return tuple(
+            meshes = tuple(
                 LinkMesh(
                     int(stored[f"{i}_link"]),
                     stored[f"{i}_vertices"],
@@ -50,13 +50,19 @@ def read(key: str) -> tuple[LinkMesh, ...] | None:
                 )
                 for i in range(int(stored["count"]))
             )
+            return meshes, Decimation(int(stored["before"]), int(stored["after"]), float(stored["deviation"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return None
 
 
-def write(key: str, meshes: tuple[LinkMesh, ...]) -> None:
+def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> None:
     """Store `meshes` under `key`; a cache that cannot be written is no error."""
-    arrays: dict[str, np.ndarray] = {"count": np.array(len(meshes))}
+    arrays: dict[str, np.ndarray] = {
+        "count": np.array(len(meshes)),
+        "before": np.array(decimation.before),
+        "after": np.array(decimation.after),
+        "deviation": np.array(decimation.deviation),
+    }
     for i, mesh in enumerate(meshes):
         for field in ("link", "vertices", "normals", "faces", "color"):
             arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))

@@ -103,23 +103,14 @@ def _mesh_color(mesh: trimesh.Trimesh) -> np.ndarray:
     return _DEFAULT_COLOR if rgba is None else np.asarray(rgba, dtype=float)[:3] / 255.0
 
 
-def face_budget(counts: Sequence[int], max_faces: int) -> list[int]:
-    """Share `max_faces` among meshes: small ones keep every face, the others get the same cap."""
-    cap = max_faces
-    remaining, open_meshes = max_faces, len(counts)
-    for count in sorted(counts):
-        cap = remaining // max(open_meshes, 1)
-        if count > cap:
-            break
-        remaining -= count
-        open_meshes -= 1
-    else:
-        return list(counts)
-    return [min(count, cap) for count in counts]
+def simplify(
+    mesh: trimesh.Trimesh, tolerance: float | None
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], float]:
+    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and what it deviates by [m].
 
-
-def simplify(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices [V, 3], vertex normals [V, 3] and faces [F, 3] of `mesh` with at most about `faces` triangles.
+    Args:
+        mesh: [m]
+        tolerance: how far its surface may move [m]; None leaves it as it is.
 
     Raises:
         DecimationError: the mesh is degenerate, or so irregular that it takes too long.
@@ -127,8 +118,10 @@ def simplify(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray,
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices(digits_vertex=7)
     mesh.update_faces(mesh.nondegenerate_faces())
-    if len(mesh.faces) > faces:
-        mesh = trimesh.Trimesh(*decimated(np.array(mesh.vertices), np.array(mesh.faces), max(faces, 4)))
+    deviation = 0.0
+    if tolerance is not None and len(mesh.faces):
+        vertices, faces, deviation = decimated(np.array(mesh.vertices), np.array(mesh.faces), tolerance)
+        mesh = trimesh.Trimesh(vertices, faces)
         mesh.update_faces(mesh.nondegenerate_faces())
     if not len(mesh.faces):
         raise DecimationError("all its triangles are without area")
@@ -136,35 +129,67 @@ def simplify(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray,
     normals = np.array(smooth.vertex_normals)
     if not np.isfinite(normals).all():
         raise DecimationError("its normals are not finite")
-    return np.array(smooth.vertices), normals, np.array(smooth.faces)
+    return np.array(smooth.vertices), normals, np.array(smooth.faces), deviation
+
+
+@dataclass(frozen=True)
+class Decimation:
+    """What became of a robot's meshes."""
+
+    before: int
+    """Triangles of the files."""
+    after: int
+    """Triangles that are rendered."""
+    deviation: float
+    """How far the surface of a part moved at most [m]."""
+
+    def __str__(self) -> str:
+        if self.deviation == 0.0:
+            return f"{self.after} triangles, as in the files"
+        return (
+            f"{self.after} of {self.before} triangles are kept, which moves no surface by more than "
+            f"{self.deviation * 1e3:.2f} mm"
+        )
 
 
 def build_link_meshes(
-    parts: Sequence[tuple[int, trimesh.Trimesh, np.ndarray]], max_faces: int, progress: Callable[[str], None]
-) -> tuple[LinkMesh, ...]:
-    """Decimate `parts` (link index, mesh, colour) to at most about `max_faces` triangles in all.
+    parts: Sequence[tuple[int, trimesh.Trimesh, np.ndarray]],
+    max_faces: int,
+    tolerance: float,
+    progress: Callable[[str], None],
+) -> tuple[tuple[LinkMesh, ...], Decimation]:
+    """The meshes of links, decimated to a tolerance where they have more than `max_faces` triangles together.
+
+    Args:
+        parts: index of a link, a mesh of it [m], and its colour.
+        max_faces: so many triangles in all are left as they are.
+        tolerance: how far surfaces may move [m].
+        progress: called with a line for people for every mesh.
 
     Raises:
         RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
     """
-    if sum(len(mesh.faces) for _, mesh, _ in parts) > MOST_FACES:
+    before = sum(len(mesh.faces) for _, mesh, _ in parts)
+    if before > MOST_FACES:
         raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler ones.")
-    budgets = face_budget([len(mesh.faces) for _, mesh, _ in parts], max_faces)
-    result = []
-    for number, ((link, mesh, color), budget) in enumerate(zip(parts, budgets, strict=True), start=1):
-        progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {min(len(mesh.faces), budget)} triangles")
+    result, deviations = [], [0.0]
+    for number, (link, mesh, color) in enumerate(parts, start=1):
         try:
-            vertices, normals, faces = simplify(mesh, budget)
+            vertices, normals, faces, deviation = simplify(mesh, tolerance if before > max_faces else None)
         except DecimationError as error:
             raise RobotError(
                 f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
                 "Export it again as a clean triangle mesh."
             ) from error
+        progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")
+        deviations.append(deviation)
         result.append(
             LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
         )
-    if sum(len(mesh.faces) for mesh in result) > _MOST_KEPT * max_faces:
+    after = sum(len(mesh.faces) for mesh in result)
+    if after > _MOST_KEPT * max_faces:
         raise RobotError(
-            f"the meshes cannot be simplified to about {max_faces} triangles. Export them as clean triangle meshes."
+            f"the meshes have {after} triangles when simplified to {tolerance * 1e3:.2g} mm; allowed are "
+            f"{_MOST_KEPT * max_faces}. Export them as clean triangle meshes."
         )
-    return tuple(result)
+    return tuple(result), Decimation(before, after, max(deviations))

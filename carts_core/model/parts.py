@@ -4,15 +4,12 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from .robot import Robot
+from .robot import SLENDER, Robot
 
 PARTS = ("shaft", "wrist", "jaws")
 """In the order of their index."""
 
 _PROBE = 0.1
-
-_SLENDER = 0.1
-"""Largest width of a shaft, in lengths."""
 
 
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
@@ -35,5 +32,5 @@ def _shaft_movers(robot: Robot, movers: Int[np.ndarray, " links"]) -> int:
     """How many degrees of freedom move the shaft; 0 for a robot that has none."""
     extents = [np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in robot.meshes]
     longest = int(np.argmax([extent[-1] for extent in extents]))
-    slender = extents[longest][-2] < _SLENDER * extents[longest][-1]
+    slender = extents[longest][-2] < SLENDER * extents[longest][-1]
     return int(movers[robot.meshes[longest].link]) if slender else 0

@@ -5,6 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
+import torch
+import trimesh
 import yourdfpy
 from jaxtyping import Float
 from torch import Tensor
@@ -15,8 +18,15 @@ from . import mesh_cache
 from .instruments import robot_file
 from .kinematics import Kinematics, exact_right_angles
 from .mesh_files import mesh_path
-from .meshes import LinkMesh, build_link_meshes, load_visual
+from .meshes import Decimation, LinkMesh, build_link_meshes, load_visual
 from .urdf_check import parsed_urdf
+
+INSTRUMENT_TOLERANCE = 2e-4
+"""How far decimation may move surfaces of an instrument [m]."""
+REACH_TOLERANCE = 1e-3
+"""The same for other robots, a part of their reach [1]."""
+SLENDER = 0.1
+"""Largest width of a shaft, in lengths [1]."""
 
 
 class Robot:
@@ -31,10 +41,17 @@ class Robot:
         joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m], infinite where not given.
         link_names: the links that carry a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
+        decimation: how many triangles were taken away, and how far surfaces moved.
     """
 
     def __init__(
-        self, name: str, urdf: Path, kinematics: Kinematics, link_names: tuple[str, ...], meshes: tuple[LinkMesh, ...]
+        self,
+        name: str,
+        urdf: Path,
+        kinematics: Kinematics,
+        link_names: tuple[str, ...],
+        meshes: tuple[LinkMesh, ...],
+        decimation: Decimation,
     ) -> None:
         self.name = name
         self.urdf = urdf
@@ -44,6 +61,7 @@ class Robot:
         self.joint_limits = kinematics.joint_limits
         self.link_names = link_names
         self.meshes = meshes
+        self.decimation = decimation
         self._kinematics = kinematics
 
     def __repr__(self) -> str:
@@ -56,6 +74,7 @@ class Robot:
         *,
         base_link: str | None = None,
         max_faces: int = 12_000,
+        tolerance: float | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Robot":
         """Read a URDF and its visual meshes; decimated meshes come from the cache the second time.
@@ -63,7 +82,9 @@ class Robot:
         Args:
             urdf: path of the URDF, mesh paths are relative to it; or `builtin:NAME`.
             base_link: frame of the link transforms, the URDF's root by default.
-            max_faces: triangles of the whole robot after decimation.
+            max_faces: a robot with so many triangles is left as it is; those of others are decimated.
+            tolerance: how far decimation may move surfaces [m]; by default 0.2 mm for an instrument, which has a
+                slender shaft, and a thousandth of the reach for other robots.
             progress: called with a line for people, now and then.
 
         Raises:
@@ -87,10 +108,10 @@ class Robot:
         except Exception as error:  # the URDF parser raises many kinds
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
-        meshes = _load_meshes(model, urdf, link_names, max_faces, report)
+        meshes, decimation = _load_meshes(model, kinematics, urdf, link_names, (max_faces, tolerance), report)
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
-        return Robot(model.robot.name, urdf, kinematics, link_names, meshes)
+        return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation)
 
     def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:
         """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
@@ -125,15 +146,21 @@ class Robot:
 
 
 def _load_meshes(
-    model: yourdfpy.URDF, urdf: Path, link_names: tuple[str, ...], max_faces: int, report: Callable[[str], None]
-) -> tuple[LinkMesh, ...]:
+    model: yourdfpy.URDF,
+    kinematics: Kinematics,
+    urdf: Path,
+    link_names: tuple[str, ...],
+    limits: tuple[int, float | None],
+    report: Callable[[str], None],
+) -> tuple[tuple[LinkMesh, ...], Decimation]:
+    """Meshes of links; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     mesh_files = [
         mesh_path(urdf.parent, visual.geometry.mesh.filename)
         for link in model.robot.links
         for visual in link.visuals
         if visual.geometry is not None and visual.geometry.mesh is not None
     ]
-    key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], max_faces)
+    key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
     if (cached := mesh_cache.read(key)) is not None:
         return cached
     report(f"{model.robot.name}: preparing meshes (once)")
@@ -145,6 +172,29 @@ def _load_meshes(
         for visual in links[name].visuals
         for mesh, color in load_visual(visual, urdf.parent, materials)
     ]
-    meshes = build_link_meshes(parts, max_faces, report)
-    mesh_cache.write(key, meshes)
-    return meshes
+    max_faces, tolerance = limits
+    if tolerance is None:
+        tolerance = _tolerance(kinematics, link_names, parts)
+    meshes, decimation = build_link_meshes(parts, max_faces, tolerance, report)
+    if decimation.deviation:
+        report(f"{model.robot.name}: {decimation}")
+    mesh_cache.write(key, meshes, decimation)
+    return meshes, decimation
+
+
+def _tolerance(
+    kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
+) -> float:
+    """How far surfaces may move [m]: what an endoscope's image cannot show, or little of a robot's reach."""
+    if not parts:
+        return INSTRUMENT_TOLERANCE
+    longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])
+    if longest[-2] < SLENDER * longest[-1]:
+        return INSTRUMENT_TOLERANCE
+    rest = torch.zeros(len(kinematics.joint_names), dtype=torch.float64)
+    Ts = kinematics(rest, link_names).numpy()
+    reach = max(
+        np.linalg.norm(mesh.bounding_box.vertices @ Ts[link, :3, :3].T + Ts[link, :3, 3], axis=1).max()
+        for link, mesh, _ in parts
+    )
+    return max(float(reach) * REACH_TOLERANCE, 1e-6)

@@ -59,7 +59,10 @@ def _check_elements(root: Element, source: Path) -> None:
     for _ in range(_DEEPEST):
         count += len(level)
         if any(_XACRO in str(element.tag) for element in level):
-            raise RobotError(f"robot {source} is a xacro file. Expand it first: xacro {source.name} > robot.urdf")
+            raise RobotError(
+                f"robot {source} is a xacro file. Expand it first: xacro {source.name} > robot.urdf "
+                "(for an instrument of dvrk_model: carts robot MODEL --instrument NUMBER)."
+            )
         level = [child for element in level for child in element]
         if not level:
             break

@@ -194,7 +194,7 @@ class SynthesisConfig:
     name: str = "synthetic"
     """Name of the sequence."""
     robot: Path = field(default_factory=shipped_robot)
-    """URDF of both arms, with the seven joints of a PSM."""
+    """URDF of both arms, with the joints of a PSM; or `builtin:NAME`."""
     tip_link: str = "tool_tip_link"
     """Link of the URDF whose origin is the point between the jaws' tips."""
     domains: tuple[str, ...] = DOMAINS

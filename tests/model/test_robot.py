@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from carts_core.errors import RobotError
-from carts_core.model.meshes import face_budget
+from carts_core.model.decimation import deviation
 from carts_core.model.robot import Robot
 from carts_core.resources import shipped_robot
 
@@ -161,11 +162,43 @@ def test_a_damaged_cache_is_made_again(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(Robot.load(shipped_robot()).meshes) > 0
 
 
-def test_decimation_keeps_to_the_budget() -> None:
-    robot = Robot.load(shipped_robot(), max_faces=3000)
-    assert sum(len(mesh.faces) for mesh in robot.meshes) < 3600
+def test_a_robot_with_few_triangles_is_left_as_it_is() -> None:
+    robot = Robot.load(shipped_robot())
+    assert robot.decimation.before == robot.decimation.after
+    assert robot.decimation.deviation == 0.0
 
 
-def test_small_meshes_keep_every_face() -> None:
-    assert face_budget([10, 5000, 5000], 4010) == [10, 2000, 2000]
-    assert face_budget([10, 20], 100) == [10, 20]
+def test_decimation_keeps_to_the_tolerance_of_an_instrument_and_says_what_was_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
+    whole = Robot.load(shipped_robot())
+    lines: list[str] = []
+    robot = Robot.load(shipped_robot(), max_faces=3000, progress=lines.append)
+    assert sum(len(mesh.faces) for mesh in robot.meshes) == robot.decimation.after < 0.8 * robot.decimation.before
+    assert 0 < robot.decimation.deviation <= 2e-4
+    assert any("moves no surface by more than" in line for line in lines)
+    for mesh, original in zip(robot.meshes, whole.meshes, strict=True):
+        moved = deviation(mesh.vertices, mesh.faces, original.vertices, original.faces)
+        assert moved <= 2.2e-4
+    assert Robot.load(shipped_robot(), max_faces=3000).decimation == robot.decimation
+
+
+def test_decimation_of_a_robot_keeps_to_a_thousandth_of_its_reach(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.3).apply_translation((0, 0, 0.7))
+    ball.export(tmp_path / "ball.stl")
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="base"/><link name="hand"><visual><geometry><mesh filename="ball.stl"/>'
+        '</geometry></visual></link><joint name="turn" type="revolute"><parent link="base"/><child link="hand"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    robot = Robot.load(tmp_path / "arm.urdf")
+    reach = 1.0
+    assert robot.decimation.after < robot.decimation.before / 4
+    assert 2e-4 < robot.decimation.deviation <= 1.2e-3 * reach
+
+
+def test_a_urdf_that_xacro_made_is_no_xacro_though_it_declares_the_namespace(tmp_path: Path) -> None:
+    expanded = shipped_robot().read_text().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
+    (tmp_path / "arm.urdf").write_text(expanded.replace("meshes/", f"{shipped_robot().parent}/meshes/"))
+    assert len(Robot.load(tmp_path / "arm.urdf").meshes) == len(Robot.load(shipped_robot()).meshes)

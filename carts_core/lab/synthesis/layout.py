@@ -14,7 +14,7 @@ ARM_NAMES = ("psm1", "psm2")
 """Seen from the camera: the arm that comes in from the left, and the one from the right."""
 
 JOINT_TYPES = ("revolute", "revolute", "prismatic", "revolute", "revolute", "revolute", "revolute")
-"""Yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw."""
+"""Yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw; instruments whose jaws do not move lack the last."""
 
 _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
 """Where the instruments pass the body wall, in the left camera's frame [m]."""
@@ -45,13 +45,13 @@ def load_robot(config: SynthesisConfig) -> Robot:
     """The robot of both arms, with finer meshes than the optimizer uses.
 
     Raises:
-        RobotError: the URDF is unusable, or it is not a PSM with seven joints.
+        RobotError: the URDF is unusable, or it is not a PSM.
     """
     robot = Robot.load(config.robot, max_faces=config.render.robot_faces)
-    if robot.joint_types != JOINT_TYPES:
+    if robot.joint_types not in (JOINT_TYPES, JOINT_TYPES[:-1]):
         raise RobotError(
             f"robot {config.robot} has the joints {', '.join(robot.joint_names)} ({', '.join(robot.joint_types)}). "
-            f"Synthetic sequences need a PSM's seven: {', '.join(JOINT_TYPES)}."
+            f"Synthetic sequences need a PSM's seven, or all but the last: {', '.join(JOINT_TYPES)}."
         )
     return robot
 

@@ -40,7 +40,7 @@ class _Rejected(Exception):
 
 def plan_motion(
     arms: Sequence[Arm], tissues: Sequence[Tissue], camera: Camera, config: SynthesisConfig
-) -> tuple[Float[np.ndarray, "frames 7"], ...]:
+) -> tuple[Float[np.ndarray, "frames dofs"], ...]:
     """True joint positions of each arm [rad, m].
 
     Random splines are drawn until one keeps inside the joint limits, in view, and free of collisions.
@@ -72,8 +72,8 @@ def sample_times(config: SynthesisConfig) -> Float[np.ndarray, " frames"]:
 
 
 def reach_tip(
-    arm: Arm, tip_link: str, targets_world: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "n 7"]
-) -> Float[np.ndarray, "n 7"]:
+    arm: Arm, tip_link: str, targets_world: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "n dofs"]
+) -> Float[np.ndarray, "n dofs"]:
     """Inverse kinematics: yaw, pitch and insertion that bring the tip to each target, the other joints as given.
 
     Newton's method on the forward kinematics; the three joints are the shaft's spherical coordinates about the
@@ -99,7 +99,7 @@ def _tips(robot: Robot, tip_link: str, joints: torch.Tensor) -> torch.Tensor:
 
 def _draw(
     arm: Arm, number: int, camera: Camera, config: SynthesisConfig, rng: np.random.Generator
-) -> Float[np.ndarray, "frames 7"]:
+) -> Float[np.ndarray, "frames dofs"]:
     """One random motion of one arm, within its limits and in view."""
     motion = config.motion
     times = sample_times(config)
@@ -112,11 +112,11 @@ def _draw(
     targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
     if not _in_view(targets, camera):
         raise _Rejected("a tip leaves the picture")
-    joints = np.zeros((len(times), 7))
+    joints = np.zeros((len(times), len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
     low, high = motion.jaw_range
-    joints[:, 6] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)]))[:, 0], low, high)
+    joints[:, 6:] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)])), low, high)
     joints = reach_tip(arm, config.tip_link, targets, joints)
     lowest, highest = arm.robot.joint_limits.numpy()[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
@@ -127,7 +127,7 @@ def _draw(
 
 def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     """Roll, wrist pitch and wrist yaw for which the jaws point inwards and down: the best of many random ones."""
-    joints = np.zeros((600, 7))
+    joints = np.zeros((600, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3] = rng.uniform(-1.8, 1.8, len(joints))
     joints[:, 4:6] = rng.uniform(-0.75, 0.75, (len(joints), 2))

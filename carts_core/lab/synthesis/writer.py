@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from ...errors import CartsError
 from ...files import OutputPath, write_bytes, write_text
 from ...model.camera import Camera
+from ...model.instruments import SCHEME, SHIPPED
 from ...model.scene import Arm
 from ...resources import shipped_robot
 from ...settings import SynthesisConfig
@@ -94,8 +95,10 @@ def _arm_section(arm: Arm, config: SynthesisConfig, output: Path) -> str:
 
 
 def _robot_reference(robot: Path, output: Path) -> str:
+    if str(robot).startswith(SCHEME):
+        return str(robot)
     if robot.resolve() == shipped_robot().resolve():
-        return "builtin:psm_lnd"
+        return SCHEME + SHIPPED
     return Path(os.path.relpath(robot.resolve(), output.resolve())).as_posix()
 
 
