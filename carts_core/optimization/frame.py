@@ -75,6 +75,8 @@ class Progress:
     index: int
     loss: float
     seconds: float
+    stage: int = 0
+    """Counts from 0; losses compare within one, see `FrameOptimizer.comparable_losses`."""
 
 
 class FrameOptimizer:
@@ -151,6 +153,7 @@ class FrameOptimizer:
     def reset(self) -> None:
         """Go back to the start; the history is emptied."""
         self.history: list[Progress] = []
+        self._visited: list[tuple[torch.Tensor, object]] = []
         self.best: Iterate | None = None
         self.stop_reason: StopReason | None = None
         self._best_point: Point | None = None
@@ -183,7 +186,9 @@ class FrameOptimizer:
             self.stop_reason = self._fit.stop_reason
             return None
         iterate = self._iterate(point, time.perf_counter() - began)
-        self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds))
+        stage = self.history[-1].stage + (point.objective_key != self._visited[-1][1]) if self.history else 0
+        self._visited.append((point.offsets, point.objective_key))
+        self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds, stage))
         if point.improves_on(self._best_point):
             self.best, self._best_point = iterate, point
         return iterate
@@ -214,6 +219,16 @@ class FrameOptimizer:
         """Step until the optimization stops."""
         while (iterate := self.step()) is not None:
             yield iterate
+
+    def comparable_losses(self) -> list[float]:
+        """Loss of every iterate so far, all compared with what was observed last.
+
+        What an iterate carries was compared with the observation of its own time, so it only compares within a stage.
+        """
+        problem = self._problem
+        if not isinstance(problem, FrameProblem):
+            return [progress.loss for progress in self.history]
+        return [problem.evaluate(offsets, FINEST, gradient=False).loss for offsets, _ in self._visited]
 
     def base_frame_gain(self) -> float | None:
         """Share of the surface residual at the best iterate that free base frames would explain [1].

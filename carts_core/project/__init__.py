@@ -2,6 +2,7 @@
 
 from .changes import Change as Change
 from .database import DamagedProject as DamagedProject
+from .fit_verdict import FitVerdict as FitVerdict
 from .identity import SequenceIdentity as SequenceIdentity
 from .keys import Edits as Edits
 from .keys import Key as Key

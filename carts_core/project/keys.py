@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 from ..errors import ProjectError
+from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
 from .layers import IgnoreRegion, Layer, MaskCorrection
 from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review, TimeOffset
@@ -30,6 +31,7 @@ class Kind(StrEnum):
     TIME_OFFSET = "time_offset"
     KEYFRAME = "keyframe"
     REVIEW = "review"
+    VERDICT = "verdict"
 
 
 VALUE_TYPES: dict[Kind, type] = {
@@ -42,11 +44,12 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.TIME_OFFSET: TimeOffset,
     Kind.KEYFRAME: Keyframe,
     Kind.REVIEW: Review,
+    Kind.VERDICT: FitVerdict,
 }
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
-_OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.KEYFRAME, Kind.REVIEW}
-_MARKS = {Kind.KEYFRAME, Kind.REVIEW}
-_OF_NOBODY = {Kind.KEYFRAME, Kind.REVIEW, Kind.TIME_OFFSET}
+_MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
+_OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, *_MARKS}
+_OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET}
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,11 @@ class Key(Generic[V_co]):
     def review(frame: int) -> "Key[Review]":
         """Review state and note of a frame."""
         return Key(Kind.REVIEW, operator.index(frame), "")
+
+    @staticmethod
+    def verdict(frame: int) -> "Key[FitVerdict]":
+        """What the image says of a frame's fit."""
+        return Key(Kind.VERDICT, operator.index(frame), "")
 
     @staticmethod
     def base_frame(arm: str) -> "Key[CorrectedTransform]":

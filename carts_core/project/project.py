@@ -120,7 +120,7 @@ class Project:
             state = self.state
             for key, value in edits.items():
                 check_edit(state.identity, key, value)
-            changed = {key: value for key, value in edits.items() if state.get(key) != value}
+            changed = state.changed(edits)
             if not changed:
                 self.record_figures(figures or {}, state)
                 return None

@@ -51,19 +51,27 @@ def worst_first(
     Args:
         state: of the project.
         frames: indices to order, by default all.
-        badness: larger is worse, None unknown. By default 1 - Dice if any of the frames has Dice, else the loss.
+        badness: larger is worse, None unknown. By default 1 - Dice if any of the frames has Dice, else the probability
+            of a failure if any has a verdict, else the loss.
     """
     indices = list(range(len(state.identity.frame_ids)) if frames is None else frames)
-    known = {index: figures for index in indices if (figures := state.figures(index)) is not None}
     if badness is None:
-        badness = _dice_badness if any(figures.dice is not None for figures in known.values()) else _loss
+        judged = _badness(state, indices)
+        return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
+    known = {index: figures for index in indices if (figures := state.figures(index)) is not None}
     judged = {index: value for index, figures in known.items() if (value := badness(figures)) is not None}
     return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
 
 
-def _dice_badness(figures: Figures) -> float | None:
-    return None if figures.dice is None else 1 - figures.dice
-
-
-def _loss(figures: Figures) -> float | None:
-    return figures.loss
+def _badness(state: ProjectState, indices: Iterable[int]) -> dict[int, float]:
+    """Of the frames of which any is known; all by the same measure, the most telling that there is."""
+    dice, failure, loss = {}, {}, {}
+    for index in indices:
+        figures, verdict = state.figures(index), state.verdict(index)
+        if verdict is not None:
+            failure[index] = verdict.failure
+        if figures is not None and figures.dice is not None:
+            dice[index] = 1.0 - figures.dice
+        if figures is not None and figures.loss is not None:
+            loss[index] = figures.loss
+    return dice or failure or loss

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
+from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, Kind
 from .values import Figures, JointCorrection, Review, ReviewState, Source
@@ -81,7 +82,7 @@ class Record:
 
 
 _EMPTY = Record({}, {})
-_MARKS = (Kind.KEYFRAME, Kind.REVIEW)
+_MARKS = (Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT)
 """Kinds that say something about a frame and do not change how its arms fit."""
 
 
@@ -103,6 +104,15 @@ class ProjectState:
         entry = self._record(key.frame).entries.get(key)
         return None if entry is None else entry.value
 
+    def changed(self, edits: Edits) -> dict[Key[Any], Any]:
+        """The edits without those that change nothing; a verdict on another pose is another one, whatever it says."""
+        changed = {key: value for key, value in edits.items() if self.get(key) != value}
+        moved = {key.frame for key in changed if key.kind not in _MARKS}
+        for key, value in edits.items():
+            if key.kind is Kind.VERDICT and (key.frame in moved or self.verdict(key.frame) != value):
+                changed[key] = value
+        return changed
+
     def values(self, kind: Kind) -> dict[Key[Any], Any]:
         """All values of one kind."""
         entries = (item for record in self.records.values() for item in record.entries.items())
@@ -116,6 +126,11 @@ class ProjectState:
     def review(self, frame: int) -> Review:
         """Review state and note of a frame; untouched at first."""
         return self._record(frame).review
+
+    def verdict(self, frame: int) -> FitVerdict | None:
+        """What the image said of a frame's fit; None if the fit was not assessed since it changed."""
+        entry = self._record(frame).entries.get(Key.verdict(frame))
+        return None if entry is None or entry.step < self.revision(frame) else entry.value
 
     def is_keyframe(self, frame: int) -> bool:
         """Whether propagation must keep the frame: a person said so, or made its joint positions and said nothing."""

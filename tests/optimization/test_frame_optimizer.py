@@ -181,3 +181,14 @@ def test_a_missing_image_is_named(sequence: Sequence, extractor: FeatureExtracto
     frame = sequence.frame(0, cameras=["left"])
     with pytest.raises(SettingsError, match="no image of camera 'right' was given; given are: left"):
         optimizer_of(sequence, extractor, frame=frame)
+
+
+def test_losses_of_all_iterates_compare_in_the_end(sequence: Sequence, extractor: FeatureExtractor) -> None:
+    optimizer = FrameOptimizer(sequence.scene, sequence.frame(0), {}, extractor, settings=SurfaceSolver())
+    iterates = list(optimizer)
+    losses = optimizer.comparable_losses()
+    assert len(losses) == len(iterates) == len(optimizer.history)
+    assert optimizer.history[-1].stage >= 2, "the default solver looks at the image several times"
+    # The end was compared with the last observation at once, earlier iterates with others.
+    assert losses[-1] == pytest.approx(iterates[-1].loss, rel=1e-4) and losses[0] > 1.5 * losses[-1]
+    assert losses[1] != pytest.approx(iterates[1].loss, rel=1e-3)

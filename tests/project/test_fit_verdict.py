@@ -1,0 +1,53 @@
+"""Verdicts on fits: kept, undone and redone with the pose that they are of, and void when that changes."""
+
+from pathlib import Path
+
+import pytest
+from project_model import HAND, IDENTITY
+
+from carts_core.errors import ProjectError
+from carts_core.project import FitVerdict, JointCorrection, Key, Project, Review, ReviewState, worst_first
+
+GOOD = FitVerdict("good", "The image supports the fit.", "", 0.01)
+FAILED = FitVerdict("failed", "The image contradicts the fit.", "Run again.", 0.9)
+
+
+def _joints(value: float) -> JointCorrection:
+    return JointCorrection((value, 0.2, 0.03), HAND)
+
+
+def test_a_verdict_holds_until_the_pose_changes_and_comes_back_with_undo(project: Project, project_path: Path) -> None:
+    project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.1), Key.verdict(0): GOOD})
+    project.apply("Accept", {Key.review(0): Review(ReviewState.ACCEPTED)})
+    assert project.state.verdict(0) == GOOD
+    project.apply("Move", {Key.joints(0, "PSM1"): _joints(0.2)})
+    assert project.state.verdict(0) is None
+    project.undo()
+    assert project.state.verdict(0) == GOOD
+    project.close()
+    with Project(IDENTITY, project_path, read_only=True) as again:
+        assert again.state.verdict(0) == GOOD and again.state.verdict(1) is None
+
+
+def test_the_same_verdict_on_another_pose_holds_too(project: Project) -> None:
+    for value in (0.1, 0.2):
+        project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(value), Key.verdict(0): FAILED})
+        assert project.state.verdict(0) == FAILED
+
+
+def test_without_truth_the_worst_frame_is_the_one_that_most_probably_failed(project: Project) -> None:
+    project.apply("Assess", {Key.verdict(0): GOOD, Key.verdict(1): FAILED})
+    assert worst_first(project.state)[:2] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fine",), "must be one of: good, doubtful, failed"),
+        (("good", "", "", 1.5), "Give a number from 0 to 1"),
+        (("good", "x" * 3000), "at most 2000 characters"),
+    ],
+)
+def test_what_is_no_verdict_is_refused(arguments: tuple, message: str) -> None:
+    with pytest.raises(ProjectError, match=message):
+        FitVerdict(*arguments)
