@@ -6,13 +6,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from carts_core.errors import CartsError
+from carts_core.model.camera import Camera
 from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
 from carts_core.settings.inference import Inference
 from carts_viewer import intents
+from carts_viewer.asked import Asked
 from carts_viewer.controller import Controller
 from carts_viewer.display import PageDisplay
 from carts_viewer.intent_queue import IntentQueue
+from carts_viewer.keys import key_groups
 from carts_viewer.layers import Layer
 from carts_viewer.layout import Layout
 from carts_viewer.overlay import OverlayRenderer
@@ -84,8 +87,11 @@ class ViewerApp:
         self.page.on_drawn(self._on_drawn)
         self.page.on_released(lambda: self.queue.put(intents.Released()))
         self.page.on_pointed(self._on_pointed)
+        self.page.on_activated(self._on_activated)
         self.page.on_painted(self._on_painted)
-        self.page.on_picked(lambda share: self.queue.put(intents.ShowFrame(int(_unit(share) * len(sequence)))))
+        self.page.key_groups = key_groups(Layer)
+        Asked(self.page, self.queue, self.sequence)
+        self.page.on_picked(lambda index: self.queue.put(intents.ShowFrame(int(min(max(index, 0.0), 1e9)))))
         self._worker = Worker(self.queue, self._controller, self.display)
         self._worker.start(self._prepare)
 
@@ -219,9 +225,19 @@ class ViewerApp:
         self.display.drawn(tab)
         self.queue.put(intents.Drawn())
 
-    def _on_pointed(self, u: float, v: float) -> None:
-        camera = self.scene.camera(self.state.camera)
-        self.queue.put(intents.PointAt(u * camera.width, v * camera.height))
+    def _on_pointed(self, u: float, v: float, index: float) -> None:
+        camera = self._camera(index)
+        if camera is not None:
+            self.queue.put(intents.PointAt(u * camera.width, v * camera.height, camera.name))
+
+    def _on_activated(self, index: float) -> None:
+        camera = self._camera(index)
+        if camera is not None:
+            self.queue.put(intents.ShowCamera(camera.name))
+
+    def _camera(self, index: float) -> Camera | None:
+        """The camera with this index; None where a tab names none."""
+        return self.scene.cameras[int(index)] if index in range(len(self.scene.cameras)) else None
 
     def _on_painted(self, tab: int, text: str) -> None:
         try:
@@ -237,7 +253,3 @@ class ViewerApp:
         client = self.page.server.get_clients().get(client_id)
         if client is not None:
             client.send_file_download(name, content, save_immediately=True)
-
-
-def _unit(share: float) -> float:
-    return min(max(share, 0.0), 1.0)

@@ -1,8 +1,10 @@
 """What the handlers of intents work with: the state, the open recording, and the way into its project."""
 
+import math
 from dataclasses import replace
 from typing import Any, Protocol
 
+from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
 from carts_core.project import Edits, Figures, Provenance, Source
 from carts_core.project.keys import WHOLE_PROJECT
@@ -133,6 +135,7 @@ class Context:
         pose = self.session.pose(self.state.frame)
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)
+            self._measure_pins()
         self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
         if self.state.mask_correction != before.mask_correction:
             self.change(scores=None)
@@ -151,6 +154,16 @@ class Context:
         if project.writable and not known and not state.playing:
             project.record_figures({state.index: Figures(dice=scores.dice)}, project.state)
             self.change(project=self._editor.view)
+
+    def _measure_pins(self) -> None:
+        """Say anew how far the pins are from their keypoints."""
+        keypoints = self.state.keypoints
+        if keypoints.pins:
+            distances = []
+            for pin in keypoints.pins:
+                at = project_keypoints(self.session.scene, self.state.pose.scene, [pin.keypoint], pin.camera)[0]
+                distances.append(math.dist(at.tolist(), pin.pixel))
+            self.change(keypoints=replace(keypoints, residuals=tuple(distances)))
 
     def forget_pins(self) -> None:
         """Drop what was said about where keypoints are."""

@@ -2,14 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 
+from carts_core.model.scene import SceneState
+from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
+from carts_core.project.keys import WHOLE_PROJECT
+from carts_viewer.compare import composed, other_pose
 from carts_viewer.layers import Layer, Rgba, paint_over
-from carts_viewer.marks import draw_keypoints, labelled_keypoints
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.rate_limit import RateLimit
 from carts_viewer.scene_view import SceneView
 from carts_viewer.session import Session
-from carts_viewer.state import ViewState
+from carts_viewer.state import Maps, ViewState
 from carts_viewer.strokes import Tool
 from carts_viewer.transport.page import Page
 
@@ -22,10 +25,10 @@ class PageDisplay:
     ) -> None:
         self._page = page
         self._scene = session.scene
+        self._session = session
         self._renderer = renderer
         self._scene_view = scene_view
         self._panels = panels
-        self._keypoints = tuple(labelled_keypoints(session.scene).values())
         self._rate_limit = RateLimit()
         self._shown: ViewState | None = None
         self.drawn = self._rate_limit.drawn
@@ -41,32 +44,55 @@ class PageDisplay:
         new_frame = old is None or state.frame is not old.frame
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
-            overlay = self._renderer.overlay(
-                state.pose.scene,
-                state.frame,
-                state.camera,
-                state.layer,
-                state.opacity,
-                state.maps,
-                state.mask_correction,
-            )
-            _draw_paint(overlay, state)
-            if state.keypoints.shown:
-                draw_keypoints(
-                    overlay, self._scene, state.pose.scene, state.camera, self._keypoints, state.keypoints.pins
-                )
+            overlays = {name: self._overlay(state, name) for name in self._seen(state)}
             # Together, or a new frame would be seen for a moment under the old frame's overlay.
             with self._page.server.atomic():
                 if new_frame:
                     self._scene_view.show_frame(state.frame.images[state.camera], camera)
-                self._scene_view.show_overlay(overlay, camera)
+                self._scene_view.show_overlay(overlays[state.camera], camera)
+                self._show_others(state, old, overlays)
             self._page.server.flush()
             self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
             self._rate_limit.sent()
             # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
             if new_pose:
                 self._scene_view.show_pose(state.pose.scene, state.camera)
+            if (
+                new_frame
+                or old is None
+                or old.project.records.get(WHOLE_PROJECT) is not state.project.records.get(WHOLE_PROJECT)
+            ):
+                self._scene_view.show_measured(self._session.measured(state.frame))
         self._shown = state
+
+    def _seen(self, state: ViewState) -> list[str]:
+        """The cameras whose images are shown: those that the frame has, the active one first."""
+        others = [camera.name for camera in self._scene.cameras if camera.name != state.camera]
+        return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
+
+    def _overlay(self, state: ViewState, camera: str) -> Rgba:
+        correction = state.project.get(Key.mask_correction(state.index, camera))
+
+        def at(scene: SceneState, maps: Maps | None) -> Rgba:
+            return self._renderer.overlay(scene, state.frame, camera, state.layer, state.opacity, maps, correction)
+
+        overlay, share = at(state.pose.scene, state.maps), state.compare.share
+        if share > 0.0:
+            other = other_pose(state.compare, self._session.measured(state.frame), state.run.start)
+            overlay = composed(overlay, at(other, None), share)
+        _draw_paint(overlay, state, correction, state.project.get(Key.ignore_region(state.index, camera)))
+        return overlay
+
+    def _show_others(self, state: ViewState, old: ViewState | None, overlays: Mapping[str, Rgba]) -> None:
+        """The images of the other cameras, as far as they are to be seen."""
+        active = self._scene.camera(state.camera)
+        again = old is None or old.frame is not state.frame or old.camera != state.camera or not old.beside
+        for camera in self._scene.cameras:
+            if camera.name != state.camera and camera.name in overlays:
+                image = state.frame.images[camera.name] if again else None
+                self._scene_view.show_beside(camera, active, image, overlays[camera.name])
+            else:
+                self._scene_view.hide_beside(camera)
 
     def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
         """Acknowledge strokes that are in the overlay that was just sent: their tabs need not draw them any more."""
@@ -83,15 +109,19 @@ class PageDisplay:
 
 def _picture(state: ViewState) -> tuple:
     brush = state.brush
-    keypoints = state.keypoints.shown, state.keypoints.pins
-    painted = state.mask_correction, state.ignore_region, brush.tool is Tool.OFF, brush.target, brush.painted
-    return state.layer, state.opacity, id(state.maps), keypoints, painted
+    keys = Kind.MASK_CORRECTION, Kind.IGNORE_REGION
+    entries = state.project.records.get(state.index)
+    layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
+    painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted
+    return state.layer, state.opacity, id(state.maps), state.beside, state.compare, painted
 
 
-def _draw_paint(overlay: Rgba, state: ViewState) -> None:
+def _draw_paint(
+    overlay: Rgba, state: ViewState, corrected: MaskCorrection | None, ignored: IgnoreRegion | None
+) -> None:
     """Draw what was painted, unless somebody wants to see nothing but the frame."""
     at_work = state.brush.tool is not Tool.OFF
     if at_work or state.layer is not Layer.NONE:
         # The comparison with the truth shows the corrected mask itself.
-        correction = None if state.layer is Layer.TRUTH else state.mask_correction
-        paint_over(overlay, correction, state.ignore_region, max(state.opacity, 0.4) if at_work else state.opacity)
+        correction = None if state.layer is Layer.TRUTH else corrected
+        paint_over(overlay, correction, ignored, max(state.opacity, 0.4) if at_work else state.opacity)

@@ -72,6 +72,7 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("U", "Choose the next joint to nudge", intents.ChooseJoint()),
         Shortcut("C", "Copy the correction of the previous frame", intents.CopyCorrection(-1)),
         Shortcut("C", "Copy the correction of the next frame", intents.CopyCorrection(1), "shift"),
+        Shortcut("V", "Cameras side by side, or one", intents.ShowBeside(), "shift"),
         Shortcut("H", "Show or hide the keypoints", intents.ShowKeypoints()),
         Shortcut("P", "Perturb all joints", "perturb"),
         Shortcut("M", "Back to measured joints", intents.BackToMeasured()),
@@ -92,9 +93,36 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
     ]
 
 
+_GROUPS = {
+    "Frames": ("frame", "Play", "worst"),
+    "Optimize": ("optimizer", "run", "keyframe", "Perturb", "measured", "correction", "joint"),
+    "Review": ("Accept", "Mark as", "Reject", "review", "Undo", "Redo"),
+    "Paint": ("Brush", "brush", "Eraser", "Polygon", "polygon", "Paint"),
+    "View": ("",),
+}
+"""Names of groups, and words by which the keys of a group are known; the first group that fits has the key."""
+
+
+def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """The shortcuts for the sheet of keys: group by group, each key with what it does."""
+    groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
+    order = ["Review", "Optimize", "Paint", "Frames", "View"]
+    for shortcut in shortcuts(layers):
+        name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
+        groups[name].append((shortcut.key, shortcut.label))
+    groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
+    groups["View"].append(("?", "This sheet"))
+    groups["View"].append(("Ctrl+K", "Find anything by name"))
+    return list(groups.items())
+
+
 def key_table(layers: Iterable[Layer]) -> str:
     """The shortcuts as a Markdown table."""
     rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
+    rows += [
+        "| **.** (held) | The measured pose, or the one compared with |",
+        "| **?** | All keys on one sheet |",
+    ]
     return "\n".join(["| Key | What it does |", "|---|---|", *rows])
 
 

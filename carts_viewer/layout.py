@@ -1,9 +1,14 @@
 """Where the panels are on the page: browsing, overlay and joints on the left, tabs on the right."""
 
+import viser
+
 from carts_viewer.intent_queue import IntentQueue
+from carts_viewer.page_state import PageState
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.curves import CurvesPanel
 from carts_viewer.panels.export import ExportPanel
+from carts_viewer.panels.find import FindPanel
+from carts_viewer.panels.fit import FitPanel
 from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.panels.joints import JointsPanel
@@ -21,10 +26,16 @@ from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
+from carts_viewer.timeline_data import TimelineData
 from carts_viewer.transport.page import Page
 
 _WIDTH = 312.0
 """Of either side [px]."""
+
+
+def choose_theme(gui: viser.GuiApi, *, light: bool) -> None:
+    """The colours of all tabs, or of the one that this is the interface of."""
+    gui.configure_theme(dark_mode=not light, show_share_button=False, show_logo=False)
 
 
 class Layout:
@@ -47,13 +58,14 @@ class Layout:
         """
         emit, waits = queue.put, queue.waits
         gui = page.server.gui
-        gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
+        choose_theme(gui, light=False)
         gui.set_panel_label("CaRTS")
         gui.main_panel.dock_left()
         gui.main_panel.set_width(_WIDTH)
         panels: list[Panel] = [
             SavedPanel(page, storage, emit),
             MessagePanel(page, emit),
+            FitPanel(page, session, emit),
             BrowsePanel(page, session, emit, waits),
             OverlayPanel(page, session, state, emit, waits),
             PaintPanel(page, session, state, emit, waits),
@@ -74,6 +86,7 @@ class Layout:
                 ReviewPanel(page, emit, waits),
                 KeyframesPanel(page, session, emit),
                 KeypointsPanel(page, session, emit),
+                FindPanel(page, session, emit, waits),
                 HistoryPanel(page, emit),
             ]
         with right.add_tab("Values"):
@@ -84,4 +97,4 @@ class Layout:
             HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
         right.dock_right()
         right.set_width(_WIDTH)
-        self.panels = [*panels, self.joints]
+        self.panels = [*panels, self.joints, PageState(page, session), TimelineData(page, session)]

@@ -1,16 +1,10 @@
-"""Keypoints over the picture: a ring where the pose has each of them, a cross where a person says that it is."""
+"""Keypoints by name, and where a pose has them in the images."""
 
-from collections.abc import Iterable
-
-import cv2
-import numpy as np
+import math
+from collections.abc import Mapping
 
 from carts_core.model.keypoints import Keypoint, keypoints, project_keypoints
 from carts_core.model.scene import Scene, SceneState
-from carts_core.optimization.keypoints import Pin
-from carts_viewer.layers import Rgba
-
-_RING, _CROSS, _EDGE = (255, 255, 255, 255), (250, 204, 21, 255), (0, 0, 0, 255)
 
 
 def labelled_keypoints(scene: Scene) -> dict[str, Keypoint]:
@@ -20,25 +14,16 @@ def labelled_keypoints(scene: Scene) -> dict[str, Keypoint]:
     return {f"{point.arm} {point.name}" if several else point.name: point for point in points}
 
 
-def draw_keypoints(
-    picture: Rgba, scene: Scene, state: SceneState, camera: str, points: Iterable[Keypoint], pins: Iterable[Pin]
-) -> None:
-    """Draw the keypoints of a pose, and the pins of this camera, into a picture of the camera's image size."""
-    size = max(picture.shape[:2]) / 640
-    for pixel in project_keypoints(scene, state, list(points), camera).tolist():
-        if np.isfinite(pixel).all() and np.abs(pixel).max() < 4 * max(picture.shape):
-            for color, thickness in ((_EDGE, 3 * size), (_RING, size)):
-                cv2.circle(picture, _corner(pixel), round(5 * size) + 1, color, max(1, round(thickness)))
-    for pin in pins:
-        if pin.camera == camera:
-            for color, thickness in ((_EDGE, 3 * size), (_CROSS, size)):
-                at = _corner(pin.pixel)
-                cv2.drawMarker(
-                    picture, at, color, cv2.MARKER_TILTED_CROSS, round(9 * size) + 2, max(1, round(thickness))
-                )
-
-
-def _corner(pixel: Iterable[float]) -> tuple[int, int]:
-    """OpenCV's index of the pixel; ours have their centres at 0.5."""
-    u, v = pixel
-    return int(np.floor(u)), int(np.floor(v))
+def keypoints_in_image(
+    scene: Scene, state: SceneState, camera: str, points: Mapping[str, Keypoint]
+) -> list[tuple[str, float, float]]:
+    """Label, column and row of every keypoint that is in or near a camera's image, as shares of its size."""
+    own = scene.camera(camera)
+    found = []
+    for label, (u, v) in zip(
+        points, project_keypoints(scene, state, list(points.values()), camera).tolist(), strict=True
+    ):
+        x, y = u / own.width, v / own.height
+        if math.isfinite(x) and math.isfinite(y) and -0.2 < x < 1.2 and -0.2 < y < 1.2:
+            found.append((label, round(x, 5), round(y, 5)))
+    return found

@@ -22,16 +22,14 @@ class OverlayRenderer:
         self._measured_joints = sequence.measured_joints
         self._device = device
         self._renderers: dict[str, Renderer] = {}
-        self._last: tuple[SceneState | None, str, layers.ArmIds] = (None, "", np.zeros((0, 0), int))
+        self._last: dict[str, tuple[SceneState, layers.ArmIds]] = {}
 
     def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
         # Overlay and scores of one pose are asked for one after the other.
-        last_state, last_camera, arm_ids = self._last
-        if last_state is not state or last_camera != camera:
-            arm_ids = self._renderer(camera).segment(state.to(self._device))[0]
-            self._last = (state, camera, arm_ids)
-        return arm_ids
+        if camera not in self._last or self._last[camera][0] is not state:
+            self._last[camera] = (state, self._renderer(camera).segment(state.to(self._device))[0])
+        return self._last[camera][1]
 
     def mask(
         self, state: SceneState, camera: str, correction: MaskCorrection | None = None
@@ -82,15 +80,19 @@ class OverlayRenderer:
         """How close the pose and its corrected mask are to the frame's truth, as far as there is one."""
         mask = None if frame.masks is None else frame.masks.get(camera)
         overlap = None if mask is None else dice(self.mask(state, camera, correction), mask)
+        others = {
+            name: dice(self.mask(state, name), mask) for name, mask in (frame.masks or {}).items() if name != camera
+        }
+        known = others if overlap is None else {camera: overlap, **others}
         values = (joints.double().numpy() for joints in state.joint_positions)
         estimate = {arm.name: joints for arm, joints in zip(self._scene.arms, values, strict=True)}
-        return Scores(overlap, joint_mae_deg(self._scene, estimate, frame.truth or {}, self._measured_joints))
+        return Scores(overlap, joint_mae_deg(self._scene, estimate, frame.truth or {}, self._measured_joints), known)
 
     @torch.no_grad()
     def _shaded(self, state: SceneState, camera: str, opacity: float) -> layers.Rgba:
         rendering = self._renderer(camera)(state.to(self._device))
         arm_ids = rendering.arm_ids[0].cpu().numpy()
-        self._last = (state, camera, arm_ids)
+        self._last[camera] = (state, arm_ids)
         return layers.shaded(rendering.image[0].cpu().numpy(), arm_ids, opacity)
 
     def _renderer(self, camera: str) -> Renderer:

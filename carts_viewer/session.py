@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from carts_core.errors import CartsError
+from carts_core.errors import CartsError, SequenceError
 from carts_core.model.perturbation import perturb
 from carts_core.model.scene import Arm, Scene, SceneState
 from carts_core.project import (
@@ -84,13 +84,18 @@ class Session:
         return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
 
     def frame(self, index: int, domain: str, camera: str) -> Frame:
-        """The frame with the image of that camera; those ahead of it are read in advance.
+        """The frame with the images of all cameras, or of that one alone where another one's cannot be used.
+
+        Those ahead of it are read in advance.
 
         Raises:
-            SequenceError: the image is not usable.
+            SequenceError: the image of that camera is not usable.
         """
         self._follow()
-        return self._reader.frame(index, domain, camera)
+        try:
+            return self._reader.frame(index, domain, *(own.name for own in self.scene.cameras))
+        except SequenceError:
+            return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
         """Stop reading frames in advance, and save what is under way.
@@ -159,12 +164,13 @@ class Session:
         return edits
 
     def saved(self, index: int) -> Edits:
-        """What brings joint positions and review of a frame, and the calibration, back to as they are saved now."""
+        """What brings joints, verdict and review of a frame, and the calibration, back to as they are saved now."""
         arms = [arm.name for arm in self.scene.arms]
         cameras = [camera.name for camera in self.scene.cameras]
         keys: list[Key[Any]] = [make(name) for make in (Key.extrinsics, Key.intrinsics) for name in cameras]
         keys += [Key.base_frame(arm) for arm in arms] + [Key.joints(index, arm) for arm in arms] + [Key.review(index)]
-        return {key: self.editor.project.state.get(key) for key in keys}
+        saved = self.editor.project.state
+        return {**{key: saved.get(key) for key in keys}, Key.verdict(index): saved.verdict(index)}
 
     def copied(self, frame: Frame, source: Frame) -> SceneState:
         """The frame's measured state, corrected by as much as the source frame is; joint limits hold.

@@ -1,5 +1,6 @@
 """The one immutable state of the app: what is shown, what is being done. The worker replaces it, panels read it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -9,9 +10,11 @@ import torch
 from carts_core.model.scene import SceneState
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings
 from carts_core.optimization.keypoints import Pin
-from carts_core.project import IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
+from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
 from carts_core.recording import Frame
 from carts_core.settings import Direction, SolverName
+from carts_viewer.compare import Compare
+from carts_viewer.finding import FrameFilter
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Brush
 
@@ -50,6 +53,8 @@ class Scores:
     """Overlap of the rendered and the true mask in the shown camera, 0..1."""
     joint_degrees: float | None = None
     """Mean absolute error of the revolute joints [deg]."""
+    cameras: Mapping[str, float] = field(default_factory=dict)
+    """Overlap in every camera whose image and true mask are at hand, 0..1."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,10 @@ class Curves:
     """One entry per iterate of the current run."""
 
     loss: tuple[float, ...] = ()
+    stages: tuple[int, ...] = ()
+    """The stage of each iterate: losses compare within one."""
+    comparable: bool = False
+    """Whether losses compare over all stages, which they do once the run has ended."""
     scores: tuple[Scores, ...] = ()
     seconds: tuple[float, ...] = ()
     """Duration of each iteration [s]."""
@@ -72,6 +81,8 @@ class Maps:
     iterate: Iterate
     cameras: tuple[str, ...]
     """The cameras that the iterate's maps belong to, in their order."""
+    of_run: bool = True
+    """Whether a run has led there; otherwise the pose was only compared."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +93,21 @@ class RunState:
     curves: Curves = field(default_factory=Curves)
     reason: str | None = None
     """Why the run stopped, for people."""
+    start: SceneState | None = None
+    """Where the run began."""
     base_frame_gain: float | None = None
     """The share of the remaining residual that free base frames would explain [1]; None where it is not known."""
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """A frame that somebody should look at after many were solved together."""
+
+    index: int
+    reason: str
+    """For people."""
+    taken: bool
+    """Whether what was solved is in the project; otherwise the frame is as it was, until somebody takes it."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +121,8 @@ class SolveState:
     running: bool = True
     text: str = ""
     """How it goes, for people."""
+    listed: tuple[ListedFrame, ...] = ()
+    """Frames whose fit became worse, or is doubtful."""
 
 
 @dataclass(frozen=True)
@@ -149,10 +175,18 @@ class ViewState:
     """The solver that `settings` are of."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
+    settings_field: str | None = None
+    """Which setting that was."""
     time_error: str | None = None
     """Why the time offset that is being typed cannot be used."""
-    every_camera: bool = False
+    every_camera: bool = True
     """Whether a run uses all cameras or only the shown one."""
+    compare: Compare = field(default_factory=Compare)
+    """The other pose that the picture shows, if any."""
+    filter: FrameFilter = field(default_factory=FrameFilter)
+    """What frames somebody looks for."""
+    beside: bool = True
+    """Whether the images of the other cameras are shown beside that of the active one."""
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
@@ -172,6 +206,16 @@ class ViewState:
     """What the worker is preparing, for people."""
     export: ExportState | None = None
     error: str | None = None
+
+    @property
+    def run_outdated(self) -> bool:
+        """Whether the pose, or what the run saw, was changed since the last run."""
+        return bool(self.run.curves.loss) and (self.maps is None or not self.maps.of_run)
+
+    @property
+    def verdict(self) -> FitVerdict | None:
+        """What the image says of the shown pose; None where it was not asked."""
+        return self.project.verdict(self.index)
 
     @property
     def undoable(self) -> int:

@@ -9,15 +9,78 @@
 
   const FRAME = "/frame";
   const OVERLAY = "/overlay";
-  const SCENE_ONLY = ["/world", "/lens"]; // what the frame covers, or what would only clutter it
+  const OTHERS = "/others"; // the other cameras' frames and overlays, beside the shown one's
+  const SCENE_ONLY = ["/world", "/lens", "/grid"]; // what the frame covers, or what would only clutter it
   const SCENE_LAYER = 7;
+  const ENDOSCOPE_LAYER = 8;
   const MARGIN = 1.02;
   const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: what is in the middle, as a share of the image
   const viser = () => window.__viserMutable;
 
-  /** The image's rectangle on the plane at distance 1 from the lens, or null before the first frame arrived. */
+  let shown = { cameras: [], active: 0 }; // what the server says of the cameras, see setPage
+
+  /** The cameras' images on the plane at distance 1 from the lens; `index` is that of the camera. */
+  function cells() {
+    const active = rectangleOf(FRAME);
+    if (!active) return [];
+    const found = [{ index: shown.active, ...active }];
+    for (const { index } of shown.cameras) {
+      const cell = index === shown.active ? null : rectangleOf(`${OTHERS}/${index}/frame`);
+      if (cell) found.push({ index, ...cell });
+    }
+    return found;
+  }
+
+  /** Put the other cameras' images where there is most room in this window: in one row, in one column, or in a grid. */
+  function arrange() {
+    const mutable = viser();
+    const active = rectangleOf(FRAME);
+    const others = shown.cameras.filter((camera) => camera.index !== shown.active);
+    if (!active || !others.length || !mutable.canvas) return;
+    const count = shown.cameras.length;
+    const places = shown.cameras.map((camera) => camera.index).sort((one, other) => one - other);
+    const [above, below] = covered();
+    const room = [mutable.canvas.clientWidth, mutable.canvas.clientHeight * (1 - above - below)];
+    const scale = (columns) =>
+      Math.min(room[0] / (columns * active.width), room[1] / (Math.ceil(count / columns) * active.height));
+    const counts = Array.from({ length: count }, (_, number) => number + 1);
+    const columns = counts.reduce((best, one) => (scale(one) > scale(best) * 1.001 ? one : best), count);
+    const cell = (index) => [places.indexOf(index) % columns, Math.floor(places.indexOf(index) / columns)];
+    const [column, row] = cell(shown.active);
+    for (const { index } of others) {
+      for (const [node, share] of [["frame", 1], ["overlay", 0.99]]) {
+        const pose = mutable.nodePoseData?.[`${OTHERS}/${index}/${node}`];
+        if (!pose) continue;
+        const z = active.depth * share;
+        const [right, down] = [cell(index)[0] - column, cell(index)[1] - row];
+        const position = [
+          (active.left + active.width / 2 + 1.01 * right * active.width) * z,
+          (active.top + active.height / 2 + 1.01 * down * active.height) * z, z,
+        ];
+        if (pose.position.some((value, axis) => Math.abs(value - position[axis]) > 1e-9)) {
+          pose.position = position;
+          pose.poseUpdateState = "needsUpdate";
+          mutable.requestRender();
+        }
+      }
+    }
+  }
+
+  /** The rectangle around all images on the plane at distance 1, or null before the first frame arrived. */
   function imageRectangle() {
-    const node = viser()?.nodeRefFromName[FRAME];
+    const all = cells();
+    if (!all.length) return null;
+    const left = Math.min(...all.map((cell) => cell.left));
+    const top = Math.min(...all.map((cell) => cell.top));
+    return {
+      left, top, depth: all[0].depth,
+      width: Math.max(...all.map((cell) => cell.left + cell.width)) - left,
+      height: Math.max(...all.map((cell) => cell.top + cell.height)) - top,
+    };
+  }
+
+  function rectangleOf(name) {
+    const node = viser()?.nodeRefFromName[name];
     let size = null;
     node?.traverse((child) => { size ??= child.geometry?.parameters?.width ? child.geometry.parameters : null; });
     if (!size || !(node.position.z > 0)) return null;
@@ -28,37 +91,66 @@
     };
   }
 
+  /** Height of what lies over the lower end of the canvas [CSS px]. */
+  function bottomBars() {
+    const strip = document.querySelector(".carts-strip");
+    return strip ? strip.offsetHeight + (parseFloat(getComputedStyle(strip).bottom) || 0) : 0;
+  }
+
+  /** Shares of the canvas that our own bars cover, above and below. */
+  function covered() {
+    const height = viser()?.canvas?.clientHeight || 1;
+    return [46 / height, bottomBars() / height];
+  }
+
   /** The part of the plane at distance 1 that the canvas shows in the endoscope view. */
   function visibleRectangle(image, aspect) {
-    const height = (Math.max(image.height, image.width / aspect) * MARGIN) / view.zoom;
+    const [above, below] = covered();
+    const free = Math.max(1 - above - below, 0.2);
+    const height = (Math.max(image.height / free, image.width / aspect) * MARGIN) / view.zoom;
     const width = height * aspect;
     return {
       left: image.left + view.x * image.width - width / 2,
-      top: image.top + view.y * image.height - height / 2,
+      top: image.top + view.y * image.height - height * (above + free / 2),
       width, height,
     };
   }
 
-  /** The image's rectangle on the canvas in the endoscope view [CSS px], or null. */
-  function imageOnScreen() {
+  /** The rectangle of a camera's image, by default the shown one's, on the canvas in the endoscope view [CSS px]. */
+  function imageOnScreen(index = shown.active) {
     const image = view.endoscope ? imageRectangle() : null;
     const { camera, canvas } = viser() ?? {};
-    if (!image || !camera || !canvas) return null;
-    const shown = visibleRectangle(image, camera.aspect);
-    const [x, y] = [canvas.clientWidth / shown.width, canvas.clientHeight / shown.height];
+    const cell = image && cells().find((one) => one.index === index);
+    if (!cell || !camera || !canvas) return null;
+    const part = visibleRectangle(image, camera.aspect);
+    const [x, y] = [canvas.clientWidth / part.width, canvas.clientHeight / part.height];
     return {
-      left: (image.left - shown.left) * x, top: (image.top - shown.top) * y,
-      width: image.width * x, height: image.height * y,
+      left: (cell.left - part.left) * x, top: (cell.top - part.top) * y,
+      width: cell.width * x, height: cell.height * y,
     };
+  }
+
+  /** The camera under the pointer, and where in its image, as shares: [index, u, v]; null outside of all images. */
+  function imageAt(event, index = null) {
+    const box = viser().canvas.getBoundingClientRect();
+    for (const cell of cells()) {
+      const on = imageOnScreen(cell.index);
+      if (!on || (index !== null && index !== cell.index)) continue;
+      const u = (event.clientX - box.left - on.left) / on.width;
+      const v = (event.clientY - box.top - on.top) / on.height;
+      if (index !== null || (u >= 0 && u < 1 && v >= 0 && v < 1)) return [cell.index, u, v];
+    }
+    return null;
   }
 
   /** Keep the image in view: centred along a side that fits, without a gap along one that does not. */
   function clampPan(image, aspect) {
-    const shown = visibleRectangle(image, aspect);
+    const part = visibleRectangle(image, aspect);
+    const [above, below] = covered();
     const clamp = (centre, share) =>
       share >= 1 ? 0.5 : Math.min(Math.max(centre, share / 2 - 0.01), 1.01 - share / 2);
-    view.x = clamp(view.x, shown.width / image.width);
-    view.y = clamp(view.y, shown.height / image.height);
+    view.x = clamp(view.x, part.width / image.width);
+    view.y = clamp(view.y, (part.height * (1 - above - below)) / image.height);
   }
 
   /** Give the camera an off-axis frustum; called from inside its own updateProjectionMatrix. */
@@ -69,7 +161,7 @@
       return;
     }
     clampPan(image, camera.aspect);
-    const shown = visibleRectangle(image, camera.aspect);
+    const part = visibleRectangle(image, camera.aspect);
     const t = Math.tan((camera.fov * Math.PI) / 360) / camera.zoom;
     const a = t * camera.aspect;
     camera.near = 0.5 * image.depth;
@@ -77,8 +169,8 @@
     camera.far = 1.5 * image.depth;
     camera.view = {
       enabled: true, fullWidth: 1, fullHeight: 1,
-      offsetX: (shown.left + a) / (2 * a), offsetY: (shown.top + t) / (2 * t),
-      width: shown.width / (2 * a), height: shown.height / (2 * t),
+      offsetX: (part.left + a) / (2 * a), offsetY: (part.top + t) / (2 * t),
+      width: part.width / (2 * a), height: part.height / (2 * t),
     };
   }
 
@@ -97,6 +189,31 @@
     refresh();
   }
 
+  /** A sphere around the lens, its frame and the tips of the arms, in the shown camera's axes [m]. */
+  function sceneBounds(depth) {
+    const low = [-depth / 2, -depth / 2, 0];
+    const high = [depth / 2, depth / 2, depth];
+    const root = viser().nodeRefFromName[""];
+    const inverse = root.matrixWorld.clone().invert();
+    viser().nodeRefFromName["/world"]?.traverse((child) => {
+      if (!child.isMesh || !child.geometry?.attributes?.position) return;
+      child.geometry.computeBoundingBox?.();
+      const box = child.geometry.boundingBox;
+      if (!box) return;
+      for (const corner of [box.min, box.max]) {
+        const at = corner.clone().applyMatrix4(child.matrixWorld).applyMatrix4(inverse).toArray();
+        // A shaft is longer than anybody wants to see; what lies far behind the picture does not count.
+        if (Math.hypot(...at) > 14 * depth) continue;
+        at.forEach((value, axis) => {
+          low[axis] = Math.min(low[axis], value);
+          high[axis] = Math.max(high[axis], value);
+        });
+      }
+    });
+    const centre = low.map((value, axis) => (value + high[axis]) / 2);
+    return { centre, radius: Math.hypot(...high.map((value, axis) => value - low[axis])) / 2 };
+  }
+
   function showScene() {
     const mutable = viser();
     const image = imageRectangle();
@@ -104,11 +221,14 @@
     view.endoscope = false;
     mutable.cameraControl.enabled = true;
     Object.assign(mutable.camera, { near: 0.1 * image.depth, far: 2000 * image.depth });
-    // From above and behind the lens, looking at where instruments usually are: some frame distances ahead.
+    // From above and beside, as far away as it takes to see the lens, its frame and what of the arms is near them.
     const root = mutable.nodeRefFromName[""];
-    const place = (x, y, z) => mutable.camera.position.clone().set(x, y, z)
-      .multiplyScalar(image.depth).applyMatrix4(root.matrixWorld);
-    const [from, to] = [place(4.4, -2.6, -1.6), place(0, 0.2, 2.6)];
+    const place = (x, y, z) => mutable.camera.position.clone().set(x, y, z).applyMatrix4(root.matrixWorld);
+    const { centre, radius } = sceneBounds(image.depth);
+    const aspect = Math.min(mutable.camera.aspect, 1);
+    const away = (1.15 * radius) / (Math.tan((mutable.camera.fov * Math.PI) / 360) * aspect);
+    const towards = [0.62, -0.48, -0.62].map((value, axis) => centre[axis] + value * away);
+    const [from, to] = [place(...towards), place(...centre)];
     mutable.cameraControl.setLookAt(from.x, from.y, from.z, to.x, to.y, to.z, true);
     refresh();
   }
@@ -127,9 +247,12 @@
         <button data-do="out" title="Zoom out" aria-label="Zoom out">−</button><output></output>
         <button data-do="in" title="Zoom in (wheel over the picture)" aria-label="Zoom in">+</button>
         <button data-do="fit" title="Show the whole picture (double click)">Fit</button>
-      </span>`;
+      </span>
+      <button data-do="theme" title="Light or dark" aria-label="Light or dark">◐</button>
+      <button data-do="help" title="Keys (?)" aria-label="Keys">?</button>`;
     const actions = {
       endoscope: showEndoscope, scene: showScene, fit: showEndoscope,
+      theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
@@ -165,11 +288,12 @@
     const image = imageRectangle();
     const camera = viser()?.camera;
     if (!image || !camera || !view.endoscope) return;
+    const [above, below] = covered();
     const before = visibleRectangle(image, camera.aspect);
     view.zoom = Math.min(Math.max(view.zoom * factor, 1), 40);
     const after = visibleRectangle(image, camera.aspect);
     view.x += ((u - 0.5) * (before.width - after.width)) / image.width;
-    view.y += ((v - 0.5) * (before.height - after.height)) / image.height;
+    view.y += ((v - above - (1 - above - below) / 2) * (before.height - after.height)) / image.height;
     refresh();
   }
 
@@ -183,19 +307,15 @@
       return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     };
     let last = null;
-    let pointing = false;
+    let pointing = null; // index of the camera in whose image something is dragged
     let place = null;
+    let pressed = null; // where the picture was pressed, and nothing else began
     /** Say where in the image the pointer is, at most 30 times a second, the last place always. */
     const point = (event) => {
-      const image = imageRectangle();
-      if (!image) return;
-      const shown = visibleRectangle(image, viser().camera.aspect);
-      const [u, v] = share(event);
+      const found = imageAt(event, pointing);
+      if (!found) return;
       if (!place) setTimeout(() => { report("pointed", place.join(" ")); place = null; }, 33);
-      place = [
-        (shown.left + u * shown.width - image.left) / image.width,
-        (shown.top + v * shown.height - image.top) / image.height,
-      ];
+      place = [found[1], found[2], found[0]];
     };
     window.addEventListener("wheel", (event) => {
       if (!inPicture(event)) return;
@@ -205,31 +325,40 @@
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
       if (!inPicture(event) || (painting(event) && event.button === 0)) return;
-      pointing = event.shiftKey && event.button === 0;
-      if (pointing) point(event);
+      const at = imageAt(event);
+      pointing = event.shiftKey && event.button === 0 ? (at?.[0] ?? shown.active) : null;
+      pressed = pointing === null && event.button === 0 && at ? [at[0], event.clientX, event.clientY] : null;
+      if (pointing !== null) point(event);
       else last = share(event);
     }, { capture: true });
     window.addEventListener("pointermove", (event) => {
-      if (pointing) point(event);
+      if (pointing !== null) point(event);
       const image = imageRectangle();
       if (!last || !view.endoscope || !image) return;
       const now = share(event);
-      const shown = visibleRectangle(image, viser().camera.aspect);
-      view.x -= ((now[0] - last[0]) * shown.width) / image.width;
-      view.y -= ((now[1] - last[1]) * shown.height) / image.height;
+      const part = visibleRectangle(image, viser().camera.aspect);
+      view.x -= ((now[0] - last[0]) * part.width) / image.width;
+      view.y -= ((now[1] - last[1]) * part.height) / image.height;
       last = now;
       refresh();
     }, { capture: true });
-    window.addEventListener("pointerup", () => {
-      if (pointing) { grabbed = true; letGo(); }
-      last = null;
-      pointing = false;
+    window.addEventListener("pointerup", (event) => {
+      if (pointing !== null) { grabbed = true; letGo(); }
+      // A click on another camera's image chooses that camera.
+      if (pressed && Math.hypot(event.clientX - pressed[1], event.clientY - pressed[2]) < 4) activate(pressed[0]);
+      last = pressed = pointing = null;
     }, { capture: true });
     window.addEventListener("click", (event) => {
-      const timeline = event.target instanceof Element && event.target.closest(".carts-timeline");
-      if (!timeline) return;
-      const box = timeline.getBoundingClientRect();
-      report("picked", String((event.clientX - box.left) / box.width));
+      const target = event.target instanceof Element ? event.target : null;
+      const frame = target?.closest("[data-frame]");
+      const timeline = target?.closest("svg.carts-timeline");
+      if (frame) {
+        event.preventDefault();
+        report("picked", frame.dataset.frame);
+      } else if (timeline) {
+        const box = timeline.getBoundingClientRect();
+        report("picked", String(Math.floor(((event.clientX - box.left) / box.width) * timeline.dataset.frames)));
+      }
     }, { capture: true });
     window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }
@@ -238,6 +367,11 @@
 
   const tab = Math.random().toString(36).slice(2);
   let reports = 0;
+
+  /** Choose the camera that edits are about. */
+  function activate(index) {
+    if (index !== shown.active) report("activated", String(index));
+  }
 
   /** Put a new text into one of the invisible fields that the server listens to. */
   function report(field, text = "") {
@@ -274,6 +408,24 @@
     }
   }
 
+  // ---- Keys go to the page again after a list, a box or a button was used with the pointer ------------------------------
+
+  window.addEventListener("click", (event) => {
+    const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
+    if (!used || event.detail === 0 || used.closest("[role=dialog]")) return;
+    const list = used.matches("[role=option]"); // its field has the focus then, and is no longer about typing
+    setTimeout(() => {
+      const focused = document.activeElement;
+      if (list || focused?.matches("button, input[type=checkbox]")) focused?.blur();
+    }, 60);
+  }, { capture: true });
+
+  // ---- Say when nobody listens any more ------------------------------------------------------------------------------
+
+  /** While there is no connection, viser's client replaces what sends by a function that only writes to the log. */
+  const connected = () => !/not connected/i.test(String(viser()?.sendMessage));
+  setInterval(() => document.body.classList.toggle("carts-offline", Boolean(viser()?.canvas) && !connected()), 300);
+
   // ---- Keep hold of the camera, which viser may replace ------------------------------------------------------------
 
   let held = null;
@@ -293,8 +445,12 @@
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
     if (view.endoscope) mutable.camera.layers.disable(SCENE_LAYER);
     else mutable.camera.layers.enable(SCENE_LAYER);
+    mutable.nodeRefFromName[OTHERS]?.traverse((child) => child.layers.set(ENDOSCOPE_LAYER));
+    if (view.endoscope) mutable.camera.layers.enable(ENDOSCOPE_LAYER);
+    else mutable.camera.layers.disable(ENDOSCOPE_LAYER);
+    arrange();
     // A new camera or image size changes the plane, which three.js does not report.
-    const now = JSON.stringify([view.endoscope, imageRectangle()]);
+    const now = JSON.stringify([view.endoscope, imageRectangle(), covered()]);
     if (now !== shape) { shape = now; refresh(); }
     reportDrawn();
   }
@@ -306,7 +462,15 @@
   })();
 
   window.carts = {
-    view, showEndoscope, showScene,
+    view, imageAt, activate, connected,
+    shown: () => shown,
+    /** What the server says of cameras, frame and marks; other scripts listen to it, too. */
+    setPage(message) {
+      shown = message;
+      document.dispatchEvent(new CustomEvent("carts-page", { detail: message }));
+      refresh();
+    },
+    showEndoscope, showScene,
     toggleView: () => (view.endoscope ? showScene() : showEndoscope()),
     zoomAt, imageOnScreen, report,
     drawnOverlay: () => drawnTexture,

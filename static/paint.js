@@ -85,6 +85,11 @@
     if (event.button !== 0) return;
     const point = inImage(event);
     if (!point) return;
+    const at = window.carts.imageAt(event);
+    if (!drawing && at && at[0] !== window.carts.shown().active) {
+      window.carts.activate(at[0]);
+      return;
+    }
     event.preventDefault();
     document.activeElement?.blur?.();
     shift = event.shiftKey;

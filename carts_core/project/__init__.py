@@ -13,6 +13,7 @@ from .place import default_path as default_path
 from .place import rescued_copies as rescued_copies
 from .project import Project as Project
 from .queries import between_kept as between_kept
+from .queries import by_hand as by_hand
 from .queries import frames_in as frames_in
 from .queries import next_unreviewed as next_unreviewed
 from .queries import worst_first as worst_first

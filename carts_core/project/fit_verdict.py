@@ -27,6 +27,8 @@ class FitVerdict(JsonValue):
     """What to try, for people; empty where nothing has to be."""
     failure: float = 0.0
     """Probability that the mask is wrong (Dice below 0.9) [1]."""
+    cameras: tuple[tuple[str, float], ...] = ()
+    """The same in single cameras, by their names, where there are several."""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -34,5 +36,7 @@ class FitVerdict(JsonValue):
         for text in (self.reason, self.remedy):
             if not isinstance(text, str) or len(text) > LONGEST_TEXT:
                 raise ProjectError(f"reason and remedy must be texts of at most {LONGEST_TEXT} characters. Shorten it.")
-        if not (isinstance(self.failure, float | int) and 0.0 <= self.failure <= 1.0):
-            raise ProjectError(f"the probability of a failure is {self.failure!r}. Give a number from 0 to 1.")
+        object.__setattr__(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
+        for value in (self.failure, *(value for _, value in self.cameras)):
+            if not (isinstance(value, float | int) and 0.0 <= value <= 1.0):
+                raise ProjectError(f"the probability of a failure is {value!r}. Give a number from 0 to 1.")

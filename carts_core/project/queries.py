@@ -5,7 +5,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable
 
 from .state import ProjectState
-from .values import Figures, ReviewState
+from .values import Figures, ReviewState, Source
 
 UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
 """States in which nobody has judged the frame yet."""
@@ -14,6 +14,13 @@ UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
 def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> list[int]:
     """Indices of the frames in one of these review states, in order."""
     return [index for index in range(len(state.identity.frame_ids)) if state.review(index).state in review_states]
+
+
+def by_hand(state: ProjectState, frame: int) -> bool:
+    """Whether a person has moved the frame's arms, and nobody has said anything about it yet."""
+    record = state.records.get(frame)
+    untouched = record is not None and record.review.state is ReviewState.UNTOUCHED
+    return record is not None and untouched and Source.HAND in record.sources
 
 
 def next_unreviewed(state: ProjectState, after: int, step: int = 1) -> int | None:

@@ -109,7 +109,11 @@ class ProjectState:
         changed = {key: value for key, value in edits.items() if self.get(key) != value}
         moved = {key.frame for key in changed if key.kind not in _MARKS}
         for key, value in edits.items():
-            if key.kind is Kind.VERDICT and (key.frame in moved or self.verdict(key.frame) != value):
+            if (
+                key.kind is Kind.VERDICT
+                and value is not None
+                and (key.frame in moved or self.verdict(key.frame) != value)
+            ):
                 changed[key] = value
         return changed
 

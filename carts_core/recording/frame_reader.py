@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from .sequence import CACHE_BYTES, Frame, Sequence
 
@@ -22,25 +22,25 @@ class FrameReader:
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
         self._lock = threading.Lock()
-        self._plan: deque[tuple[int, str, str]] = deque()
+        self._plan: deque[tuple[int, str, tuple[str, ...]]] = deque()
         self._thread: threading.Thread | None = None
         self._closed = False
         self._last: int | None = None
         self._stride = 1
 
-    def frame(self, index: int, domain: str, camera: str) -> Frame:
-        """One frame with the image of one camera.
+    def frame(self, index: int, domain: str, *cameras: str) -> Frame:
+        """One frame with the images of some cameras.
 
         Raises:
             SequenceError: there is no such frame, domain or camera, or the image is not usable.
         """
         self._replace_plan(())
-        frame = self._sequence.frame(index, domain, [camera])
+        frame = self._sequence.frame(index, domain, list(cameras))
         moved = 0 if self._last is None else index - self._last
         self._last = index
         if moved:
             self._stride = moved if abs(moved) <= LONGEST_STRIDE else 1
-        self._replace_plan((row, domain, camera) for row in self._neighbours(index, camera))
+        self._replace_plan((row, domain, cameras) for row in self._neighbours(index, cameras))
         return frame
 
     def close(self) -> None:
@@ -52,15 +52,15 @@ class FrameReader:
         if thread is not None:
             thread.join()
 
-    def _neighbours(self, index: int, camera: str) -> list[int]:
+    def _neighbours(self, index: int, cameras: Collection[str]) -> list[int]:
         """Numbers of the frames that will probably be asked for next, the likeliest first."""
-        own = self._sequence.scene.camera(camera)
+        sizes = [own.width * own.height for own in self._sequence.scene.cameras if own.name in cameras]
         # An image, a mask; and no more than half of the cache, or they would push out what was seen last.
-        ahead = min(AHEAD, CACHE_BYTES // 2 // (4 * own.width * own.height))
+        ahead = min(AHEAD, CACHE_BYTES // 2 // max(4 * sum(sizes), 1))
         rows = [index + self._stride * count for count in range(1, ahead + 1)] + [index - self._stride]
         return [row for row in rows if 0 <= row < len(self._sequence)]
 
-    def _replace_plan(self, plan: Iterable[tuple[int, str, str]]) -> None:
+    def _replace_plan(self, plan: Iterable[tuple[int, str, tuple[str, ...]]]) -> None:
         with self._lock:
             self._plan = deque(() if self._closed else plan)
             if self._plan and self._thread is None:
@@ -73,8 +73,8 @@ class FrameReader:
                 if not self._plan:
                     self._thread = None
                     return
-                index, domain, camera = self._plan.popleft()
+                index, domain, cameras = self._plan.popleft()
             try:
-                self._sequence.frame(index, domain, [camera])
+                self._sequence.frame(index, domain, list(cameras))
             except Exception:  # Whoever asks for this frame meets the same.
                 continue

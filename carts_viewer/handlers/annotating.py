@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatchmethod
 
+import torch
+
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
@@ -45,6 +47,10 @@ class AnnotatingHandler:
         """The keypoint under somebody's pointer."""
         self._pinned_from: SceneState | None = None
         """The pose before the first of the present pins."""
+        self._fitted: SceneState | None = None
+        """The pose that the present pins have led to."""
+        self._worst: int | None = None
+        """The frame that `ShowWorse` went to last; None after anything else has shown another one."""
 
     @singledispatchmethod
     def handle(self, intent: intents.Annotation) -> None:
@@ -122,11 +128,13 @@ class AnnotatingHandler:
         frames = range(len(project.identity.frame_ids))
         open_ones = [i for i in frames if i == state.index or project.review(i).state not in _SETTLED]
         order = worst_first(project, open_ones)
-        place = order.index(state.index) + (1 if intent.step > 0 else -1)
         if len(order) == 1:
             raise CartsError("Every other frame is accepted or rejected.")
-        # Whoever begins on a frame that is settled begins with the worst one.
-        self._go(order[place % len(order)])
+        # Who comes from elsewhere begins with the worst one; who is there already, with the one after it.
+        begins = self._worst != state.index and order[0] != state.index
+        place = 0 if begins else (order.index(state.index) + (1 if intent.step > 0 else -1)) % len(order)
+        self._go(order[place])
+        self._worst = order[place]
 
     def _review(self, state: ReviewState) -> None:
         note = self._context.state.review.note
@@ -176,25 +184,33 @@ class AnnotatingHandler:
     def _(self, intent: intents.PointAt) -> None:
         self._open_run.end("Stopped: the pose was changed by hand")
         state = self._context.state
-        camera = self._session.scene.camera(state.camera)
+        camera = self._session.scene.camera(intent.camera or state.camera)
         if not (math.isfinite(intent.u) and math.isfinite(intent.v)):
             raise CartsError(f"({intent.u}, {intent.v}) is no place in the image.")
         pixel = min(max(intent.u, 0.0), float(camera.width)), min(max(intent.v, 0.0), float(camera.height))
-        self._held = self._held or state.keypoints.chosen or self._nearest(pixel)
+        self._held = self._held or state.keypoints.chosen or self._nearest(pixel, camera.name)
         pin = Pin(self._keypoints[self._held], camera.name, pixel)
         others = [old for old in state.keypoints.pins if (old.keypoint, old.camera) != (pin.keypoint, pin.camera)]
-        if not state.keypoints.pins or self._pinned_from is None:
+        if not state.keypoints.pins or self._pinned_from is None or self._moved_since(state.pose.scene):
             self._pinned_from = state.pose.scene
         pins = (*others, pin)
         fit = fit_keypoints(self._session.scene, self._pinned_from, pins)
+        self._fitted = fit.state
         placed = replace(state.keypoints, shown=True, pins=pins, residuals=fit.residuals)
         self._context.change(keypoints=placed)
         gesture = (intents.PointAt, pin.keypoint, pin.camera)
         self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
 
-    def _nearest(self, pixel: tuple[float, float]) -> str:
+    def _moved_since(self, scene: SceneState) -> bool:
+        """Whether something else, a run, has moved the arms since they were fitted to pins."""
+        if self._fitted is None:
+            return True
+        pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
+        return not all(torch.allclose(one, other, atol=1e-5) for one, other in pairs)
+
+    def _nearest(self, pixel: tuple[float, float], camera: str) -> str:
         state = self._context.state
         points = list(self._keypoints.values())
-        shown = project_keypoints(self._session.scene, state.pose.scene, points, state.camera)
+        shown = project_keypoints(self._session.scene, state.pose.scene, points, camera)
         distances = (shown - shown.new_tensor(pixel)).norm(dim=-1).nan_to_num(math.inf)
         return list(self._keypoints)[int(distances.argmin())]

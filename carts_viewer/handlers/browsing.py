@@ -4,11 +4,13 @@ import logging
 import time
 from dataclasses import replace
 from functools import singledispatchmethod
+from typing import Any
 
 from carts_core.errors import SequenceError
 from carts_core.project import Key, TimeOffset
 from carts_viewer import intents
 from carts_viewer.checks import clamped, finite, one_of, unknown
+from carts_viewer.compare import Against
 from carts_viewer.context import Context, OpenRun
 from carts_viewer.state import RunState
 
@@ -123,6 +125,25 @@ class BrowsingHandler:
     @handle.register
     def _(self, intent: intents.ShowCamera) -> None:
         self.show(camera=intent.camera)
+
+    @handle.register
+    def _(self, intent: intents.ShowBeside) -> None:
+        self._context.change(beside=not self._context.state.beside if intent.on is None else intent.on)
+
+    @handle.register
+    def _(self, intent: intents.CompareWith) -> None:
+        self._compare(against=None if intent.against is None else Against(intent.against))
+
+    @handle.register
+    def _(self, intent: intents.SetSwipe) -> None:
+        self._compare(swipe=clamped(intent.share, 0.0, 1.0))
+
+    @handle.register
+    def _(self, intent: intents.Peek) -> None:
+        self._compare(peek=bool(intent.on))
+
+    def _compare(self, **changes: Any) -> None:
+        self._context.change(compare=replace(self._context.state.compare, **changes))
 
     @handle.register
     def _(self, intent: intents.ShowLayer) -> None:

@@ -5,21 +5,26 @@ from functools import singledispatchmethod
 from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.project import Edits, Key, Review, ReviewState
-from carts_core.settings import SolverName
+from carts_core.optimization import Iterate
+from carts_core.project import Edits, FitVerdict, Key, Review, ReviewState
+from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer import intents
+from carts_viewer.active_run import ActiveRun
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context
+from carts_viewer.fit_check import FitCheck
 from carts_viewer.layers import Layer
-from carts_viewer.running import ActiveRun, OptimizerFactory
+from carts_viewer.presets import PRESETS
+from carts_viewer.running import OptimizerFactory
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
 
 _REASONS = {
     "iterations": "Done, best iterate kept",
     "not optimized": "Evaluated only, as the solver says",
-    "converged": "Converged",
+    "converged": "Ended: no step lowers the loss any more",
+    "failed": "Ended: the image contradicts what was found",
     "start kept": "Start kept: it explains the image as well",
     "cancelled": "Cancelled",
 }
@@ -32,6 +37,7 @@ class OptimizingHandler:
         self._context = context
         self._session = context.session
         self._optimizers = optimizers
+        self._check = FitCheck(context.session, optimizers)
         self._run: ActiveRun | None = None
         self._before: Edits | None = None
         """What brings the frame back to where the last run began."""
@@ -95,7 +101,7 @@ class OptimizingHandler:
             # Without weights, say, there is nothing to show, and trying again with every picture would not help.
             self._context.change(layer=Layer.MASK)
             raise
-        self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras), busy=None)
+        self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
@@ -143,10 +149,22 @@ class OptimizingHandler:
                 settings = changed(settings, {intent.name: intent.value}, "the solver")
         except SettingsError as error:
             # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
-            self._context.change(settings_error=str(error))
+            self._context.change(settings_error=str(error), settings_field=intent.name)
             return
         self.end("Settings changed; Run starts anew from here")
-        self._context.change(settings=settings, solver=solver, settings_error=None, maps=None)
+        self._context.change(settings=settings, solver=solver, settings_error=None, settings_field=None, maps=None)
+
+    @handle.register
+    def _(self, intent: intents.ResetSettings) -> None:
+        preset = PRESETS.get(intent.preset)
+        if preset is None:
+            raise SettingsError(f"There is no preset {intent.preset!r}; there are: {', '.join(PRESETS)}.")
+        state = self._context.state
+        settings = named_solver(state.solver)
+        if isinstance(settings, SurfaceSolver):
+            settings = replace(settings, **preset.changes(settings))
+        self.end("Settings changed; Run starts anew from here")
+        self._context.change(settings=settings, settings_error=None, settings_field=None, maps=None)
 
     @handle.register
     def _(self, intent: intents.SetFreeJoint) -> None:
@@ -183,9 +201,9 @@ class OptimizingHandler:
             raise CartsError("Many frames are being solved. Wait, or stop that first.")
         self._run = self._make(self._context.cameras)
         self._context.save()
-        self._context.forget_pins()
         self._before = self._session.saved(self._context.state.index)
-        self._context.change(run=RunState(Phase.RUNNING), playing=False, error=None, busy=None)
+        run = RunState(Phase.RUNNING, start=self._context.state.pose.scene)
+        self._context.change(run=run, playing=False, error=None, busy=None)
 
     def _iterate(self) -> None:
         run = self._run
@@ -195,8 +213,10 @@ class OptimizingHandler:
         if iterate is None:
             best, reason = run.best(), run.stop_reason
             if best is not None:
-                self._accept(run, best)
-            self.end(run.verdict() or _REASONS.get(reason or "", reason))
+                self._accept(run, best, self._verdict(run, best))
+                curves = self._context.state.run.curves
+                self._set(curves=replace(curves, loss=run.comparable_losses(), comparable=True))
+            self.end(_REASONS.get(reason or "", reason))
             self._set(base_frame_gain=run.base_frame_gain())
             return
         self._accept(run, iterate)
@@ -205,19 +225,44 @@ class OptimizingHandler:
         self._set(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
+                run.stages,
+                False,
                 (*curves.scores, self._context.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
                 best.index if best else 0,
             )
         )
 
-    def _accept(self, run: ActiveRun, iterate: Any) -> None:
+    def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
+        """On the end of a run: what its own cameras say, and where there are several, what each of all says alone."""
+        own = run.verdict()
+        if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
+            return own
+        state = self._context.state
+        try:
+            found = self._check.fit(state.index, state.domain, run.pose(end), state.settings).verdict
+        except CartsError:
+            # A solver that needs no surface network has run without one.
+            return own
+        return found
+
+    @handle.register
+    def _(self, intent: intents.Assess) -> None:
+        self.end("Stopped: the fit was checked")
+        state = self._context.state
+        found = self._check.fit(state.index, state.domain, state.pose, state.settings)
+        self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
+        self._context.change(busy=None)
+
+    def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:
         """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
         state = self._context.state
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
         review = self._session.editor.project.state.review(state.index)
         if review.state is ReviewState.UNTOUCHED:
             edits[Key.review(state.index)] = Review(ReviewState.OPTIMIZED, review.note)
+        # An earlier verdict was on another pose.
+        edits[Key.verdict(state.index)] = verdict
         maps = Maps(iterate, run.cameras)
         self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
 

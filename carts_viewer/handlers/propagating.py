@@ -5,18 +5,17 @@ from dataclasses import replace
 from functools import singledispatchmethod
 from typing import Any
 
-import numpy as np
-
 from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
-from carts_core.project import Edits, Figures, Key, Keyframe, ProjectState, Review, ReviewState, between_kept
+from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kept
 from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun
-from carts_viewer.running import OptimizerFactory, SequenceRun
-from carts_viewer.session import joint_correction
-from carts_viewer.state import SolveState
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.sequence_run import SequenceRun
+from carts_viewer.solved import Comparison, Outcome, reviewed, unchecked
+from carts_viewer.state import ListedFrame, SolveState
 
 
 class PropagatingHandler:
@@ -27,6 +26,9 @@ class PropagatingHandler:
         self._open_run = run
         self._session = context.session
         self._optimizers = optimizers
+        self._comparison = Comparison(context.session, context.renderer, optimizers)
+        self._held: dict[int, Outcome] = {}
+        """Frames that would fit worse than before, and are as they were."""
         self._run: SequenceRun | None = None
         self._work: Iterator[None] = iter(())
         self._before: ProjectState = context.session.editor.view
@@ -130,7 +132,7 @@ class PropagatingHandler:
         )
 
     def _bits(self, run: SequenceRun) -> Iterator[None]:
-        dice: dict[int, float | None] = {}
+        outcomes: dict[int, Outcome] = {}
         try:
             while run.step():
                 self._check_calibration()
@@ -139,24 +141,24 @@ class PropagatingHandler:
             for index, estimate in run.estimates().items():
                 if run.cancelled:
                     break
-                dice[index] = self._dice(estimate)
-                self._report(text=f"Comparing with the truth, frame {len(dice)} of {run.done}")
+                if self._solved(estimate):
+                    outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
+                    self._context.change(busy=None)
+                    self._check_calibration()
+                self._report(text=f"Comparing with how it was, frame {len(outcomes)} of {run.done}")
                 yield
         finally:
             # An image that is missing in the end does not cost what was solved before it.
             if self._run is run:
                 self._run = None
                 self._report(running=False, text="")
-                self._report(text=self._save(run, dice))
+                self._report(text=self._save(run, outcomes))
 
-    def _dice(self, estimate: FrameEstimate) -> float | None:
-        state, sequence = self._context.state, self._session.sequence
-        if not sequence.has_masks(state.camera, state.domain):
-            return None
-        frame = sequence.frame(estimate.index, state.domain, [state.camera])
-        scene = self._session.with_joints(state.pose.scene, estimate.joint_positions)
-        correction = self._session.editor.view.get(Key.mask_correction(estimate.index, state.camera))
-        return self._context.renderer.scores(scene, frame, state.camera, correction).dice
+    def _solved(self, estimate: FrameEstimate) -> bool:
+        """Whether an estimate is for the project: what somebody has done to a frame meanwhile counts more."""
+        now, index = self._session.editor.view, estimate.index
+        kept = estimate.start == "keyframe" or index in now.kept_frames
+        return not kept and now.joints(index) == self._before.joints(index)
 
     def _check_calibration(self) -> None:
         now = self._session.editor.view
@@ -166,36 +168,60 @@ class PropagatingHandler:
                 "The calibration was changed meanwhile, so the solved frames do not fit. Solve them again."
             )
 
-    def _save(self, run: SequenceRun, dice: Mapping[int, float | None]) -> str:
-        """Save all frames that were solved as one step, and say so."""
+    def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
+        """Save the frames that fit no worse than before as one step, list the others, and say so."""
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         figures: dict[int, Figures] = {}
-        now, kept = self._session.editor.view, set(self._session.editor.view.kept_frames)
+        listed: list[ListedFrame] = []
+        self._held = {}
+        now = self._session.editor.view
         for index, estimate in run.estimates().items():
-            # What somebody has done to a frame meanwhile counts more.
-            if estimate.start != "keyframe" and index not in kept and now.joints(index) == self._before.joints(index):
-                edits.update(_edits(estimate, run, now.review(index)))
-                figures[index] = Figures(estimate.loss, dice.get(index))
-        if not figures:
+            if not self._solved(estimate):
+                continue
+            outcome = outcomes.get(index) or unchecked(estimate, run)
+            if outcome.held:
+                self._held[index] = outcome
+            else:
+                edits.update({**outcome.edits, **reviewed(index, now.review(index))})
+                figures[index] = outcome.figures
+            if outcome.remark is not None:
+                listed.append(ListedFrame(index, outcome.remark, not outcome.held))
+        self._report(listed=tuple(sorted(listed, key=lambda frame: frame.index)))
+        count = len(figures) + len(self._held)
+        if not count:
             return "Stopped before a frame was solved"
-        first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
-        self._session.editor.project.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
+        if figures:
+            first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
+            self._session.editor.project.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
+            self._context.refresh()
+        text = f"{'Stopped: ' if run.cancelled else ''}{len(figures)} frames solved, one step of undo"
+        return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
+
+    @handle.register
+    def _(self, intent: intents.TakeSolved) -> None:
+        now = self._session.editor.view
+        taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
+        taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
+        if not taken:
+            raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list is gone.")
+        self._open_run.end("Stopped: solved frames are taken")
+        self._context.save()
+        edits: dict[Key[Any], Any] = {}
+        for index, outcome in taken.items():
+            edits.update({**outcome.edits, **reviewed(index, now.review(index))})
+            del self._held[index]
+        figures = {index: outcome.figures for index, outcome in taken.items()}
+        self._session.editor.project.apply(f"Take {len(taken)} solved frames", edits, figures)
+        listed = self._context.state.solve.listed if self._context.state.solve else ()
+        self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()
-        return f"{'Stopped: ' if run.cancelled else ''}{len(figures)} frames solved, one step of undo"
+
+    @handle.register
+    def _(self, intent: intents.DropSolved) -> None:
+        self._held = {}
+        self._report(listed=())
 
     def _report(self, **changes: Any) -> None:
         if self._context.state.solve is not None:
             self._context.change(solve=replace(self._context.state.solve, **changes))
-
-
-def _edits(estimate: FrameEstimate, run: SequenceRun, review: Review) -> Edits:
-    edits: dict[Key[Any], Any] = {}
-    for arm, std in estimate.joint_std.items():
-        # An arm that was not free stays as it is.
-        if np.isfinite(std).any():
-            correction = joint_correction(estimate.joint_positions[arm], run.provenance, std)
-            edits[Key.joints(estimate.index, arm)] = correction
-    if review.state is ReviewState.UNTOUCHED:
-        edits[Key.review(estimate.index)] = Review(ReviewState.OPTIMIZED, review.note)
-    return edits

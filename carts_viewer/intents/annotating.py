@@ -93,6 +93,8 @@ class PointAt(Annotation, Latest):
     """Column [px]."""
     v: float
     """Row [px]."""
+    camera: str | None = None
+    """In whose image; None: the shown one's."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from carts_viewer.compare import Against
 from carts_viewer.intents.base import Intent, Latest
 from carts_viewer.layers import Layer
 
@@ -58,6 +59,34 @@ class ShowCamera(Browsing, Latest):
     """Look through this camera; joints stay as they are."""
 
     camera: str
+
+
+@dataclass(frozen=True)
+class ShowBeside(Browsing):
+    """Show the other cameras' images beside the active one's, or not; None changes over."""
+
+    on: bool | None = None
+
+
+@dataclass(frozen=True)
+class CompareWith(Browsing, Latest):
+    """Compare the pose with another one; None: with none."""
+
+    against: Against | None
+
+
+@dataclass(frozen=True)
+class SetSwipe(Browsing, Latest):
+    """Show the other pose up to this share of the picture's width, 0..1."""
+
+    share: float
+
+
+@dataclass(frozen=True)
+class Peek(Browsing):
+    """Show the other pose all over, or no more."""
+
+    on: bool
 
 
 @dataclass(frozen=True)

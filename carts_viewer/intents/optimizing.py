@@ -38,6 +38,11 @@ class Reset(Optimizing):
 
 
 @dataclass(frozen=True)
+class Assess(Optimizing):
+    """Say how well the shown pose fits the images, and move nothing."""
+
+
+@dataclass(frozen=True)
 class SetSetting(Optimizing):
     """Change one field of the optimizer's settings."""
 
@@ -48,6 +53,14 @@ class SetSetting(Optimizing):
     def key(self) -> Hashable:
         """One slot per field."""
         return (SetSetting, self.name)
+
+
+@dataclass(frozen=True)
+class ResetSettings(Optimizing):
+    """Set all settings of the chosen solver to those of a preset."""
+
+    preset: str
+    """One of `presets.PRESETS`."""
 
 
 @dataclass(frozen=True)

@@ -36,3 +36,15 @@ class SetDirection(Propagating):
     """Choose where solving begins: at the first frame, or at the last one."""
 
     direction: Direction
+
+
+@dataclass(frozen=True)
+class TakeSolved(Propagating):
+    """Take what was solved of a frame that was kept as it was, because it fits worse; None: of all of them."""
+
+    index: int | None = None
+
+
+@dataclass(frozen=True)
+class DropSolved(Propagating):
+    """Leave the listed frames as they are, and forget the list."""

@@ -1,5 +1,7 @@
 """Which frame, domain and camera are shown, and playing."""
 
+from datetime import UTC, datetime
+
 import viser
 
 from carts_core.project import Source
@@ -27,6 +29,8 @@ class BrowsePanel:
         self._session = session
         self._waits = waits
         self._count = len(sequence)
+        stamps = sequence.timestamps
+        self._began = 0.0 if stamps is None else float(stamps[0])
         # Shown on while those of a newer pose are being computed, or the line would jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
@@ -85,10 +89,23 @@ class BrowsePanel:
             _SOURCES[state.pose.source],
         ]
         if state.frame.timestamp is not None:
-            parts.append(f"at {state.frame.timestamp:.3f} s")
+            parts.append(_time(state.frame.timestamp, self._began))
         scores = self._scores = state.scores or self._scores
         if scores.dice is not None:
             parts.append(f"Dice <b>{scores.dice:.3f}</b>")
         if scores.joint_degrees is not None:
             parts.append(f"joint error <b>{scores.joint_degrees:.2f}°</b>")
         return " · ".join(parts)
+
+
+_CALENDAR = 1e8
+"""Times from here on are counted from 1970, as ROS does, and read as dates [s]."""
+
+
+def _time(stamp: float, began: float) -> str:
+    """When a frame was taken, as people read it: since the first one, and the date where it is known."""
+    since = f"{stamp - began:.3f} s after the first"
+    if stamp < _CALENDAR:
+        return f"at {stamp:.3f} s"
+    date = f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return f'<span title="{stamp:.6f} s since 1970">{since}, {date}</span>'

@@ -5,6 +5,7 @@ import viser
 from carts_core.export import FORMATS
 from carts_core.project import ProjectState, ReviewState, frames_in
 from carts_viewer import intents
+from carts_viewer.export_warnings import export_warnings
 from carts_viewer.handlers.exporting import FRAME_CHOICES
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.session import Session
@@ -27,6 +28,7 @@ class ExportPanel:
     def __init__(self, page: Page, session: Session, storage: Storage, emit: Emit) -> None:
         gui = page.server.gui
         cameras = len(session.scene.cameras)
+        self._camera_names = [camera.name for camera in session.scene.cameras]
         self._kept = storage.scratch is None
         self._formats = {known.label: name for name, known in FORMATS.items()}
         self._counted: ProjectState | None = None
@@ -50,7 +52,7 @@ class ExportPanel:
         on_click(self._export, lambda _: self._intent(), emit)
         on_click(self._cancel, lambda _: intents.CancelExport(), emit)
         on_click(self._download, intents.Download, emit)
-        for widget in (self._format, self._frames):
+        for widget in (self._format, self._frames, self._cameras):
             on_input(widget, lambda _: intents.Refresh(), emit)
 
     def show(self, state: ViewState) -> None:
@@ -87,9 +89,12 @@ class ExportPanel:
         )
 
     def _show_count(self, state: ViewState) -> None:
-        if state.unsaved or (state.project is self._counted and self._frames.value == self._chosen):
+        chosen = f"{self._frames.value} {self._cameras.value} {state.camera}"
+        if state.unsaved or (state.project is self._counted and chosen == self._chosen):
             return
-        self._counted, self._chosen = state.project, self._frames.value
-        count = len(frames_in(state.project, FRAME_CHOICES.get(self._chosen, frozenset[ReviewState]())))
-        frames = len(state.project.identity.frame_ids)
-        self._count.content = f'<p class="carts-caption"><b>{count}</b> of {frames} frames</p>'
+        self._counted, self._chosen = state.project, chosen
+        frames = frames_in(state.project, FRAME_CHOICES.get(self._frames.value, frozenset[ReviewState]()))
+        cameras = [state.camera] if self._cameras.value == "Shown one" else self._camera_names
+        notes = "".join(f"<br>⚠ {escaped(line)}" for line in export_warnings(state.project, frames, cameras))
+        total = len(state.project.identity.frame_ids)
+        self._count.content = f'<p class="carts-caption"><b>{len(frames)}</b> of {total} frames{notes}</p>'

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import viser
 
 from carts_viewer import intents
@@ -33,14 +34,19 @@ class JointsPanel:
         self._session = session
         self._waits = waits
         self._server = page.server
-        self._window = 20.0
+        self._window = 5.0
         self._sliders: dict[tuple[str, int], tuple[JointRange, viser.GuiSliderHandle[float]]] = {}
         self._centred_on: object = None
         tabs = gui.add_tab_group()
         for arm in session.scene.arms:
             with tabs.add_tab(arm.name, viser.Icon.GRAIN):
                 self._add_arm(page, arm.name, state, emit)
-        window = gui.add_dropdown("Slider range", list(_WINDOWS), initial_value="± 20")
+        window = gui.add_dropdown(
+            "Slider range",
+            list(_WINDOWS),
+            initial_value="± 5",
+            hint="How far the sliders reach from the measured values [° or mm]",
+        )
         perturb = gui.add_button("Perturb all joints", color="gray")
         self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
@@ -84,7 +90,7 @@ class JointsPanel:
         with self._server.atomic():
             if self._centred_on != state.frame.index:
                 self._centred_on = state.frame.index
-                self._centre(state)
+                self._centre(state, joints)
             for (arm, joint), (limits, slider) in self._sliders.items():
                 shown = to_shown(limits, float(joints[arm][joint]))
                 # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
@@ -115,15 +121,20 @@ class JointsPanel:
     def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], intents.Intent]:
         return lambda shown: intents.SetJoint(arm, joint, from_shown(limits, shown))
 
-    def _centre(self, state: ViewState) -> None:
-        """Put the sliders' ends around the measured values, within the joints' limits."""
+    def _centre(self, state: ViewState, joints: dict[str, np.ndarray]) -> None:
+        """Put the sliders' ends around the measured values, within the joints' limits, and the sliders where they are.
+
+        Whatever a slider showed before was of another frame.
+        """
         measured = state.frame.measured
         for (arm, joint), (limits, slider) in self._sliders.items():
             low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
             middle = to_shown(limits, float(measured[arm][joint]))
-            slider.min = _tidy(max(low, min(middle - self._window, high)))
-            slider.max = _tidy(min(high, max(middle + self._window, low)))
-            self._widen(slider, slider.value if math.isfinite(slider.value) else middle)
+            shown = round(to_shown(limits, float(joints[arm][joint])), 2)
+            first, last = max(low, min(middle - self._window, high)), min(high, max(middle + self._window, low))
+            slider.min = _tidy(min(first, math.floor(shown)))
+            slider.max = _tidy(max(last, math.ceil(shown)))
+            slider.value = shown
 
     @staticmethod
     def _widen(slider: viser.GuiSliderHandle[float], value: float) -> None:

@@ -10,6 +10,7 @@ from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import Page
 
+_LONGEST_LIST = 200
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
 
@@ -21,6 +22,7 @@ class KeyframesPanel:
         self._ids = session.sequence.frame_ids
         self._seen: tuple[ProjectState | None, int] = (None, -1)
         self._solvable, self._plan = False, ""
+        self._index = 0
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
                 "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
@@ -31,10 +33,18 @@ class KeyframesPanel:
             page.row(self._between, self._all, weights=(3, 2))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
             self._progress = gui.add_progress_bar(0.0, visible=False)
+            self._listed = gui.add_html("", visible=False)
+            self._take = gui.add_button("Take it as solved", color="gray", visible=False)
+            self._take_all = gui.add_button("Take all", color="gray", visible=False)
+            page.row(self._take, self._take_all, weights=(3, 2))
+            self._drop = gui.add_button("Leave them, close the list", icon=viser.Icon.X, color="gray", visible=False)
             self._stop = gui.add_button("Stop and keep", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)), emit)
         on_click(self._between, lambda _: intents.Solve(), emit)
         on_click(self._all, lambda _: intents.Solve(whole=True), emit)
+        on_click(self._take, lambda _: self._take_shown(), emit)
+        on_click(self._take_all, lambda _: intents.TakeSolved(), emit)
+        on_click(self._drop, lambda _: intents.DropSolved(), emit)
         on_click(self._stop, lambda _: intents.StopSolving(), emit)
         on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]), emit)
 
@@ -50,7 +60,27 @@ class KeyframesPanel:
         if state.solve is not None:
             self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
             lines.append(f"<b>{escaped(state.solve.text)}</b>")
+        self._show_listed(state)
         self._text.content = f'<p class="carts-caption">{"<br>".join(lines)}</p>'
+
+    def _take_shown(self) -> intents.Intent:
+        return intents.TakeSolved(self._index)
+
+    def _show_listed(self, state: ViewState) -> None:
+        """The frames that became worse or are doubtful, each a link to it."""
+        self._index = state.index
+        listed = () if state.solve is None or state.solving else state.solve.listed
+        held = [frame.index for frame in listed if not frame.taken]
+        self._listed.visible = self._drop.visible = bool(listed)
+        self._take.visible = self._take_all.visible = bool(held)
+        self._take.disabled = state.index not in held
+        rows = "".join(
+            f'<li><a href="#" data-frame="{frame.index}">{escaped(self._ids[frame.index])}</a> '
+            f"{escaped(frame.reason)}{'' if frame.taken else ' <b>kept as it was</b>'}</li>"
+            for frame in listed[:_LONGEST_LIST]
+        )
+        more = f"<li>and {len(listed) - _LONGEST_LIST} more</li>" if len(listed) > _LONGEST_LIST else ""
+        self._listed.content = f'<ul class="carts-list" aria-label="Frames to look at">{rows}{more}</ul>'
 
     def _plan_ahead(self, state: ViewState) -> None:
         """Find out what "between" means here; while somebody is moving a joint, what it meant before."""

@@ -1,5 +1,7 @@
 """Run, Pause, Step, Reset, how it is going, and which solver."""
 
+import math
+
 import viser
 
 from carts_core.optimization import BASE_FRAME_GAIN
@@ -20,6 +22,8 @@ SOLVER_LABELS = {
     SolverName.NONE: "None: compare only",
 }
 """What people read for the solvers."""
+UNDETERMINED = "Not determined by this image"
+"""What people read for unknowns that an image says nothing of."""
 
 
 class OptimizePanel:
@@ -27,6 +31,7 @@ class OptimizePanel:
 
     def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
         gui = page.server.gui
+        self._session = session
         self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY, color="teal")
         self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, color="gray", disabled=True)
         page.row(self._run, self._pause)
@@ -37,7 +42,7 @@ class OptimizePanel:
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         cameras = [camera.name for camera in session.scene.cameras]
-        self._cameras = gui.add_dropdown("Cameras", ["Shown camera", "All cameras"], visible=len(cameras) > 1)
+        self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
         on_click(self._run, lambda _: intents.Run(), emit)
         on_click(self._pause, lambda _: intents.Pause(), emit)
         on_click(self._step, lambda _: intents.Step(), emit)
@@ -55,9 +60,8 @@ class OptimizePanel:
         self._reset.disabled = not state.run.curves.loss
         write(self._solver, SOLVER_LABELS[state.solver])
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        self._status.content = (
-            f'<p class="carts-status">{status_line(state)}</p>{observability_lines(state)}{calibration_line(state)}'
-        )
+        lines = f"{undetermined_lines(state, self._session)}{calibration_line(state)}"
+        self._status.content = f'<p class="carts-status">{status_line(state)}</p>{lines}'
 
 
 def status_line(state: ViewState) -> str:
@@ -74,21 +78,36 @@ def status_line(state: ViewState) -> str:
     elif phase is Phase.PAUSED:
         parts.append("paused")
     elif state.run.reason:
-        parts.append(f"<b>{escaped(state.run.reason)}</b>")
+        parts.append(escaped(state.run.reason))
+    if state.run_outdated and phase is Phase.IDLE:
+        parts.append("changed since")
     return " · ".join(parts) or "Press Run to fit the arm to this frame."
 
 
-def observability_lines(state: ViewState) -> str:
-    """Which unknowns the image leaves open, as HTML; empty while running and for losses that cannot say."""
-    known = None if state.maps is None else state.maps.iterate.uncertainty
+def undetermined_lines(state: ViewState, session: Session) -> str:
+    """Which unknowns the images of a run left open, and what it did to them, as HTML; empty while running."""
+    known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
     lines = []
-    for verdict, meaning in (("weak", "Weakly determined"), ("not visible", "Not visible, left as it was")):
-        names = [_spoken(name) for name in known.names if known.verdict(name) == verdict]
+    for verdict, meaning in (("weak", "Weakly determined by this image"), ("not visible", UNDETERMINED)):
+        names = [_spoken(name) + _moved(name, state, session) for name in known.names if known.verdict(name) == verdict]
         if names:
             lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
     return "".join(lines)
+
+
+def _moved(unknown: str, state: ViewState, session: Session) -> str:
+    """By how much a run has moved a joint, in brackets; nothing for other unknowns."""
+    arm, _, joint = unknown.partition("/")
+    found = [limits for limits in session.ranges if limits.arm == arm]
+    places = [number for number, limits in enumerate(found) if limits.joint == joint]
+    if not places or state.run.start is None:
+        return ""
+    before, now = (session.joints(scene)[arm][places[0]] for scene in (state.run.start, state.pose.scene))
+    revolute = found[places[0]].revolute
+    by = math.degrees(now - before) if revolute else 1e3 * (now - before)
+    return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{'°' if revolute else ' mm'})"
 
 
 def calibration_line(state: ViewState) -> str:

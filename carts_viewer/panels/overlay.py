@@ -1,11 +1,14 @@
 """What is drawn over the frame, and what its colours mean."""
 
 from carts_viewer import intents
+from carts_viewer.compare import Against
 from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
 from carts_viewer.panels.inputs import Emit, Waits, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import Page
+
+_NOTHING = "Nothing"
 
 
 class OverlayPanel:
@@ -21,7 +24,13 @@ class OverlayPanel:
             self._layer = gui.add_dropdown("Layer", [str(layer) for layer in options], initial_value=str(state.layer))
             self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
             self._legend = gui.add_html("")
+            self._against = gui.add_dropdown(
+                "Compare with", [_NOTHING, *map(str, Against)], hint="Hold . to see only the other pose"
+            )
+            self._swipe = gui.add_slider("Swipe %", 0, 100, 1, 50, visible=False)
         on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)), emit)
+        on_input(self._against, lambda name: intents.CompareWith(None if name == _NOTHING else Against(name)), emit)
+        on_input(self._swipe, lambda value: intents.SetSwipe(value / 100), emit)
         on_input(self._opacity, lambda value: intents.SetOpacity(value / 100), emit)
 
     def show(self, state: ViewState) -> None:
@@ -29,6 +38,10 @@ class OverlayPanel:
         write(self._layer, str(state.layer))
         if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))
+        write(self._against, str(state.compare.against or _NOTHING))
+        self._swipe.visible = state.compare.against is not None
+        if not self._waits(intents.SetSwipe):
+            write(self._swipe, round(100 * state.compare.swipe))
         self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
 
     def _explain(self, state: ViewState) -> str:

@@ -42,7 +42,9 @@ class SavedPanel:
             text = "Not saved yet …"
         else:
             text = f"<b>Saved</b> in {escaped(path.name)}"
-        self._text.content = f'<p class="carts-caption" title="{escaped(str(path))}">{text}</p>'
+        self._text.content = (
+            f'<p class="carts-caption carts-saved" title="{escaped(str(path))}"><span>{text}</span></p>'
+        )
         self._undo.disabled, self._redo.disabled = state.project.undoable is None, state.project.redoable is None
 
 

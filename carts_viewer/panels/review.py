@@ -4,7 +4,7 @@ from collections import Counter
 
 import viser
 
-from carts_core.project import Kind, ProjectState, ReviewState
+from carts_core.project import Kind, ProjectState, ReviewState, by_hand
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.state import ViewState
@@ -17,6 +17,10 @@ STATE_COLORS = {
     ReviewState.ACCEPTED: "#2dd4a7",
     ReviewState.REJECTED: "#ef4444",
 }
+
+
+BY_HAND = "moved by hand"
+"""What people read for a frame that was moved and not judged."""
 
 
 class ReviewPanel:
@@ -58,7 +62,8 @@ class ReviewPanel:
         """Bring the widgets up to date."""
         review = state.review
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
-        self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{review.state}</b>{keyframe}</p>'
+        name = BY_HAND if by_hand(state.project, state.index) else review.state
+        self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{name}</b>{keyframe}</p>'
         if not self._waits(intents.SetNote):
             write(self._note, review.note)
         if self._counted is None or not (state.unsaved or state.project is self._counted):
@@ -69,9 +74,11 @@ class ReviewPanel:
         reviews = project.values(Kind.REVIEW).values()
         counts = Counter(review.state for review in reviews)
         counts[ReviewState.UNTOUCHED] += len(project.identity.frame_ids) - len(reviews)
-        known = " ".join(
-            f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>' for name in ReviewState if counts[name]
-        )
+        hand = sum(by_hand(project, index) for index in project.records)
+        counts[ReviewState.UNTOUCHED] -= hand
+        shown = [(_dot(name), counts[name], str(name)) for name in ReviewState]
+        shown.insert(1, (_dot(ReviewState.UNTOUCHED), hand, BY_HAND))
+        known = " ".join(f'<span class="carts-key">{dot}{count} {name}</span>' for dot, count, name in shown if count)
         self._counts.content = f'<p class="carts-caption">{known}</p>'
 
 

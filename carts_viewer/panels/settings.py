@@ -6,10 +6,13 @@ from dataclasses import fields
 from enum import StrEnum
 from typing import Any, get_args, get_type_hints
 
+import viser
+
 from carts_core.settings import DescentSolver, SurfaceSolver
 from carts_core.settings.docstrings import field_docstrings
 from carts_viewer import intents
-from carts_viewer.panels.inputs import Emit, escaped, humanized, on_input, write
+from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
+from carts_viewer.presets import PRESETS
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import Page
@@ -18,37 +21,72 @@ _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsic
 
 
 class SettingsPanel:
-    """One widget per number of the chosen solver's settings; the field's own docstring is its hint.
+    """A preset, and a window with one widget per number of the chosen solver's settings, explained by its docstring.
 
     Stages are not edited here: a settings file holds them (`carts evaluate --settings`).
     """
 
     def __init__(self, page: Page, state: ViewState, emit: Emit) -> None:
         gui = page.server.gui
+        self._gui = gui
         self._widgets: dict[type, dict[str, Any]] = {}
-        with gui.add_folder("Solver settings", expand_by_default=False):
-            self._error = gui.add_html("", visible=False)
-            for example in (SurfaceSolver(), DescentSolver()):
-                kind, shown = type(example), type(state.settings)
-                self._widgets[kind] = {
-                    field.name: _widget(gui, kind, field.name, getattr(example, field.name))
-                    for field in fields(kind)
-                    if field.name != "stages"
-                }
-                for name, widget in self._widgets[kind].items():
-                    widget.visible = kind is shown
-                    on_input(widget, _setter(name), emit)
+        self._error: viser.GuiHtmlHandle | None = None
+        self._preset = gui.add_dropdown(
+            "Preset", list(PRESETS), hint=" ".join(f"{name}: {preset.meaning}" for name, preset in PRESETS.items())
+        )
+        advanced = gui.add_button("Advanced settings", icon=viser.Icon.ADJUSTMENTS, color="gray")
+        self._window = gui.add_panel(visible=False)
+        with self._window.add_tab("Solver settings"):
+            reset = gui.add_button("Reset all to the preset", icon=viser.Icon.HISTORY, color="gray")
+            close = gui.add_button("Close", icon=viser.Icon.X, color="gray")
+            page.row(reset, close, weights=(2, 1))
+            self._folder = gui.add_folder("Of the chosen solver")
+            with self._folder:
+                for example in (SurfaceSolver(), DescentSolver()):
+                    self._add(example, type(state.settings), emit)
+        self._window.float(x=40, y=60, width=400, height=620)
+        on_input(self._preset, intents.ResetSettings, emit)
+        on_click(reset, lambda _: intents.ResetSettings(self._preset.value), emit)
+
+        @advanced.on_click
+        async def _(_: viser.GuiEvent) -> None:
+            self._window.visible = not self._window.visible
+
+        @close.on_click
+        async def _(_: viser.GuiEvent) -> None:
+            self._window.visible = False
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
-        self._error.visible = state.settings_error is not None
-        self._error.content = f'<p class="carts-error">{escaped(state.settings_error or "")}</p>'
+        self._show_error(state)
         for kind, widgets in self._widgets.items():
             chosen = isinstance(state.settings, kind)
             for name, widget in widgets.items():
                 widget.visible = chosen
                 if chosen and state.settings_error is None:
                     write(widget, getattr(state.settings, name))
+
+    def _add(self, example: Any, shown: type, emit: Emit) -> None:
+        kind = type(example)
+        self._widgets[kind] = {
+            field.name: _widget(self._gui, kind, field.name, getattr(example, field.name))
+            for field in fields(kind)
+            if field.name != "stages"
+        }
+        for name, widget in self._widgets[kind].items():
+            widget.visible = kind is shown
+            on_input(widget, _setter(name), emit)
+
+    def _show_error(self, state: ViewState) -> None:
+        """Say what is wrong right below the field that it is about."""
+        if self._error is not None:
+            self._error.remove()
+            self._error = None
+        widget = self._widgets[type(state.settings)].get(state.settings_field or "")
+        if state.settings_error is not None:
+            text = f'<p class="carts-error" role="alert">{escaped(state.settings_error)}</p>'
+            with self._folder:
+                self._error = self._gui.add_html(text, order=None if widget is None else widget.order + 0.5)
 
 
 class FreePanel:

@@ -58,6 +58,8 @@ class Page:
         check_address(host, port)
         self._guard = Guard(host)
         self._title = title
+        self.key_groups: list[Any] = []
+        """What the sheet of keys lists: names of groups, each with pairs of key and meaning."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
@@ -67,13 +69,16 @@ class Page:
         self._drawn = self.server.gui.add_text("drawn", "", visible=False)
         # And into this one when somebody lets go of a slider or leaves a field.
         self._released = self.server.gui.add_text("released", "", visible=False)
-        # Into this one which share of the timeline somebody clicked.
+        # Into this one the index of a frame that somebody picked.
         self._picked = self.server.gui.add_text("picked", "", visible=False)
         # Into these strokes over the picture, and keys that viser's shortcuts do not know.
         self._painted = self.server.gui.add_text("painted", "", visible=False)
         self._pressed = self.server.gui.add_text("pressed", "", visible=False)
         # And into this one where somebody points in the picture.
         self._pointed = self.server.gui.add_text("pointed", "", visible=False)
+        self._activated = self.server.gui.add_text("activated", "", visible=False)
+        # And into this one what a tab asks for in words.
+        self._asked = self.server.gui.add_text("asked", "", visible=False)
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -96,13 +101,17 @@ class Page:
             if event.client_id is not None:
                 callback()
 
-    def on_pointed(self, callback: Callable[[float, float], None]) -> None:
-        """Call `callback(u, v)` on the event loop whenever somebody points at a place of the image.
+    def on_pointed(self, callback: Callable[[float, float, float], None]) -> None:
+        """Call `callback(u, v, camera)` on the event loop whenever somebody points at a place of a camera's image.
 
-        u and v are shares of its width and height, from its upper left corner; any numbers, if the tab is none of ours.
+        u and v are shares of its width and height, from its upper left corner, and the camera is an index; any numbers,
+        if the tab is none of ours.
         """
+        _on_numbers(self._pointed, 3, callback)
 
-        _on_numbers(self._pointed, 2, callback)
+    def on_activated(self, callback: Callable[[float], None]) -> None:
+        """Call `callback(camera)` on the event loop when somebody chooses a camera's image; any number, as above."""
+        _on_numbers(self._activated, 1, callback)
 
     def on_painted(self, callback: Callable[[int, str], None]) -> None:
         """Call `callback(client_id, text)` on the event loop whenever a tab says that it has painted; any text."""
@@ -112,8 +121,12 @@ class Page:
         """Call `callback(key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
         _on_text(self._pressed, lambda _, key: callback(key))
 
+    def on_asked(self, callback: Callable[[int, str], None]) -> None:
+        """Call `callback(client_id, text)` on the event loop when a tab asks for something in words; any text."""
+        _on_text(self._asked, callback)
+
     def on_picked(self, callback: Callable[[float], None]) -> None:
-        """Call `callback(share)` on the event loop whenever somebody clicks the timeline; any number, as above."""
+        """Call `callback(index)` on the event loop whenever somebody picks a frame; any number, as above."""
         _on_numbers(self._picked, 1, callback)
 
     def call(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
@@ -219,6 +232,9 @@ class Page:
                 "released": element_id(self._released),
                 "picked": element_id(self._picked),
                 "pointed": element_id(self._pointed),
+                "activated": element_id(self._activated),
+                "asked": element_id(self._asked),
+                "keyGroups": self.key_groups,
                 "painted": element_id(self._painted),
                 "pressed": element_id(self._pressed),
                 "keys": OWN_KEYS,
@@ -233,7 +249,10 @@ class Page:
                 '<link rel="stylesheet" href="/static/page.css" />'
                 f"<script>{_FORGET_TOKEN} window.cartsConfiguration = {configuration};</script>"
                 '<script src="/static/page.js" defer></script>'
-                '<script src="/static/paint.js" defer></script>',
+                '<script src="/static/paint.js" defer></script>'
+                '<script src="/static/marks.js" defer></script>'
+                '<script src="/static/timeline.js" defer></script>'
+                '<script src="/static/shell.js" defer></script>',
                 1,
             )
             .encode()

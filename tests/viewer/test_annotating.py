@@ -1,5 +1,7 @@
 """History, review, copied corrections and keypoints: what intents about the project do."""
 
+import math
+
 import numpy as np
 import pytest
 from viewer_desk import Desk
@@ -8,7 +10,7 @@ from carts_core.errors import CartsError
 from carts_core.model.keypoints import project_keypoints
 from carts_core.project import Figures, Project, ReviewState, Source
 from carts_viewer import intents
-from carts_viewer.marks import draw_keypoints, labelled_keypoints
+from carts_viewer.marks import keypoints_in_image, labelled_keypoints
 
 
 def _drag(desk: Desk, *values: float, joint: int = 0) -> None:
@@ -206,16 +208,34 @@ def test_a_place_that_is_none_is_refused_and_one_outside_the_image_is_at_its_edg
     assert desk.state.keypoints.pins[0].pixel == (96.0, 0.0)
 
 
-def test_rings_and_crosses_are_where_keypoints_and_pins_are(desk: Desk) -> None:
-    desk.do(intents.PointAt(40.0, 30.0), intents.Released())
+def test_keypoints_that_the_image_shows_are_named_with_their_places(desk: Desk) -> None:
     state, scene = desk.state, desk.session.scene
-    points = list(labelled_keypoints(scene).values())
-    picture = np.zeros((72, 96, 4), np.uint8)
-    draw_keypoints(picture, scene, state.pose.scene, "left", points, state.keypoints.pins)
-    assert picture[30, 40, 3] == 255
-    for u, v in project_keypoints(scene, state.pose.scene, points, "left").tolist():
-        ring = picture[max(int(v) - 3, 0) : int(v) + 4, max(int(u) - 3, 0) : int(u) + 4]
-        assert ring[..., 3].any()
+    points = labelled_keypoints(scene)
+    pixels = project_keypoints(scene, state.pose.scene, list(points.values()), "left").tolist()
+    found = keypoints_in_image(scene, state.pose.scene, "left", points)
+    assert found and len(found) <= len(points)
+    for label, u, v in found:
+        assert (96 * u, 72 * v) == pytest.approx(pixels[list(points).index(label)], abs=1e-2)
+
+
+def test_clicks_stay_when_the_optimizer_runs_and_say_how_far_off_they_are_then(desk: Desk) -> None:
+    desk.do(intents.PointAt(40.0, 30.0), intents.Released())
+    (pin,) = desk.state.keypoints.pins
+    desk.do(intents.Run())
+    state = desk.finish()
+    assert state.keypoints.pins == (pin,)
+    at = project_keypoints(desk.session.scene, state.pose.scene, [pin.keypoint], "left")[0]
+    assert state.keypoints.residuals == pytest.approx([math.dist(at.tolist(), pin.pixel)], abs=1e-3)
+    # The next click starts from where the run has ended, not from before it.
+    before = state.pose.scene
+    desk.do(intents.PointAt(*at.tolist()), intents.Released())
+    pairs = zip(before.joint_positions, desk.state.pose.scene.joint_positions, strict=True)
+    assert all(np.allclose(one, other, atol=2e-3) for one, other in pairs)
+
+
+def test_a_click_in_another_camera_is_of_that_camera(desk: Desk) -> None:
+    desk.do(intents.PointAt(40.0, 30.0, "right"))
+    assert desk.state.keypoints.pins[0].camera == "right" and desk.state.camera == "left"
 
 
 def test_edits_of_a_project_that_takes_none_are_shown_until_another_frame_is(desk: Desk) -> None:

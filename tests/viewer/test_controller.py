@@ -181,7 +181,7 @@ def test_a_locked_joint_does_not_move(desk: Desk) -> None:
 
 
 def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk) -> None:
-    desk.do(intents.SetFreeGroup("extrinsics", True), intents.Run())
+    desk.do(intents.SetCameras(False), intents.SetFreeGroup("extrinsics", True), intents.Run())
     state = desk.finish()
     calibrated = [camera.T_camera_world for camera in desk.session.scene.cameras]
     left, right = state.pose.scene.T_camera_world.numpy()

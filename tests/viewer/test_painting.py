@@ -123,6 +123,7 @@ def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, mon
         return make(self, *arguments)
 
     monkeypatch.setattr(OptimizerFactory, "make", watched)
+    desk.do(intents.SetCameras(False))
     desk.do(_polygon(Target.IGNORE), _polygon(Target.IGNORE, frame=1, number=2), intents.Step())
     assert list(given[-1]) == ["left"] and np.array_equal(given[-1]["left"], _pixels(desk))
     desk.do(intents.ShowCamera("right"), intents.Step())

@@ -29,7 +29,7 @@ REPLACED = {
     "transport/gate.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
-IN_THE_PAGE = {"page.js": {"__viserMutable"}, "paint.js": {"__viserMutable"}}
+IN_THE_PAGE = {name: {"__viserMutable"} for name in ("page.js", "paint.js", "marks.js", "timeline.js", "shell.js")}
 """What our scripts use of viser's page that it does not document."""
 
 

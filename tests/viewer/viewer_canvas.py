@@ -57,7 +57,13 @@ class Canvas:
         png = self._page.screenshot(clip={"x": box["x"], "y": box["y"], "width": box["width"], "height": box["height"]})
         image = decoded(png, cv2.IMREAD_COLOR)[..., ::-1].copy()
         image[: self._bar_height()] = 0
+        image[image.shape[0] - self._strip_height() :] = 0
         return image
+
+    def _strip_height(self) -> int:
+        """How far up the timeline and its label hide the picture [px]."""
+        boxes = [self._page.locator(f".carts-strip{part}").first.bounding_box() for part in ("", " output")]
+        return int(sum(box["height"] for box in boxes if box is not None)) + 1
 
     def _bar_height(self) -> int:
         """How far down the tool bar hides the picture [px]."""
@@ -91,6 +97,7 @@ class Canvas:
         arm_ids = self._renderer.arm_ids(self._app.state.pose.scene, self._app.state.camera)
         wanted = _warped(arm_ids >= 0, map_, image.shape[:2])
         wanted[: self._bar_height()] = False
+        wanted[wanted.shape[0] - self._strip_height() :] = False
         if not shown.any() or not wanted.any():
             return float("inf")
         return max(_outline_distance(shown, wanted), _outline_distance(wanted, shown))

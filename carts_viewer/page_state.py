@@ -1,0 +1,77 @@
+"""What the page's own scripts draw over the picture: cameras with their fit, keypoints, clicks, the frame."""
+
+import uuid
+from typing import Any
+
+import viser
+
+from carts_core.project import by_hand
+from carts_viewer.marks import keypoints_in_image, labelled_keypoints
+from carts_viewer.panels.fit import quality
+from carts_viewer.panels.review import BY_HAND
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
+
+
+class PageState:
+    """Sends every tab what it needs to know, when it has changed and when the tab is new."""
+
+    def __init__(self, page: Page, session: Session) -> None:
+        self._page = page
+        self._session = session
+        self._points = labelled_keypoints(session.scene)
+        self._labels = {point: label for label, point in self._points.items()}
+        self._server = uuid.uuid4().hex
+        self._sent: dict[str, Any] = {}
+
+        @page.server.on_client_connect
+        async def _(client: viser.ClientHandle) -> None:
+            if self._sent:
+                page.call(client, "setPage", self._sent)
+
+    def show(self, state: ViewState) -> None:
+        """Send what has changed."""
+        message = self._message(state)
+        if message != self._sent:
+            self._sent = message
+            for client in self._page.server.get_clients().values():
+                self._page.call(client, "setPage", message)
+
+    def _message(self, state: ViewState) -> dict[str, Any]:
+        scene, names = self._session.scene, [camera.name for camera in self._session.scene.cameras]
+        dice = {} if state.scores is None else dict(state.scores.cameras)
+        failures = {} if state.verdict is None else dict(state.verdict.cameras)
+        if state.verdict is not None and not failures:
+            failures = {names[0]: state.verdict.failure} if len(names) == 1 else {}
+        cameras = []
+        for index, name in enumerate(names):
+            if name != state.camera and not (state.beside and name in state.frame.images):
+                continue
+            shown = state.keypoints.shown or bool(state.keypoints.pins)
+            own = scene.camera(name)
+            cameras.append(
+                {
+                    "index": index,
+                    "name": name,
+                    "dice": dice.get(name),
+                    "fit": quality(failures[name]) if name in failures else None,
+                    "points": keypoints_in_image(scene, state.pose.scene, name, self._points) if shown else [],
+                    "pins": [
+                        (self._labels[pin.keypoint], pin.pixel[0] / own.width, pin.pixel[1] / own.height)
+                        for pin in state.keypoints.pins
+                        if pin.camera == name
+                    ],
+                }
+            )
+        return {
+            "server": self._server,
+            "cameras": cameras,
+            "active": names.index(state.camera),
+            "chosen": state.keypoints.chosen,
+            "frame": state.index,
+            "domain": state.domain,
+            "label": state.frame.frame_id,
+            "review": BY_HAND if by_hand(state.project, state.index) else str(state.review.state),
+            "fit": None if state.verdict is None else state.verdict.verdict,
+        }

@@ -1,0 +1,72 @@
+"""How far the shown pose can be relied on: a verdict with its reason and what to try, and the fit in every camera."""
+
+import viser
+
+from carts_core.project import FitVerdict
+from carts_viewer import intents
+from carts_viewer.panels.inputs import Emit, escaped, on_click
+from carts_viewer.session import Session
+from carts_viewer.state import Phase, ViewState
+from carts_viewer.transport.page import Page
+
+_POSSIBLE, _LIKELY = 0.1, 0.5
+"""Probabilities of a failure from which a single camera's fit is doubtful and has failed; as the verdict's own [1]."""
+
+
+class FitPanel:
+    """The verdict, always in view, and a button that asks the images for one."""
+
+    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
+        gui = page.server.gui
+        self._cameras = [camera.name for camera in session.scene.cameras]
+        self._text = gui.add_html("")
+        self._check = gui.add_button(
+            "Check the fit",
+            icon=viser.Icon.STETHOSCOPE,
+            color="gray",
+            hint="Compare the arms as they are with the images of all cameras, and move nothing",
+        )
+        on_click(self._check, lambda _: intents.Assess(), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the verdict up to date."""
+        running = state.run.phase is Phase.RUNNING or state.solving
+        self._check.disabled = running
+        self._check.visible = state.verdict is None
+        self._text.content = fit_text(state.verdict, running=running, scores=_scores(state, self._cameras))
+
+
+def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, float]) -> str:
+    """A verdict with its reason, remedy and cameras, as HTML.
+
+    Args:
+        verdict: of the shown pose; None where it was not assessed.
+        running: whether the pose is still moving.
+        scores: Dice of the cameras with a true mask.
+    """
+    cameras = dict(verdict.cameras) if verdict is not None else {}
+    chips = []
+    for name in {**scores, **cameras}:
+        dice = f" Dice {scores[name]:.3f}" if name in scores else ""
+        mark = f'<span class="carts-dot {quality(cameras[name])}"></span>' if name in cameras else ""
+        said = f" {quality(cameras[name])}" if name in cameras else ""
+        chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
+    line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
+    if verdict is None:
+        name = "running" if running else "not checked"
+        return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
+    remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
+    return (
+        f'<div class="carts-verdict {verdict.verdict}" role="status"><b>{verdict.verdict.capitalize()}</b> '
+        f"{escaped(verdict.reason)}{remedy}{line}</div>"
+    )
+
+
+def quality(failure: float) -> str:
+    """The verdict that a probability of failure calls for."""
+    return "failed" if failure >= _LIKELY else "doubtful" if failure >= _POSSIBLE else "good"
+
+
+def _scores(state: ViewState, cameras: list[str]) -> dict[str, float]:
+    known = {} if state.scores is None else state.scores.cameras
+    return {name: known[name] for name in cameras if name in known}

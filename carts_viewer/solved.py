@@ -1,0 +1,120 @@
+"""Frames that were solved together, each compared with how it was and, where that is better, with a run of its own."""
+
+import json
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from carts_core.optimization import FrameEstimate
+from carts_core.project import Edits, Figures, Key, ProjectState, Provenance, Review, ReviewState, Source
+from carts_core.recording import Frame
+from carts_viewer.active_run import ActiveRun
+from carts_viewer.fit_check import Fit, FitCheck
+from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.sequence_run import SequenceRun
+from carts_viewer.session import Session, joint_correction
+from carts_viewer.state import Pose, ViewState
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What solving found for one frame."""
+
+    edits: Edits
+    figures: Figures
+    remark: str | None = None
+    """Why somebody should look at it, for people."""
+    held: bool = False
+    """Whether it fits worse than before, so that the frame stays as it was."""
+
+
+class Comparison:
+    """Compares what was solved with how a frame was."""
+
+    def __init__(self, session: Session, renderer: OverlayRenderer, optimizers: OptimizerFactory) -> None:
+        self._session = session
+        self._renderer = renderer
+        self._optimizers = optimizers
+        self._check = FitCheck(session, optimizers)
+
+    def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
+        """The better one of what was solved and a run on the frame alone, or how it was if both are worse.
+
+        The run alone is only made where what was solved is worse than before, or not good.
+
+        Raises:
+            CartsError: an image or the weights are not usable.
+        """
+        frame = self._frame(estimate.index, state)
+        was = self._session.pose(frame, before)
+        pose = Pose(self._session.with_joints(was.scene, estimate.joint_positions), Source.PROPAGATED)
+        earlier, solved = self._fit(frame, was, state), self._fit(frame, pose, state)
+        found = Outcome(solved_edits(estimate, run), Figures(estimate.loss, solved.dice))
+        worse = solved.worse_than(earlier)
+        if worse is not None or solved.verdict.verdict != "good":
+            alone, edits = self._alone(frame, was, state, run.provenance)
+            if alone.worse_than(earlier) is None and alone.worse_than(solved) is None and solved.worse_than(alone):
+                found, solved, worse = Outcome(edits, Figures(alone.loss, alone.dice)), alone, None
+        remark = worse
+        if remark is None and solved.verdict.verdict != "good":
+            remark = f"{solved.verdict.verdict}: {solved.verdict.reason}"
+        verdict = {Key.verdict(estimate.index): solved.verdict}
+        return replace(found, edits={**found.edits, **verdict}, remark=remark, held=worse is not None)
+
+    def _frame(self, index: int, state: ViewState) -> Frame:
+        sequence, domain = self._session.sequence, state.domain
+        cameras = [camera.name for camera in self._session.scene.cameras if sequence.has_masks(camera.name, domain)]
+        return sequence.frame(index, domain, cameras)
+
+    def _fit(self, frame: Frame, pose: Pose, state: ViewState) -> Fit:
+        fit = self._check.fit(frame.index, state.domain, pose, state.settings)
+        view, dice = self._session.editor.view, []
+        for camera in frame.masks or {}:
+            correction = view.get(Key.mask_correction(frame.index, camera))
+            dice.append(self._renderer.scores(pose.scene, frame, camera, correction).dice)
+        known = [value for value in dice if value is not None]
+        return replace(fit, dice=min(known, default=None))
+
+    def _alone(self, frame: Frame, start: Pose, state: ViewState, of_many: Provenance) -> tuple[Fit, Edits]:
+        """The fit of a run on this frame alone, and the edits that take it."""
+        session, cameras = self._session, [camera.name for camera in self._session.scene.cameras]
+        free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
+        ignore = session.ignored(frame.index, cameras)
+        optimizer = self._optimizers.make(
+            session.sequence, frame.index, state.domain, cameras, start, state.settings, free, ignore
+        )
+        provenance = replace(of_many, settings=json.dumps({**json.loads(of_many.settings or "{}"), "alone": True}))
+        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance)
+        while run.step() is not None:
+            pass
+        best = run.best()
+        assert best is not None
+        pose = run.pose(best)
+        return self._fit(frame, pose, state), session.edits(frame, pose.scene, provenance, best.joint_std())
+
+
+def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
+    """What a project must change so that a frame is as it was solved."""
+    edits: dict[Key[Any], Any] = {}
+    for arm, std in estimate.joint_std.items():
+        # An arm that was not free stays as it is.
+        if np.isfinite(std).any():
+            edits[Key.joints(estimate.index, arm)] = joint_correction(
+                estimate.joint_positions[arm], run.provenance, std
+            )
+    return edits
+
+
+def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
+    """What was solved of a frame and not compared, because somebody stopped it."""
+    edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
+    return Outcome(edits, Figures(estimate.loss), "not compared with how it was, because solving was stopped")
+
+
+def reviewed(index: int, review: Review) -> Edits:
+    """Marks a frame as optimized that nobody has said anything about."""
+    if review.state is not ReviewState.UNTOUCHED:
+        return {}
+    return {Key.review(index): Review(ReviewState.OPTIMIZED, review.note)}

@@ -1,0 +1,107 @@
+"""What the page's timeline draws of every frame, as one number; only what has changed is sent."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import viser
+
+from carts_core.project import FitVerdict, ProjectState, ReviewState, Source, by_hand
+from carts_core.project.fit_verdict import VERDICTS
+from carts_core.project.state import Record
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
+
+_REVIEWS = (
+    ReviewState.UNTOUCHED,
+    ReviewState.OPTIMIZED,
+    ReviewState.NEEDS_WORK,
+    ReviewState.ACCEPTED,
+    ReviewState.REJECTED,
+)
+_BY_HAND = len(_REVIEWS)
+_SOURCES = (Source.HAND, Source.OPTIMIZER, Source.PROPAGATED)
+_FULL = 0.2
+"""1 - Dice, and probability of failure, that fill the height of a bar [1]."""
+_MOST_IDS = 5000
+"""Of longer sequences, frames are named by their number."""
+
+
+class TimelineData:
+    """Sends every tab what is known of the frames, whole when the tab is new, and then what has changed."""
+
+    def __init__(self, page: Page, session: Session) -> None:
+        self._page = page
+        self._ids = session.sequence.frame_ids
+        stamps = session.sequence.timestamps
+        span = 0.0 if stamps is None or len(stamps) < 2 else float(stamps[-1] - stamps[0])
+        self._fps = (len(self._ids) - 1) / span if span > 0 else 0.0
+        self._records: Mapping[int, Record] = {}
+        self._codes: dict[int, int] = {}
+        self._solving: list[int] | None = None
+
+        @page.server.on_client_connect
+        async def _(client: viser.ClientHandle) -> None:
+            page.call(client, "setTimeline", self._whole())
+
+    def show(self, state: ViewState) -> None:
+        """Send what has changed; a gesture that is not finished changes nothing."""
+        solving = None
+        if state.solve is not None and state.solving:
+            solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]
+        changed = [] if state.unsaved else self._changed(state.project)
+        if changed or solving != self._solving:
+            self._solving = solving
+            message = {"whole": False, "codes": changed, "solving": solving}
+            for client in self._page.server.get_clients().values():
+                self._page.call(client, "setTimeline", message)
+
+    def _whole(self) -> dict[str, Any]:
+        codes = [number for pair in list(self._codes.items()) for number in pair]
+        ids = list(self._ids) if len(self._ids) <= _MOST_IDS else None
+        return {
+            "whole": True,
+            "frames": len(self._ids),
+            "fps": self._fps,
+            "ids": ids,
+            "codes": codes,
+            "solving": self._solving,
+        }
+
+    def _changed(self, project: ProjectState) -> list[int]:
+        """Frame and code, one after the other, of the frames whose code is another one than before."""
+        if project.records is self._records:
+            return []
+        before, self._records = self._records, project.records
+        touched = [i for i, record in project.records.items() if i >= 0 and before.get(i) is not record]
+        whole = before.get(-1) is not project.records.get(-1)
+        # What the calibration changes makes figures and verdicts of all frames void.
+        indices = {i for i in project.records if i >= 0} if whole else set(touched)
+        changed: list[int] = []
+        for index in sorted(indices | {i for i in before if i >= 0 and i not in project.records}):
+            number = code(project, index)
+            if self._codes.get(index, 0) != number:
+                self._codes[index] = number
+                changed += [index, number]
+        return changed
+
+
+def code(project: ProjectState, frame: int) -> int:
+    """Review, verdict, source, whether it is kept, and how badly it fits (0 to 255), each in its own bits."""
+    record = project.records.get(frame)
+    if record is None:
+        return 0
+    review = _BY_HAND if by_hand(project, frame) else _REVIEWS.index(project.review(frame).state)
+    verdict, figures = project.verdict(frame), project.figures(frame)
+    source = next((number for number, source in enumerate(_SOURCES, start=1) if source in record.sources), 0)
+    dice = None if figures is None else figures.dice
+    badness = verdict.failure if dice is None and verdict is not None else 0.0 if dice is None else 1.0 - dice
+    return review + 8 * _fit(verdict) + 32 * source + 128 * int(record.is_kept) + 256 * _height(badness)
+
+
+def _fit(verdict: FitVerdict | None) -> int:
+    return 0 if verdict is None else 1 + VERDICTS.index(verdict.verdict)
+
+
+def _height(badness: float) -> int:
+    return min(round(255 * badness / _FULL), 255)

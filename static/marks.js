@@ -1,0 +1,92 @@
+// What is drawn over the pictures and must not grow with the zoom: the cameras' names with their fit, a frame around the
+// chosen camera's image, keypoints with their names, and clicks. Needs page.js.
+(() => {
+  "use strict";
+
+  const SVG = "http://www.w3.org/2000/svg";
+  const NEAR = 34; // from the pointer, where a mark fades so that it hides nothing [px]
+  let layer = null;
+  let page = { cameras: [], active: 0 };
+  let pointer = [-1e4, -1e4];
+  let drawn = "";
+
+  function element(parent, name, attributes, text) {
+    const made = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    if (text !== undefined) made.textContent = text;
+    parent.append(made);
+    return made;
+  }
+
+  function build() {
+    const below = window.__viserMutable?.canvas;
+    if (!below || layer?.isConnected) return;
+    layer = document.createElementNS(SVG, "svg");
+    layer.setAttribute("class", "carts-marks");
+    below.parentElement.append(layer);
+    drawn = "";
+  }
+
+  /** A keypoint: an open ring, so that what it is about stays visible, and its name. */
+  function drawPoint(group, label, x, y, line, chosen) {
+    const near = Math.hypot(x - pointer[0], y - pointer[1]) < NEAR;
+    const mark = element(group, "g", { class: `carts-point${chosen ? " chosen" : ""}${near ? " near" : ""}` });
+    element(mark, "circle", { cx: x, cy: y, r: 7, class: "edge" });
+    element(mark, "circle", { cx: x, cy: y, r: 7 });
+    element(mark, "text", { x: x + 12, y: line }, label.replace(/ joint$/, ""));
+  }
+
+  function drawPin(group, label, x, y) {
+    const mark = element(group, "g", { class: "carts-pin" });
+    for (const kind of ["edge", ""]) {
+      element(mark, "path", { d: `M${x - 6} ${y - 6}l12 12M${x + 6} ${y - 6}l-12 12`, class: kind });
+    }
+    element(mark, "title", {}, label);
+  }
+
+  function drawCamera(camera, place, several) {
+    const group = element(layer, "g", { "data-camera": camera.name });
+    if (several) {
+      const active = camera.index === page.active;
+      element(group, "rect", {
+        x: place.left, y: place.top, width: place.width, height: place.height,
+        class: `carts-cell${active ? " active" : ""}`,
+      });
+      const dice = camera.dice === null ? "" : ` · Dice ${camera.dice.toFixed(3)}`;
+      const label = element(group, "text", { x: place.left + 24, y: place.top + 19, class: "carts-cell-label" });
+      label.textContent = `${camera.name}${camera.fit ? ` · ${camera.fit}` : ""}${dice}`;
+      element(group, "circle", {
+        cx: place.left + 13, cy: place.top + 14, r: 5, class: `carts-fit ${camera.fit ?? "unknown"}`,
+      });
+    }
+    let lowest = -1e4; // of the names so far, which must not lie over one another
+    const at = ([, u, v]) => [place.left + u * place.width, place.top + v * place.height];
+    for (const point of [...camera.points].sort((one, other) => one[2] - other[2])) {
+      const [x, y] = at(point);
+      lowest = Math.max(y + 4, lowest + 12);
+      drawPoint(group, point[0], x, y, lowest, point[0] === page.chosen);
+    }
+    for (const pin of camera.pins) drawPin(group, pin[0], ...at(pin));
+  }
+
+  function everyFrame() {
+    requestAnimationFrame(everyFrame);
+    build();
+    if (!layer || !window.carts) return;
+    const places = page.cameras.map((camera) => window.carts.imageOnScreen(camera.index));
+    const marked = page.cameras.some((camera) => camera.points.length);
+    const now = JSON.stringify([places, page, marked ? pointer.map((value) => Math.round(value / 4)) : 0]);
+    if (now === drawn) return;
+    drawn = now;
+    layer.replaceChildren();
+    const several = page.cameras.length > 1;
+    page.cameras.forEach((camera, number) => { if (places[number]) drawCamera(camera, places[number], several); });
+  }
+
+  document.addEventListener("carts-page", (event) => { page = event.detail; });
+  window.addEventListener("pointermove", (event) => {
+    const box = window.__viserMutable?.canvas?.getBoundingClientRect();
+    if (box) pointer = [event.clientX - box.left, event.clientY - box.top];
+  }, { capture: true });
+  everyFrame();
+})();

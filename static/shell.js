@@ -1,0 +1,157 @@
+// What belongs to one tab of the browser: its theme, where it was before the server was started anew, the sheet of keys,
+// and on a small screen the few buttons that reading and reviewing needs. Needs page.js.
+(() => {
+  "use strict";
+
+  const ask = (text) => window.carts.report("asked", text);
+  const remembered = (key) => { try { return JSON.parse(sessionStorage.getItem(key)); } catch { return null; } };
+  const wanted = () => localStorage.getItem("carts-theme") ?? "dark"; // pictures are judged best before a dark wall
+
+  // ---- Theme ------------------------------------------------------------------------------------------------------
+
+  function chooseTheme(name) {
+    localStorage.setItem("carts-theme", name);
+    ask(`theme ${name}`);
+  }
+
+  // ---- Where this tab was -------------------------------------------------------------------------------------------
+
+  let server = null; // which one answers; another one knows nothing of our widgets
+  const tabs = () => [...document.querySelectorAll("[role=tab][data-dock-tab]")];
+
+  function chooseTabs(labels) {
+    for (const label of labels ?? []) {
+      const tab = tabs().find((one) => one.textContent === label && one.getAttribute("aria-selected") !== "true");
+      tab?.dispatchEvent(new PointerEvent("pointerdown", { bubbles: true, button: 0 }));
+      tab?.dispatchEvent(new PointerEvent("pointerup", { bubbles: true, button: 0 }));
+      tab?.click();
+    }
+  }
+
+  function onPage({ detail }) {
+    if (server !== null && server !== detail.server) {
+      location.reload();
+      return;
+    }
+    const first = server === null;
+    server = detail.server;
+    const before = remembered("carts-tab");
+    if (first) {
+      if (wanted() === "light") ask("theme light");
+      if (before && before.server !== server && before.title === document.title) {
+        ask(`restore ${JSON.stringify({ frame: before.frame, camera: before.camera, domain: before.domain })}`);
+      }
+      if (before) setTimeout(() => chooseTabs(before.tabs), 400);
+      if (before && before.server !== server) return; // until what was asked for is there
+    }
+    remember(detail);
+  }
+
+  let latest = null;
+  function remember(detail) {
+    latest = detail ?? latest;
+    if (!latest) return;
+    const chosen = tabs().filter((tab) => tab.getAttribute("aria-selected") === "true").map((tab) => tab.textContent);
+    const before = remembered("carts-tab");
+    sessionStorage.setItem("carts-tab", JSON.stringify({
+      server, title: document.title, frame: latest.frame, camera: latest.active, domain: latest.domain,
+      tabs: chosen.length ? chosen : before?.tabs ?? [],
+    }));
+  }
+
+  document.addEventListener("carts-page", onPage);
+  window.addEventListener("click", (event) => {
+    if (event.target instanceof Element && event.target.closest("[data-dock-tab]")) setTimeout(remember, 50);
+  });
+  // viser builds its panels anew when the connection is back.
+  let away = false;
+  setInterval(() => {
+    const on = window.carts?.connected?.() ?? true;
+    if (on && away) setTimeout(() => chooseTabs(remembered("carts-tab")?.tabs), 900);
+    away = !on;
+  }, 300);
+
+  // ---- The sheet of keys ----------------------------------------------------------------------------------------------
+
+  let sheet = null;
+
+  function showSheet(open) {
+    if (!sheet) {
+      sheet = document.createElement("dialog");
+      sheet.className = "carts-sheet";
+      sheet.setAttribute("aria-label", "Keys");
+      const groups = window.cartsConfiguration.keyGroups ?? [];
+      const row = ([key, text]) => `<tr><td><kbd>${key}</kbd></td><td>${text}</td></tr>`;
+      const table = ([name, rows]) => `<section><h3>${name}</h3><table>${rows.map(row).join("")}</table></section>`;
+      sheet.innerHTML =
+        `<header><b>Keys</b> Press ? again, or Escape, to go on.<button aria-label="Close">×</button></header>` +
+        `<div class="carts-columns">${groups.map(table).join("")}</div>`;
+      sheet.querySelector("button").addEventListener("click", () => showSheet(false));
+      sheet.addEventListener("click", (event) => { if (event.target === sheet) showSheet(false); });
+      document.body.append(sheet);
+    }
+    if (open && !sheet.open) sheet.showModal();
+    if (!open && sheet.open) sheet.close();
+  }
+
+  window.addEventListener("keydown", (event) => {
+    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
+    if (event.key !== "?" || typing) return;
+    showSheet(!sheet?.open);
+    event.preventDefault();
+    event.stopPropagation();
+  }, { capture: true });
+
+  // ---- The other pose, as long as a key is held --------------------------------------------------------------------------
+
+  let peeking = false;
+  const peek = (on) => { if (on !== peeking) { peeking = on; ask(on ? "do peek" : "do look"); } };
+  window.addEventListener("keydown", (event) => {
+    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
+    if (event.key === "." && !typing) { peek(true); event.preventDefault(); }
+  }, { capture: true });
+  window.addEventListener("keyup", (event) => { if (event.key === ".") peek(false); }, { capture: true });
+  window.addEventListener("blur", () => peek(false));
+
+  // ---- A small screen ---------------------------------------------------------------------------------------------------
+
+  const small = matchMedia("(max-width: 36em)");
+  let bar = null;
+
+  function buildBar() {
+    if (!small.matches || bar || !window.__viserMutable?.canvas) return;
+    bar = document.createElement("div");
+    bar.className = "carts-review-bar";
+    bar.innerHTML =
+      `<div class="carts-review-line"></div>` +
+      [["previous", "‹", "Previous frame"], ["accept", "Accept", ""], ["work", "Needs work", ""], ["reject", "Reject", ""],
+        ["next", "›", "Next frame"], ["controls", "⋯", "All controls"]]
+        .map(([name, text, label]) => `<button data-do="${name}"${label ? ` aria-label="${label}"` : ""}>${text}</button>`).join("");
+    bar.addEventListener("click", (event) => {
+      const name = event.target.closest?.("button")?.dataset.do;
+      if (name === "controls") document.body.classList.toggle("carts-controls");
+      else if (name) ask(`do ${name}`);
+    });
+    document.body.append(bar);
+  }
+
+  function drawBar() {
+    if (!bar || !latest) return;
+    const line = bar.querySelector(".carts-review-line");
+    const text = `<span class="carts-dot ${latest.fit ?? "unknown"}"></span>Frame ${latest.label} · ${latest.review}` +
+      `${latest.fit ? ` · ${latest.fit}` : ""}`;
+    if (line.innerHTML !== text) line.innerHTML = text;
+  }
+
+  setInterval(() => {
+    document.body.classList.toggle("carts-small", small.matches);
+    buildBar();
+    drawBar();
+  }, 300);
+
+  Object.assign(window.carts, {
+    showSheet: () => showSheet(true),
+    toggleTheme: () =>
+      chooseTheme(document.documentElement.dataset.mantineColorScheme === "light" ? "dark" : "light"),
+  });
+})();

@@ -1,0 +1,227 @@
+// The strip below the picture: all frames with what was said and found about them, to be zoomed, dragged and clicked.
+// A line of the whole sequence lies below it. Needs page.js.
+(() => {
+  "use strict";
+
+  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15"]; // the last one: moved by hand
+  const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
+  const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
+  const [TOP, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
+  const LEAST = 8; // frames that are shown when zoomed in as far as it goes
+
+  let strip = null;
+  let canvas = null;
+  let readout = null;
+  let frames = 0;
+  let ids = null;
+  let codes = new Uint32Array(0); // per frame: review + 8 fit + 32 source + 128 kept + 256 badness
+  let here = 0;
+  let solving = null;
+  let fps = 0;
+  let view = [0, 1]; // first and last frame that is shown
+  let dragging = null; // "scrub" or "whole"
+  let hover = null;
+  let dirty = true;
+  let wanted = null;
+
+  function build() {
+    const below = window.__viserMutable?.canvas;
+    if (!below || strip?.isConnected) return;
+    strip = document.createElement("div");
+    strip.className = "carts-strip";
+    strip.innerHTML = `<canvas role="slider" aria-label="Timeline: drag to scrub, wheel to zoom" tabindex="-1"></canvas>
+      <output></output>`;
+    [canvas, readout] = [strip.querySelector("canvas"), strip.querySelector("output")];
+    for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
+      strip.addEventListener(kind, (event) => event.stopPropagation());
+    }
+    canvas.addEventListener("pointerdown", press);
+    canvas.addEventListener("pointermove", move);
+    canvas.addEventListener("pointerup", () => { dragging = null; });
+    canvas.addEventListener("pointerleave", () => { hover = null; dirty = true; });
+    canvas.addEventListener("wheel", zoom, { passive: false });
+    canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
+    below.parentElement.append(strip);
+    dirty = true;
+  }
+
+  const width = () => canvas.clientWidth;
+  const frameAt = (x) => view[0] + (x / width()) * (view[1] - view[0]);
+  const xOf = (frame) => ((frame - view[0]) / (view[1] - view[0])) * width();
+  const clamped = (frame) => Math.min(Math.max(Math.floor(frame), 0), frames - 1);
+
+  /** Show these frames, as many as they are, inside the sequence. */
+  function show(first, count) {
+    const shown = Math.min(Math.max(count, Math.min(LEAST, frames)), frames);
+    const start = Math.min(Math.max(first, 0), frames - shown);
+    view = [start, start + shown];
+    dirty = true;
+  }
+
+  function go(frame) {
+    if (frame === wanted) return;
+    if (wanted === null) setTimeout(() => { window.carts.report("picked", String(wanted)); wanted = null; }, 33);
+    wanted = frame;
+  }
+
+  function press(event) {
+    canvas.setPointerCapture(event.pointerId);
+    dragging = event.offsetY >= TOP + BARS + FITS + SOURCES + 2 ? "whole" : "scrub";
+    move(event);
+  }
+
+  function move(event) {
+    const inWhole = event.offsetY >= TOP + BARS + FITS + SOURCES + 2;
+    hover = clamped(inWhole && dragging !== "scrub" ? (event.offsetX / width()) * frames : frameAt(event.offsetX));
+    dirty = true;
+    if (dragging === "scrub") go(clamped(frameAt(event.offsetX)));
+    else if (dragging === "whole" && view[1] - view[0] < frames) {
+      const count = view[1] - view[0];
+      show((event.offsetX / width()) * frames - count / 2, count);
+    } else if (dragging === "whole") go(hover);
+  }
+
+  function zoom(event) {
+    event.preventDefault();
+    const count = view[1] - view[0];
+    const by = Math.exp((Math.abs(event.deltaX) > Math.abs(event.deltaY) ? 0 : event.deltaY) * 0.002);
+    const at = event.offsetX / width();
+    const next = Math.min(Math.max(count * by, Math.min(LEAST, frames)), frames);
+    show(frameAt(event.offsetX) - at * next + (event.deltaX / width()) * count, next);
+  }
+
+  /** For every column of pixels the frame that fits worst, and whether any is kept. */
+  function columns(first, last, count) {
+    const found = [];
+    for (let column = 0; column < count; column += 1) {
+      const from = Math.floor(first + ((last - first) * column) / count);
+      const to = Math.max(Math.floor(first + ((last - first) * (column + 1)) / count), from + 1);
+      let [worst, any, kept] = [0, 0, false];
+      for (let frame = from; frame < to && frame < frames; frame += 1) {
+        const code = codes[frame];
+        if (code >= worst) worst = code;
+        any = any || code;
+        kept ||= Boolean(code & 128);
+      }
+      found.push([worst || any, kept]);
+    }
+    return found;
+  }
+
+  function bar(context, x, wide, code, top, height) {
+    if (!code) return;
+    const bad = (code >> 8) / 255;
+    const high = Math.max(3, bad * height);
+    context.fillStyle = REVIEW[code & 7];
+    context.fillRect(x, top + height - high, wide, high);
+  }
+
+  function draw() {
+    const ratio = window.devicePixelRatio || 1;
+    const [w, h] = [width(), canvas.clientHeight];
+    if (!w) return;
+    [canvas.width, canvas.height] = [Math.round(w * ratio), Math.round(h * ratio)];
+    const context = canvas.getContext("2d");
+    context.scale(ratio, ratio);
+    const light = document.documentElement.dataset.mantineColorScheme === "light";
+    const ink = light ? "#374151" : "#aab4b4";
+    drawTicks(context, ink, w);
+    const count = view[1] - view[0];
+    const cells = Math.min(Math.ceil(count), Math.floor(w));
+    const wide = w / cells;
+    columns(view[0], view[1], cells).forEach(([code, kept], number) => {
+      const x = number * wide;
+      const thick = Math.max(wide - (wide > 3 ? 1 : 0), 1);
+      bar(context, x, thick, code, TOP, BARS);
+      if (FIT[(code >> 3) & 3]) { context.fillStyle = FIT[(code >> 3) & 3]; context.fillRect(x, TOP + BARS + 1, thick, FITS - 1); }
+      if (SOURCE[(code >> 5) & 3]) { context.fillStyle = SOURCE[(code >> 5) & 3]; context.fillRect(x, TOP + BARS + FITS + 1, thick, SOURCES - 1); }
+      if (kept) { context.fillStyle = light ? "#111827" : "#f8fafc"; context.fillRect(x + wide / 2 - 1, TOP, 2, 6); }
+    });
+    if (solving) {
+      context.fillStyle = "rgba(232, 121, 249, 0.2)";
+      context.fillRect(xOf(solving[0]), TOP, xOf(solving[0] + solving[1]) - xOf(solving[0]), BARS);
+    }
+    drawWhole(context, w, h, light);
+    const x = xOf(here);
+    context.fillStyle = light ? "#0f766e" : "#2dd4a7";
+    context.fillRect(x, TOP - 3, Math.max(xOf(here + 1) - x, 2), 3);
+    context.globalAlpha = 0.3;
+    context.fillRect(x, TOP, Math.max(xOf(here + 1) - x, 2), BARS + FITS + SOURCES);
+    context.globalAlpha = 1;
+    const frame = hover ?? here;
+    const code = codes[frame] ?? 0;
+    const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand"][code & 7];
+    const fit = ["", " · good", " · doubtful", " · failed"][(code >> 3) & 3];
+    readout.textContent = `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}`;
+  }
+
+  const name = (frame) => (ids && ids[frame] !== undefined ? ids[frame] : String(frame + 1));
+
+  function drawTicks(context, ink, w) {
+    const count = view[1] - view[0];
+    const least = (count / w) * 62;
+    const step = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000].find((one) => one >= least) ?? 1e5;
+    context.fillStyle = ink;
+    context.font = "10px system-ui, sans-serif";
+    for (let frame = Math.ceil(view[0] / step) * step; frame < view[1]; frame += step) {
+      const x = xOf(frame);
+      context.fillRect(x, 0, 1, TOP - 4);
+      const seconds = fps ? frame / fps : null;
+      const time = seconds === null || seconds < 1 ? "" : ` ${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
+      context.fillText(`${frame + 1}${time}`, x + 3, 8);
+    }
+  }
+
+  function drawWhole(context, w, h, light) {
+    const top = h - WHOLE;
+    context.fillStyle = light ? "#e5e7eb" : "#23282b";
+    context.fillRect(0, top, w, WHOLE);
+    const cells = Math.min(frames, Math.floor(w));
+    columns(0, frames, cells).forEach(([code], number) => {
+      if (!code) return;
+      context.fillStyle = FIT[(code >> 3) & 3] ?? REVIEW[code & 7];
+      context.fillRect((number * w) / cells, top + 2, Math.max(w / cells, 1), WHOLE - 4);
+    });
+    context.strokeStyle = light ? "#0f766e" : "#2dd4a7";
+    context.strokeRect((view[0] / frames) * w + 0.5, top + 0.5, ((view[1] - view[0]) / frames) * w - 1, WHOLE - 1);
+    context.fillStyle = context.strokeStyle;
+    context.fillRect((here / frames) * w, top, 2, WHOLE);
+  }
+
+  function everyFrame() {
+    requestAnimationFrame(everyFrame);
+    build();
+    if (!canvas || !frames) return;
+    const size = `${canvas.clientWidth} ${canvas.clientHeight} ${document.documentElement.dataset.mantineColorScheme}`;
+    if (size !== everyFrame.size) { everyFrame.size = size; dirty = true; }
+    if (!dirty) return;
+    dirty = false;
+    draw();
+  }
+
+  document.addEventListener("carts-page", ({ detail }) => {
+    if (detail.frame === here) return;
+    here = detail.frame;
+    const count = view[1] - view[0];
+    // What is shown follows the frame, but not while somebody drags.
+    if (dragging === null && (here < view[0] || here >= view[1])) show(here - count / 2, count);
+    dirty = true;
+  });
+  Object.assign(window.carts, {
+    /** All that is known, or with `whole` unset what has changed: pairs of frame and code in one row. */
+    setTimeline(message) {
+      if (message.whole) {
+        const other = frames !== message.frames;
+        [frames, fps, ids] = [message.frames, message.fps, message.ids];
+        codes = new Uint32Array(frames);
+        if (other) view = [0, frames];
+      }
+      for (let place = 0; place < message.codes.length; place += 2) codes[message.codes[place]] = message.codes[place + 1];
+      solving = message.solving;
+      dirty = true;
+    },
+    timeline: () => ({ view, frames, here, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
+    showFrames: show,
+  });
+  everyFrame();
+})();

@@ -1,0 +1,160 @@
+"""What once stood in people's way, in a real browser: one session, several checks."""
+
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import expect
+from viewer_canvas import eventually
+from viewer_tab import Tab
+
+from carts_viewer import intents
+from carts_viewer.app import ViewerApp
+from carts_viewer.state import Phase
+
+pytestmark = pytest.mark.browser
+
+
+def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(cameras=("left", "right"), width=160, height=120)
+    tab = open_tab(app)
+    tab.page.wait_for_function("carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
+    left, right = (tab.page.evaluate(f"carts.imageOnScreen({index})") for index in (0, 1))
+    apart = abs(left["left"] - right["left"]) >= left["width"] or abs(left["top"] - right["top"]) >= left["height"]
+    assert apart and left["width"] == pytest.approx(right["width"], abs=1.0)
+    # The fit of both is in view, whichever is chosen, and the run is about both.
+    expect(tab.page.locator(".carts-marks [data-camera=left] text").first).to_contain_text("Dice")
+    expect(tab.page.locator(".carts-marks [data-camera=right] text").first).to_contain_text("Dice")
+    assert app.state.every_camera
+    box = tab.page.locator("canvas").first.bounding_box()
+    assert box is not None
+
+    def on_screen(u: float, v: float) -> tuple[float, float]:
+        place = tab.page.evaluate("carts.imageOnScreen(1)")
+        return box["x"] + place["left"] + u * place["width"], box["y"] + place["top"] + v * place["height"]
+
+    # A keypoint can be placed in either; a plain click chooses the camera that is painted on.
+    tab.page.keyboard.down("Shift")
+    tab.page.mouse.click(*on_screen(0.5, 0.4))
+    tab.page.keyboard.up("Shift")
+    (pin,) = eventually(lambda: app.state.keypoints.pins, lambda pins: len(pins) == 1)
+    assert pin.camera == "right" and pin.pixel == pytest.approx((80.0, 48.0), abs=1.0)
+    tab.page.mouse.click(*on_screen(0.2, 0.2))
+    eventually(lambda: app.state.camera, lambda camera: camera == "right")
+    # Rings have names, and do not grow with the zoom.
+    expect(tab.page.locator(".carts-point text").first).not_to_be_empty()
+    width = "document.querySelector('.carts-point circle').getBoundingClientRect().width"
+    before, shown = tab.page.evaluate(width), tab.page.evaluate("carts.imageOnScreen(1).width")
+    tab.page.evaluate("carts.zoomAt(4, 0.5, 0.5)")
+    tab.page.wait_for_timeout(200)
+    assert tab.page.evaluate("carts.imageOnScreen(1).width") > 3 * shown
+    assert tab.page.evaluate(width) == pytest.approx(before, abs=0.5)
+
+
+def test_the_page_says_what_is_so(open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
+    app = open_viewer(width=160, height=120)
+    tab = open_tab(app)
+    verdict = tab.page.locator(".carts-verdict")
+    expect(verdict).to_contain_text("not checked")
+    # Key 5 shows what the optimizer would see, and is no run.
+    tab.page.keyboard.press("5")
+    eventually(lambda: app.state.maps, lambda maps: maps is not None)
+    app.wait_until_shown()
+    expect(tab.page.get_by_text("determined by this image")).to_have_count(0)
+    tab.button("Run")
+    eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
+    said = eventually(lambda: app.state.verdict, lambda found: found is not None)
+    assert said is not None
+    expect(verdict).to_contain_text(said.verdict.capitalize())
+    expect(tab.page.get_by_text("Converged")).to_have_count(0)
+    # The curve compares every iterate with the same image, is named, and says so when it is out of date.
+    assert app.state.run.curves.comparable
+    expect(tab.page.locator(".u-legend .u-label").filter(has_text="Loss [1]").first).to_be_visible()
+    expect(tab.page.locator(".carts-curve.carts-outdated")).to_have_count(0)
+    tab.page.keyboard.press("o")
+    expect(tab.page.locator(".carts-curve.carts-outdated").first).to_be_visible()
+    expect(verdict).to_contain_text("not checked")
+    # Moved by hand is not untouched.
+    app.queue.put(intents.ShowFrame(1))
+    app.wait_until_shown()
+    tab.page.keyboard.press("o")
+    tab.page.get_by_text("Review", exact=True).first.click()
+    expect(tab.page.get_by_text("1 moved by hand")).to_be_visible()
+    # Nothing is saved by a server that does not answer.
+    expect(tab.page.locator(".carts-saved span")).to_be_visible()
+    app.page.close()
+    expect(tab.page.locator("body.carts-offline .carts-saved")).to_be_visible(timeout=10_000)
+    style = "getComputedStyle(document.querySelector('.carts-saved'), '::after').content"
+    assert "NOT CONNECTED" in tab.page.evaluate(style)
+    expect(tab.page.locator(".carts-saved span")).to_be_hidden()
+
+
+def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
+    app = open_viewer(frames=12, width=160, height=120, domains=("regular", "smoke"))
+    tab = open_tab(app, (1280, 800))
+    # A slider's ends are those of the frame that is shown.
+    slider = app.joints.slider("PSM1", 0)
+    assert slider.max - slider.min <= 12
+    app.queue.put(intents.ShowFrame(11))
+    app.wait_until_shown()
+    assert slider.max - slider.min <= 12 and slider.min <= slider.value <= slider.max
+    # Keys go on working after a list was used.
+    tab.choose("Domain", "Smoke")
+    eventually(lambda: app.state.domain, lambda domain: domain == "smoke")
+    tab.page.wait_for_timeout(150)
+    tab.page.keyboard.press("b")
+    eventually(lambda: app.state.index, lambda index: index == 10)
+    # Numbers are not cut off.
+    cut = tab.page.evaluate(
+        "[...document.querySelectorAll('.mantine-Slider-root + .mantine-NumberInput-root input')]"
+        ".filter(field => field.offsetParent && field.scrollWidth > field.clientWidth + 1).length"
+    )
+    assert cut == 0
+    # An error is right below its field, and goes with a reset.
+    tab.button("Advanced settings")
+    field = tab.page.get_by_label("Noise", exact=True).first
+    app.queue.put(intents.SetSetting("noise", -5.0))
+    error = tab.page.locator(".carts-error").filter(has_text="noise is -5")
+    expect(error).to_be_visible()
+    above, below = field.bounding_box(), error.bounding_box()
+    assert above is not None and below is not None and 0 <= below["y"] - above["y"] - above["height"] < 40
+    tab.button("Reset all to the preset")
+    expect(error).to_be_hidden()
+    tab.button("Close")
+    # The timeline takes the whole width, zooms with the wheel and follows the pointer.
+    strip = tab.page.locator(".carts-strip canvas")
+    box, canvas = strip.bounding_box(), tab.page.locator("canvas").first.bounding_box()
+    assert box is not None and canvas is not None and box["width"] == pytest.approx(canvas["width"], abs=2)
+    tab.page.mouse.move(box["x"] + 0.04 * box["width"], box["y"] + 20)
+    tab.page.mouse.down()
+    eventually(lambda: app.state.index, lambda index: index == 0)
+    tab.page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 20, steps=4)
+    tab.page.mouse.up()
+    eventually(lambda: app.state.index, lambda index: index == 6)
+    tab.page.mouse.wheel(0, -200)
+    shown = eventually(lambda: tab.page.evaluate("carts.timeline().view"), lambda view: view[1] - view[0] < 10)
+    assert shown[0] < 6 < shown[1]
+    # The sheet of keys, and the theme, which stays with the tab.
+    tab.page.keyboard.press("?")
+    expect(tab.page.get_by_role("dialog", name="Keys")).to_contain_text("Accept, and go to the next")
+    tab.page.keyboard.press("Escape")
+    tab.page.get_by_role("button", name="Light or dark").click()
+    expect(tab.page.locator("html[data-mantine-color-scheme=light]")).to_have_count(1)
+
+
+def test_a_phone_shows_what_reading_and_reviewing_needs(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(width=160, height=120)
+    tab = open_tab(app, (390, 844))
+    accept = tab.page.locator(".carts-review-bar").get_by_role("button", name="Accept", exact=True)
+    expect(accept).to_be_visible()
+    place = tab.page.evaluate("carts.imageOnScreen()")
+    assert place["left"] >= 0 and place["left"] + place["width"] <= 391
+    for button in tab.page.locator(".carts-review-bar button").all():
+        box = button.bounding_box()
+        assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 391 and box["height"] >= 44
+    accept.click()
+    eventually(lambda: app.state.project.review(0).state, lambda state: state == "accepted")
+    expect(tab.page.locator(".carts-review-line")).to_contain_text("Frame 002")
