@@ -87,7 +87,7 @@ class Recorder:
             if self._error is None:
                 try:
                     self._write_one(tracked)
-                except Exception as error:  # Told at the end; the stream goes on.
+                except Exception as error:  # Reported at the end; the stream goes on.
                     self._error = error
 
     def _write_one(self, tracked: Tracked) -> None:

@@ -57,8 +57,8 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
     else:
         return SequenceAssessment(Verdict.GOOD, "The images support the fit.", "", probability, named)
     (reason, remedy), _ = against.most_common(1)[0]
-    told = f"{share} of {len(frames)} frames are not to be relied on, most of them for this: {reason}"
-    return SequenceAssessment(verdict, told, remedy, probability, named)
+    summary = f"{share} of {len(frames)} frames are not to be relied on, most of them for this: {reason}"
+    return SequenceAssessment(verdict, summary, remedy, probability, named)
 
 
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:

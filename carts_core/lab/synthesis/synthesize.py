@@ -65,10 +65,10 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     joints = plan_motion(arms, [tissue, other], cameras[0], config)
     stage = Stage(arms, joints, times)
 
-    painter = _Painter(config, stage, cameras, tissue, other)
+    tracing = _Tracing(config, stage, cameras, tissue, other)
     for frame in range(frames):
         if not _is_done(work, frame, cameras):
-            painter.paint(work, frame)
+            tracing.trace(work, frame)
         report("frames", frame + 1, frames)
 
     measured = [
@@ -80,7 +80,7 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     write_sequence_file(work / "sequence.toml", config, output, arms, cameras)
 
 
-class _Painter:
+class _Tracing:
     """Renders one frame after the other into the work folder."""
 
     def __init__(
@@ -93,7 +93,7 @@ class _Painter:
         self._conditions = Conditions(config, tissue)
         self._gains: list[float] = []
 
-    def paint(self, folder: OutputPath, frame: int) -> None:
+    def trace(self, folder: OutputPath, frame: int) -> None:
         """All pictures of one frame. Its masks come last: they say that the frame is complete."""
         masks = []
         for number, camera in enumerate(self._cameras):
