@@ -11,10 +11,10 @@ import numpy as np
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
 from ..files import append_line, file_name, output_path, write_bytes, write_text
+from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.scene import Scene
 from ..project import Edits, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
-from ..resources import shipped_robot
 from .loop import Tracked
 from .tracker import LiveVerdict
 
@@ -127,14 +127,18 @@ def _sequence_file(sequence: Sequence, scene: Scene) -> str:
         'frame_id = "{frame}"',
         'timestamp = "time"',
     ]
+    described = parse_toml(read_text(sequence.path, SEQUENCE))["arms"]
+    robots = {table["name"]: table["robot"] for table in described}
     for arm in scene.arms:
-        urdf = arm.robot.urdf
-        robot = "builtin:psm_lnd" if urdf == shipped_robot().absolute() else str(urdf)
+        robot = robots[arm.name]
+        if not robot.startswith("builtin:"):
+            robot = str(sequence.path.parent.resolve() / robot)
         lines += [
             "",
             "[[arms]]",
             f"name = {json.dumps(arm.name)}",
             f"robot = {json.dumps(robot)}",
+            f"base_link = {json.dumps(arm.robot.base_link)}",
             f"T_world_base = {np.asarray(arm.T_world_base).tolist()}",
             "",
             "[arms.joints]",

@@ -29,7 +29,12 @@ def test_a_replay_gives_a_line_for_each_frame_and_a_recording_that_can_be_review
     assert {line["type"] for line in lines} == {"result"} and all(line["masks"]["left"] for line in lines)
     original, recorded = Sequence.open(sequence), Sequence.open(folder / "sequence.toml")
     assert len(recorded) == len(lines)
-    assert [arm.name for arm in recorded.scene.arms] == ["PSM1"]
+    (arm,), (same,) = original.scene.arms, recorded.scene.arms
+    assert (same.name, same.robot.base_link, same.robot.joint_names) == (
+        arm.name,
+        arm.robot.base_link,
+        arm.robot.joint_names,
+    )
     for number, line in enumerate(lines):
         index = original.frame_ids.index(line["id"])
         one, other = recorded.frame(number), original.frame(index)
