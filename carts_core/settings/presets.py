@@ -62,11 +62,11 @@ WARM: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
 """A frame of a sequence whose neighbours are known."""
 
 LIVE: tuple[Stage, ...] = (
-    Observe(scale=1.0, margin=12, attention=12),
-    Descend(blur=1.2, steps=2, tolerance=0.06),
+    Observe(scale=0.75, margin=12, attention=12),
+    Descend(blur=1.2, steps=1),
     AlignEdges(steps=8),
 )
-"""A frame of a live stream, near where it is expected: one small observation, two steps at most, and the outlines."""
+"""A frame of a live stream, near where it is expected: one small observation, one step, and the outlines."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
 """How well a given state fits a frame, in a smaller image."""
