@@ -64,6 +64,8 @@ class Calibrate:
         observer = self.network.observer(self.solving.chosen)
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [sequence.frame(index, self.domain, cameras) for index in indices]
+            known = observer.warnings(sequence, indices[0], self.domain, tuple(cameras), background=False)
+            print_hints(console, *known)
             optimizer = CalibrationOptimizer(
                 sequence.scene,
                 frames,

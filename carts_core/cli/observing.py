@@ -10,6 +10,7 @@ from .selection import Network
 if TYPE_CHECKING:
     from ..networks.extractor import FeatureExtractor
     from ..optimization import MaskPredictor
+    from ..recording import Sequence
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,23 @@ class Observer:
     """Fingerprint of the networks and of who runs them; empty without any."""
     masked: bool
     """Whether masks of the sequence are fitted."""
+
+    def warnings(
+        self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
+    ) -> list[str]:
+        """What speaks against the network for these arms and images, from one frame; nothing where masks are fitted.
+
+        Args:
+            sequence, index, domain, cameras: which frame.
+            background: whether the solver knows the empty background.
+        """
+        if self.masked:
+            return []
+        from ..optimization import familiarity
+
+        frame = sequence.frame(index, domain, cameras)
+        found = familiarity(sequence.scene.with_cameras(cameras), frame, self.predictor)
+        return found.warnings(", ".join(cameras), background=background)
 
 
 @dataclass(frozen=True)

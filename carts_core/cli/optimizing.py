@@ -18,6 +18,7 @@ from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
 from ..recording import Frame, Sequence
+from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
@@ -87,6 +88,7 @@ class Optimizing:
 
     def _run(self, part: _Part) -> None:
         frames, output, together = self._frames, part.output, self._asked.mode == "sequence"
+        sequence, scene = self._sequence, self._sequence.scene.with_cameras(part.cameras)
         origins = self._origins(part)
         common = origins.common
         if together:
@@ -96,6 +98,10 @@ class Optimizing:
             now = {index: origins.of(index) for index in frames}
         todo = self._to_do(part, now)
         self._tell_of_others(part, common)
+        if todo and isinstance(self._solver, SurfaceSolver):
+            known = Backgrounds.of(sequence, part.cameras, part.domain).covers(scene)
+            warned = self._observer.warnings(sequence, todo[0], part.domain, part.cameras, background=known)
+            print_hints(self._console, *warned)
         if not together:
             self._each_alone(todo, part, now)
         elif todo:

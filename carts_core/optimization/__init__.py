@@ -15,6 +15,8 @@ from .calibration import UnknownChange as UnknownChange
 from .counterfactual import Backgrounds as Backgrounds
 from .factors import Factor as Factor
 from .factors import Linearization as Linearization
+from .familiarity import Familiarity as Familiarity
+from .familiarity import familiarity as familiarity
 from .fit import StopReason as StopReason
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
@@ -46,6 +48,7 @@ __all__ = [
     "DescentSolver",
     "Evidence",
     "Factor",
+    "Familiarity",
     "FrameEstimate",
     "FrameOptimizer",
     "FramePredictor",
@@ -66,5 +69,6 @@ __all__ = [
     "SurfaceSolver",
     "UnknownChange",
     "Verdict",
+    "familiarity",
     "propose_ignore",
 ]
