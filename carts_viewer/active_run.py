@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from carts_core.model.scene import Scene
-from carts_core.optimization import Assessment, Iterate, Progress, StopReason
+from carts_core.optimization import Assessment, FreeParameters, Iterate, Progress, StopReason
 from carts_core.project import FitVerdict, Provenance, Source
 from carts_viewer.state import Pose
 
@@ -44,8 +44,15 @@ class ActiveRun:
     """One run on one frame: the optimizer, and where it started."""
 
     def __init__(
-        self, optimizer: Optimizer, scene: Scene, start: Pose, cameras: tuple[str, ...], provenance: Provenance
+        self,
+        optimizer: Optimizer,
+        scene: Scene,
+        start: Pose,
+        cameras: tuple[str, ...],
+        provenance: Provenance,
+        free: FreeParameters,
     ) -> None:
+        self._free = free
         self.start = start
         self.provenance = provenance
         self.cameras = cameras
@@ -87,10 +94,16 @@ class ActiveRun:
         return self._optimizer.base_frame_gain()
 
     def pose(self, iterate: Iterate) -> Pose:
-        """An iterate's state, which knows the run's cameras only, as a pose of the whole scene."""
-        state = iterate.state.to("cpu")
-        extrinsics = self.start.scene.T_camera_world.clone()
-        intrinsics = self.start.scene.intrinsics.clone()
-        extrinsics[self._rows] = state.T_camera_world
-        intrinsics[self._rows] = state.intrinsics
-        return Pose(replace(state, T_camera_world=extrinsics, intrinsics=intrinsics), Source.OPTIMIZER)
+        """An iterate's state, which knows the run's cameras only, as a pose of the whole scene.
+
+        What was not free is exactly as it was: rounding must not count as a new calibration of all frames.
+        """
+        state, start, free = iterate.state.to("cpu"), self.start.scene, self._free
+        extrinsics, intrinsics = start.T_camera_world.clone(), start.intrinsics.clone()
+        if free.extrinsics:
+            extrinsics[self._rows] = state.T_camera_world
+        if free.intrinsics:
+            intrinsics[self._rows] = state.intrinsics
+        bases = state.T_world_base if free.base_frames else start.T_world_base
+        scene = replace(state, T_world_base=bases, T_camera_world=extrinsics, intrinsics=intrinsics)
+        return Pose(scene, Source.OPTIMIZER)

@@ -16,6 +16,7 @@ from carts_viewer.handlers.annotating import AnnotatingHandler
 from carts_viewer.handlers.browsing import BrowsingHandler
 from carts_viewer.handlers.exporting import Deliver, ExportingHandler
 from carts_viewer.handlers.finding import FindingHandler
+from carts_viewer.handlers.jobs import JobsHandler
 from carts_viewer.handlers.optimizing import OptimizingHandler
 from carts_viewer.handlers.painting import PaintingHandler
 from carts_viewer.handlers.posing import PosingHandler
@@ -57,11 +58,16 @@ class Controller:
         self._annotating = AnnotatingHandler(context, run, self._browsing.show)
         self._propagating = PropagatingHandler(context, run, optimizers)
         self._exporting = ExportingHandler(context, run, deliver)
+        self._jobs = JobsHandler(context, run, optimizers, self._propagating, self._exporting)
         self._handlers: dict[type[intents.Intent], Callable[[Any], None]] = {
             intents.Browsing: self._browsing.handle,
             intents.Posing: PosingHandler(context, run).handle,
             intents.Optimizing: self._optimizing.handle,
             intents.Annotation: self._annotating.handle,
+            # What takes long is queued; the rest of its kind is done at once.
+            intents.Solve: self._jobs.handle,
+            intents.Export: self._jobs.handle,
+            intents.Jobs: self._jobs.handle,
             intents.Propagating: self._propagating.handle,
             intents.Exporting: self._exporting.handle,
             intents.Painting: PaintingHandler(context, run).handle,
@@ -88,10 +94,11 @@ class Controller:
         if handle is None:
             raise unknown(intent)
         handle(intent)
+        self._jobs.settle()
 
     def wait_time(self) -> float | None:
         """How long nothing needs to be done unless somebody asks [s]; None for ever."""
-        handlers = (self._optimizing, self._propagating, self._exporting, self._browsing)
+        handlers = (self._optimizing, self._propagating, self._exporting, self._jobs, self._browsing)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
@@ -108,8 +115,13 @@ class Controller:
     def advance(self) -> None:
         """Do one bit of what is going on: an iteration, a frame to be solved or exported, the next frame of playing."""
         self._optimizing.advance()
-        self._propagating.advance()
-        self._exporting.advance()
+        try:
+            self._propagating.advance()
+            self._exporting.advance()
+        except Exception as error:
+            self._jobs.fail(str(error))
+            raise
+        self._jobs.advance()
         self._browsing.advance()
         if self._editor.overdue_in() == 0.0:
             self._context.save()
@@ -141,6 +153,7 @@ class Controller:
             with suppress(CartsError):
                 self._propagating.finish()
             self._exporting.cancel()
+            self._jobs.fail(text)
             self._context.change(playing=False)
 
     def close(self) -> None:
@@ -151,6 +164,7 @@ class Controller:
         """
         self._exporting.cancel()
         self._propagating.finish()
+        self._jobs.close()
         self._context.save()
 
     def say(self, text: str | None) -> None:

@@ -11,6 +11,7 @@ from carts_viewer.panels.find import FindPanel
 from carts_viewer.panels.fit import FitPanel
 from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.inputs import Panel
+from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel
 from carts_viewer.panels.keyframes import KeyframesPanel
 from carts_viewer.panels.keypoints import KeypointsPanel
@@ -91,6 +92,8 @@ class Layout:
             ]
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
+        with right.add_tab("Jobs"):
+            panels.append(JobsPanel(page, emit))
         with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, storage, emit))
         with right.add_tab("Help"):

@@ -1,12 +1,13 @@
 """Frames that were solved together, each compared with how it was and, where that is better, with a run of its own."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from carts_core.optimization import FrameEstimate
+from carts_core.optimization import FrameEstimate, FreeParameters
 from carts_core.project import Edits, Figures, Key, ProjectState, Provenance, Review, ReviewState, Source
 from carts_core.recording import Frame
 from carts_viewer.active_run import ActiveRun
@@ -77,22 +78,46 @@ class Comparison:
         known = [value for value in dice if value is not None]
         return replace(fit, dice=min(known, default=None))
 
+    def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
+        """A run on one frame alone, from how it is: None after every step, at last its fit, edits and what is worse.
+
+        Raises:
+            CartsError: an image, the weights or a setting is not usable.
+        """
+        frame = self._frame(index, state)
+        was = self._session.pose(frame)
+        earlier = self._fit(frame, was, state)
+        cameras = [camera.name for camera in self._session.scene.cameras]
+        provenance = self._optimizers.provenance(cameras, state.settings, _joints_alone(state))
+        for outcome in self._steps(frame, was, state, provenance):
+            yield None if outcome is None else (*outcome, outcome[0].worse_than(earlier))
+
     def _alone(self, frame: Frame, start: Pose, state: ViewState, of_many: Provenance) -> tuple[Fit, Edits]:
         """The fit of a run on this frame alone, and the edits that take it."""
+        settings = json.dumps({**json.loads(of_many.settings or "{}"), "alone": True})
+        steps = self._steps(frame, start, state, replace(of_many, settings=settings))
+        return next(outcome for outcome in steps if outcome is not None)
+
+    def _steps(
+        self, frame: Frame, start: Pose, state: ViewState, provenance: Provenance
+    ) -> Iterator[tuple[Fit, Edits] | None]:
         session, cameras = self._session, [camera.name for camera in self._session.scene.cameras]
-        free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
         ignore = session.ignored(frame.index, cameras)
         optimizer = self._optimizers.make(
-            session.sequence, frame.index, state.domain, cameras, start, state.settings, free, ignore
+            session.sequence, frame.index, state.domain, cameras, start, state.settings, _joints_alone(state), ignore
         )
-        provenance = replace(of_many, settings=json.dumps({**json.loads(of_many.settings or "{}"), "alone": True}))
-        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance)
+        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance, _joints_alone(state))
         while run.step() is not None:
-            pass
+            yield None
         best = run.best()
         assert best is not None
         pose = run.pose(best)
-        return self._fit(frame, pose, state), session.edits(frame, pose.scene, provenance, best.joint_std())
+        yield self._fit(frame, pose, state), session.edits(frame, pose.scene, provenance, best.joint_std())
+
+
+def _joints_alone(state: ViewState) -> FreeParameters:
+    """What a run on one frame of many may move: the calibration is that of all frames."""
+    return replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
 
 
 def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:

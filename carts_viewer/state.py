@@ -15,6 +15,7 @@ from carts_core.recording import Frame
 from carts_core.settings import Direction, SolverName
 from carts_viewer.compare import Compare
 from carts_viewer.finding import FrameFilter
+from carts_viewer.jobs import Job
 from carts_viewer.layers import Layer
 from carts_viewer.strokes import Brush
 
@@ -202,6 +203,8 @@ class ViewState:
     """Of the shown pose, frame and domain; None while nobody needs them."""
     scores: Scores | None = None
     """Of the shown pose; None until they are computed, which is after its picture has been sent."""
+    jobs: tuple[Job, ...] = ()
+    """What takes long, oldest first."""
     busy: str | None = None
     """What the worker is preparing, for people."""
     export: ExportState | None = None

@@ -14,7 +14,7 @@ from carts_viewer.state import ViewState
 
 _log = logging.getLogger(__name__)
 
-_BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting)
+_BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
 """Intents that may begin what takes long."""
 
 

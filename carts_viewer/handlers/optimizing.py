@@ -192,7 +192,7 @@ class OptimizingHandler:
             sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, ignore
         )
         provenance = self._optimizers.provenance(cameras, state.settings, state.free)
-        return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance)
+        return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance, state.free)
 
     def _start(self) -> None:
         if self._context.state.settings_error is not None:

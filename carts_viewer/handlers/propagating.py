@@ -85,8 +85,12 @@ class PropagatingHandler:
             raise CartsError(f"There is no direction {intent.direction!r}.")
         self._context.change(direction=intent.direction)
 
-    @handle.register
-    def _(self, intent: intents.Solve) -> None:
+    def solve(self, whole: bool, at: int) -> None:
+        """Begin to solve all frames, or those between the kept frames around the frame `at`.
+
+        Raises:
+            CartsError: there is nothing to solve, or it could not be saved.
+        """
         if self._run is not None:
             raise CartsError("Frames are being solved already. Wait, or stop that first.")
         project = self._session.editor.project
@@ -94,12 +98,12 @@ class PropagatingHandler:
             raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
         self._open_run.end("Stopped: many frames are solved together")
         self._context.save()
-        view, index = self._session.editor.view, self._context.state.index
-        if not (intent.whole or view.kept_frames):
+        view = self._session.editor.view
+        if not (whole or view.kept_frames):
             raise CartsError(
                 "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
             )
-        frames = range(len(self._session.sequence)) if intent.whole else between_kept(view, index)
+        frames = range(len(self._session.sequence)) if whole else between_kept(view, at)
         kept = [frame for frame in view.kept_frames if frame in frames]
         if len(kept) == len(frames):
             raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")

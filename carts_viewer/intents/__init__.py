@@ -48,6 +48,12 @@ from .finding import Finding as Finding
 from .finding import ReviewFound as ReviewFound
 from .finding import SetFilter as SetFilter
 from .finding import ShowFound as ShowFound
+from .jobs import Calibrate as Calibrate
+from .jobs import CancelJob as CancelJob
+from .jobs import ForgetJobs as ForgetJobs
+from .jobs import Jobs as Jobs
+from .jobs import OptimizeFrames as OptimizeFrames
+from .jobs import RepeatJob as RepeatJob
 from .optimizing import Assess as Assess
 from .optimizing import Optimizing as Optimizing
 from .optimizing import Pause as Pause

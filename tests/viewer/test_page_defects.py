@@ -158,3 +158,30 @@ def test_a_phone_shows_what_reading_and_reviewing_needs(
     accept.click()
     eventually(lambda: app.state.project.review(0).state, lambda state: state == "accepted")
     expect(tab.page.locator(".carts-review-line")).to_contain_text("Frame 002")
+
+
+def test_jobs_go_on_while_the_page_is_used_and_a_server_that_comes_back_finds_everybody_where_they_were(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(frames=6, width=160, height=120)
+    tab = open_tab(app)
+    tab.page.get_by_text("Jobs", exact=True).first.click()
+    tab.button("Optimize each alone")
+    running = tab.page.locator(".carts-jobs li.running")
+    expect(running).to_contain_text("Optimize 6 frames, each alone")
+    tab.page.keyboard.press("n")
+    eventually(lambda: app.state.index, lambda index: index == 1)
+    tab.button("Cancel")
+    expect(tab.page.locator(".carts-jobs li.cancelled")).to_be_visible()
+    # The same address answers again, by another server: frame and tab are those from before.
+    app.queue.put(intents.ShowFrame(4))
+    app.wait_until_shown()
+    tab.page.wait_for_function("carts.shown().frame == 4")
+    port = int(app.url.split(":")[2].strip("/").split("/")[0].split("?")[0])
+    app.close()
+    expect(tab.page.locator("body.carts-offline")).to_be_attached(timeout=10_000)
+    with ViewerApp.open(app.sequence.path, port=port) as again:
+        again.wait_until_shown(60)
+        eventually(lambda: again.state.index, lambda index: index == 4, timeout=60)
+        expect(tab.page.locator("[role=tab][aria-selected=true]").filter(has_text="Jobs")).to_be_visible(timeout=20_000)
+        expect(tab.page.locator(".carts-jobs li.cancelled")).to_be_visible()

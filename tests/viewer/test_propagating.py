@@ -173,7 +173,6 @@ def test_closing_saves_what_is_solved(desk: Desk) -> None:
     [
         ((), "no keyframe yet"),
         ((intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True)), "needs the solver"),
-        ((intents.Solve(whole=True),), "already"),
     ],
 )
 def test_what_cannot_be_solved_is_refused_with_the_reason(

@@ -1,0 +1,243 @@
+"""What intents about jobs do: one after the other is started, followed, stopped and remembered."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import singledispatchmethod
+from typing import Any
+
+from carts_core.errors import CartsError
+from carts_core.export import FORMATS
+from carts_core.project import frames_in
+from carts_core.project.queries import UNREVIEWED
+from carts_viewer import intents
+from carts_viewer.checks import unknown
+from carts_viewer.context import Context, OpenRun
+from carts_viewer.finding import found
+from carts_viewer.handlers.exporting import ExportingHandler
+from carts_viewer.handlers.propagating import PropagatingHandler
+from carts_viewer.job_work import Progress, calibrate, optimize_frames
+from carts_viewer.jobs import Job, JobList, JobState
+from carts_viewer.running import OptimizerFactory
+from carts_viewer.solved import Comparison
+
+_SAVE_EVERY = 5.0
+"""How often it is written down how far a job is [s]."""
+
+
+class JobsHandler:
+    """The handler of what takes long; everything else goes on meanwhile."""
+
+    def __init__(
+        self,
+        context: Context,
+        run: OpenRun,
+        optimizers: OptimizerFactory,
+        propagating: PropagatingHandler,
+        exporting: ExportingHandler,
+    ) -> None:
+        self._context = context
+        self._open_run = run
+        self._optimizers = optimizers
+        self._propagating, self._exporting = propagating, exporting
+        self._comparison = Comparison(context.session, context.renderer, optimizers)
+        project = context.session.editor.project
+        self._list = JobList(project.path, kept=project.writable)
+        self._work: Iterator[Progress] | None = None
+        self._saved_at = 0.0
+        self._publish()
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Intent) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def wait_time(self) -> float | None:
+        """0 while there is something to do; None when there is not."""
+        return 0.0 if any(not job.over for job in self._list.jobs) else None
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.Solve) -> None:
+        index = self._context.state.index
+        self._queue(
+            "solve", "Solve all frames" if intent.whole else "Solve between keyframes", {**asdict(intent), "at": index}
+        )
+
+    @handle.register
+    def _(self, intent: intents.Export) -> None:
+        label = FORMATS[intent.format].label if intent.format in FORMATS else str(intent.format)
+        self._queue("export", f"Export {intent.frames.lower()} as {label}", asdict(intent))
+
+    @handle.register
+    def _(self, intent: intents.OptimizeFrames) -> None:
+        frames = self._frames(intent.frames)
+        self._queue("optimize", f"Optimize {len(frames)} frames, each alone", {"frames": frames})
+
+    @handle.register
+    def _(self, intent: intents.Calibrate) -> None:
+        self._queue("calibrate", f"Calibrate on {intent.frames} frames", {"frames": int(intent.frames)})
+
+    @handle.register
+    def _(self, intent: intents.CancelJob) -> None:
+        job = self._list.find(intent.number)
+        if job.state is JobState.RUNNING:
+            self._stop(job)
+        if not job.over:
+            self._end(job, JobState.CANCELLED, "Cancelled; what was saved is kept.")
+
+    @handle.register
+    def _(self, intent: intents.RepeatJob) -> None:
+        job = self._list.find(intent.number)
+        if not job.over:
+            raise CartsError("This job has not ended yet.")
+        first = job.done if job.kind == "optimize" and job.state is not JobState.DONE else 0
+        self._queue(job.kind, job.title, {**job.options, "first": first})
+
+    @handle.register
+    def _(self, intent: intents.ForgetJobs) -> None:
+        self._list.forget()
+        self._publish()
+
+    # ---- The queue -------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Begin the next job, or follow the one that runs.
+
+        Raises:
+            CartsError: the job could not be done; it is said to have failed, and the next one is begun later.
+        """
+        job = self._running()
+        if job is None:
+            job = next((job for job in self._list.jobs if job.state is JobState.WAITING), None)
+            if job is None:
+                return
+            self._begin(job)
+        else:
+            self._follow(job)
+
+    def settle(self) -> None:
+        """Notice that what runs was stopped by somebody who did not ask for the job."""
+        job = self._running()
+        if job is not None and job.kind in ("solve", "export"):
+            self._follow(job)
+
+    def fail(self, text: str) -> None:
+        """Say of the job that runs, if there is one, that it has failed."""
+        job = self._running()
+        if job is not None:
+            self._end(job, JobState.FAILED, text)
+
+    def close(self) -> None:
+        """Write down how far everything is; the viewer ends."""
+        self._list.save()
+
+    def _queue(self, kind: str, title: str, options: dict[str, Any]) -> None:
+        job = self._list.add(kind, title, options)
+        if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
+            # At once, so that whoever asked for what cannot be learns it now.
+            self._begin(job)
+        self._publish()
+
+    def _begin(self, job: Job) -> None:
+        self._list.change(job.number, "begun", state=JobState.RUNNING, began=time.time())
+        try:
+            if job.kind == "solve":
+                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)))
+            elif job.kind == "export":
+                names = ("format", "frames", "parts", "images", "shown_camera")
+                self._exporting.handle(intents.Export(**{name: job.options[name] for name in names}))
+            else:
+                self._open_run.end("Stopped: a job was started")
+                self._work = self._own(job)
+        except Exception as error:
+            self._end(job, JobState.FAILED, str(error))
+            raise
+        self._publish()
+
+    def _own(self, job: Job) -> Iterator[Progress]:
+        if job.kind == "optimize":
+            frames = [index for index in job.options["frames"] if 0 <= index < len(self._context.session.sequence)]
+            return optimize_frames(self._context, self._comparison, frames, int(job.options.get("first", 0)))
+        if job.kind == "calibrate":
+            return calibrate(self._context, self._optimizers, int(job.options["frames"]))
+        raise CartsError(f"There is no job of the kind {job.kind!r}.")
+
+    def _follow(self, job: Job) -> None:
+        state = self._context.state
+        if job.kind == "solve":
+            solve = state.solve
+            if solve is None or not solve.running:
+                self._end(job, JobState.DONE, solve.text if solve else "")
+            else:
+                self._report(job, Progress(solve.done, len(solve.frames), solve.text))
+        elif job.kind == "export":
+            export = state.export
+            if export is None:
+                self._end(job, JobState.CANCELLED, "Cancelled; nothing of it is left.")
+            elif export.path is not None:
+                self._end(job, JobState.DONE, f"{export.frames} frames in {export.path}")
+            else:
+                self._report(job, Progress(export.done, export.total, export.format))
+        else:
+            self._step(job)
+
+    def _step(self, job: Job) -> None:
+        try:
+            progress = None if self._work is None else next(self._work, None)
+        except Exception as error:
+            self._work = None
+            self._end(job, JobState.FAILED, str(error))
+            raise
+        if progress is None:
+            self._work = None
+            self._end(job, JobState.DONE, self._list.find(job.number).text)
+        else:
+            self._report(job, progress)
+
+    def _report(self, job: Job, progress: Progress) -> None:
+        now = self._list.find(job.number)
+        if (now.done, now.total, now.text) == (progress.done, progress.total, progress.text) and progress.line is None:
+            return
+        self._list.change(job.number, progress.line, done=progress.done, total=progress.total, text=progress.text)
+        if time.monotonic() - self._saved_at > _SAVE_EVERY:
+            self._saved_at = time.monotonic()
+            self._list.save()
+        self._publish()
+
+    def _stop(self, job: Job) -> None:
+        if job.kind == "solve":
+            self._propagating.finish()
+        elif job.kind == "export":
+            self._exporting.cancel()
+        self._work = None
+
+    def _end(self, job: Job, state: JobState, text: str) -> None:
+        done = {"done": job.total} if state is JobState.DONE and job.total else {}
+        self._list.change(job.number, f"{state}: {text}", state=state, text=text, ended=time.time(), **done)
+        self._context.change(busy=None)
+        self._publish()
+
+    def _running(self) -> Job | None:
+        return next((job for job in self._list.jobs if job.state is JobState.RUNNING), None)
+
+    def _frames(self, which: str) -> list[int]:
+        state = self._context.state
+        view = self._context.session.editor.view
+        if which == "found":
+            frames = found(view, state.filter)
+        elif which == "all":
+            frames = list(range(len(self._context.session.sequence)))
+        else:
+            frames = frames_in(view, UNREVIEWED)
+        if not frames:
+            raise CartsError("There is no such frame. Choose others.")
+        return frames
+
+    def _publish(self) -> None:
+        self._context.change(jobs=self._list.jobs)

@@ -1,0 +1,117 @@
+"""What jobs do that no other part of the viewer does: runs on many frames, each alone, and a calibration."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from carts_core.errors import CartsError
+from carts_core.model.scene import Scene
+from carts_core.optimization.calibration import CalibrationOptimizer
+from carts_core.project import CorrectedIntrinsics, CorrectedTransform, Figures, Key, Provenance, Source
+from carts_core.recording import spread
+from carts_core.settings import CALIBRATION_SETTINGS
+from carts_viewer.context import Context
+from carts_viewer.running import OptimizerFactory, scene_at
+from carts_viewer.solved import Comparison, reviewed
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is."""
+
+    done: int
+    total: int
+    text: str
+    line: str | None = None
+    """For the log."""
+
+
+def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Iterator[Progress]:
+    """Run on each of these frames alone, from the one at place `first` on; a result that fits worse is not taken.
+
+    Every frame is a step of undo of its own, and is saved before the next one begins.
+    """
+    taken = worse = 0
+    for place, index in enumerate(frames):
+        if place < first:
+            continue
+        name = context.session.sequence.frame_ids[index]
+        session = context.session
+        if index in session.editor.view.kept_frames:
+            yield Progress(place + 1, len(frames), f"{name} is kept as it is", f"{name}: kept, not touched")
+            continue
+        yield Progress(place, len(frames), f"Frame {name}")
+        steps = comparison.own_run(index, context.state)
+        while (outcome := next(steps)) is None:
+            yield Progress(place, len(frames), f"Frame {name}")
+        fit, edits, remark = outcome
+        if remark is not None:
+            worse += 1
+            yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: not taken, it would be worse ({remark})")
+            continue
+        context.save()
+        review = reviewed(index, session.editor.view.review(index))
+        changes = {**edits, **review, Key.verdict(index): fit.verdict}
+        session.editor.project.apply(f"Optimize, frame {name}", changes, {index: Figures(fit.loss, fit.dice)})
+        context.refresh()
+        taken += 1
+        yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: {fit.verdict.verdict}, loss {fit.loss:.3g}")
+    text = f"{taken} frames optimized" + (f", {worse} not taken because they would be worse" if worse else "")
+    yield Progress(len(frames), len(frames), text)
+
+
+def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Iterator[Progress]:
+    """Fit base frames, and cameras where they are free, to frames spread over the sequence; one step of undo."""
+    session, state = context.session, context.state
+    sequence = session.sequence
+    cameras = [camera.name for camera in session.scene.cameras]
+    indices = spread(len(sequence), min(count, len(sequence)))
+    free = replace(
+        state.free, base_frames=state.free.base_frames or not (state.free.extrinsics or state.free.intrinsics)
+    )
+    yield Progress(0, 0, f"Reading {len(indices)} frames")
+    frames = [sequence.frame(index, state.domain, cameras) for index in indices]
+    ignored = [session.ignored(index, cameras) for index in indices]
+    before = session.editor.view
+    scene = scene_at(session.scene, session.measured(state.frame))
+    optimizer = CalibrationOptimizer(
+        scene, frames, optimizers.prepare(), free=replace(free, joints=False), ignore=ignored
+    )
+    most = CALIBRATION_SETTINGS.iterations
+    while (iterate := optimizer.step()) is not None:
+        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
+        yield Progress(iterate.index, most, text, text)
+    result = optimizer.result()
+    for change in result.unknowns:
+        line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f} {change.unit}"
+        yield Progress(most, most, "Comparing", line)
+    found = result.assessment
+    verdict = "" if found is None else f"{found.verdict.value}: {found.reason} {found.remedy}"
+    provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free)
+    edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
+    if not edits:
+        yield Progress(most, most, f"Nothing was changed. {verdict}")
+        return
+    if session.editor.view.records.get(-1) is not before.records.get(-1):
+        raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
+    context.save()
+    session.editor.project.apply(f"Calibrate on {len(indices)} frames", edits)
+    context.refresh()
+    yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}")
+
+
+def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> dict[Key[Any], Any]:
+    """What a project must change so that it has this calibration."""
+    edits: dict[Key[Any], Any] = {}
+    for old, new in zip(before.arms, after.arms, strict=True):
+        if (old.T_world_base != new.T_world_base).any():
+            edits[Key.base_frame(new.name)] = CorrectedTransform(
+                tuple(map(tuple, new.T_world_base.tolist())), provenance
+            )
+    for old, new in zip(before.cameras, after.cameras, strict=True):
+        if (old.T_camera_world != new.T_camera_world).any():
+            matrix = tuple(map(tuple, new.T_camera_world.tolist()))
+            edits[Key.extrinsics(new.name)] = CorrectedTransform(matrix, provenance)
+        if old.intrinsics != new.intrinsics:
+            edits[Key.intrinsics(new.name)] = CorrectedIntrinsics(tuple(new.intrinsics), provenance)
+    return edits

@@ -1,0 +1,84 @@
+"""The jobs: what waits, runs and has ended, with progress, time left, log, and buttons for the chosen one."""
+
+import time
+
+import viser
+
+from carts_viewer import intents
+from carts_viewer.jobs import Job, JobState
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
+from carts_viewer.state import ViewState
+from carts_viewer.transport.page import Page
+
+_NONE = "None"
+_FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "All": "all"}
+
+
+class JobsPanel:
+    """Queues jobs and shows how they go."""
+
+    def __init__(self, page: Page, emit: Emit) -> None:
+        gui = page.server.gui
+        self._numbers: dict[str, int] = {}
+        self._shown: tuple[Job, ...] | None = None
+        with gui.add_folder("New job"):
+            self._frames = gui.add_dropdown("Frames", list(_FRAMES))
+            optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
+            self._count = gui.add_number("Frames", 20, min=1, max=500, step=1, hint="Spread evenly over the sequence")
+            calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
+            gui.add_html(
+                '<p class="carts-caption">Solving (Review) and exports queue up here, too. A calibration fits base '
+                "frames, or what is ticked under Free parameters.</p>"
+            )
+        with gui.add_folder("Jobs"):
+            self._list = gui.add_html("")
+            self._chosen = gui.add_dropdown("Job", [_NONE])
+            self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
+            self._again = gui.add_button("Start again", icon=viser.Icon.REFRESH, color="gray")
+            self._forget = gui.add_button("Clear ended", color="gray")
+            page.row(self._cancel, self._again, self._forget)
+            self._log = gui.add_html("")
+        on_click(optimize, lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")), emit)  # type: ignore[arg-type]
+        on_click(calibrate, lambda _: intents.Calibrate(int(self._count.value)), emit)
+        on_click(self._cancel, lambda _: intents.CancelJob(self._number()), emit)
+        on_click(self._again, lambda _: intents.RepeatJob(self._number()), emit)
+        on_click(self._forget, lambda _: intents.ForgetJobs(), emit)
+        on_input(self._chosen, lambda _: intents.Refresh(), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the list up to date; the newest job is chosen when it comes."""
+        jobs = tuple(reversed(state.jobs))
+        numbers = {f"{job.number}. {job.title}": job.number for job in jobs}
+        if numbers != self._numbers:
+            newer = jobs and max(numbers.values()) > max(self._numbers.values(), default=0)
+            self._numbers = numbers
+            self._chosen.options = tuple(numbers) or (_NONE,)
+            if newer:
+                self._chosen.value = next(iter(numbers))
+        now = time.time()
+        self._list.content = (
+            f'<ul class="carts-jobs" aria-label="Jobs">{"".join(job_line(job, now) for job in jobs)}</ul>'
+        )
+        job = next((job for job in jobs if job.number == self._number()), None)
+        self._cancel.disabled = job is None or job.over
+        self._again.disabled = job is None or not job.over
+        self._forget.disabled = not any(job.over for job in jobs)
+        lines = "<br>".join(escaped(line) for line in (job.log[-12:] if job else ()))
+        self._log.content = f'<p class="carts-caption carts-log" role="log">{lines}</p>'
+
+    def _number(self) -> int:
+        return self._numbers.get(self._chosen.value, -1)
+
+
+def job_line(job: Job, now: float) -> str:
+    """One job with its progress and the time that is left, as HTML."""
+    left = job.seconds_left(now)
+    eta = "" if left is None else f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
+    running = job.state is JobState.RUNNING
+    steps = f" {job.done} of {job.total}{eta}" if running and job.total else ""
+    share = 100.0 * job.done / job.total if job.total else 0.0
+    bar = f'<progress max="100" value="{share:.0f}"></progress>' if running else ""
+    return (
+        f'<li class="{job.state}"><b>{job.number}. {escaped(job.title)}</b> {job.state}{steps}{bar}'
+        f"<br>{escaped(job.text)}</li>"
+    )
