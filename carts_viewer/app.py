@@ -61,9 +61,11 @@ class ViewerApp:
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
+        page: Page | None = None,
     ) -> None:
         """Start serving an open sequence with its project, which is closed with the viewer; the rest as in `open`."""
         self._report = report
+        self._own_page = page is None
         self._closed = False
         self.sequence = sequence
         self.scene = sequence.scene
@@ -78,7 +80,7 @@ class ViewerApp:
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")
         self._renderer.arm_ids(state.pose.scene, state.camera)
-        self.page = Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
+        self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
         self.url = self.page.url
         layout = Layout(self.page, self._session, storage, state, self.queue)
         self.joints = layout.joints
@@ -107,6 +109,7 @@ class ViewerApp:
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
+        page: Page | None = None,
     ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
 
@@ -119,6 +122,7 @@ class ViewerApp:
             inference: Who runs the surface network.
             weights: Weights files; a network that none is given of is the shipped one.
             report: Called with a line about what takes long.
+            page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
@@ -141,6 +145,7 @@ class ViewerApp:
                 inference=inference,
                 weights=weights,
                 report=report,
+                page=page,
             )
         except BaseException:
             storage.close()
@@ -172,7 +177,8 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
-        self.page.close()
+        if self._own_page:
+            self.page.close()
         with ExitStack() as stack:
             # From the last to the first, whatever fails.
             stack.callback(self._storage.close)

@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TextIO
@@ -13,6 +14,8 @@ from carts_core.settings.inference import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.ending import EndRequest
 from carts_viewer.opening import opened_in_browser
+from carts_viewer.start.site import Site
+from carts_viewer.transport.guard import check_address
 
 
 def serve(
@@ -67,18 +70,63 @@ def serve(
                 end.wait()
             _say("\nClosing.")
         finally:
-            _close(app)
+            _close(app, lambda: app.project.incident)
 
 
-def _close(app: ViewerApp) -> None:
+def serve_site(
+    folders: Sequence[Path],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    device: str = "cpu",
+    weights: tuple[Path, ...] = (),
+    open_browser: bool = False,
+) -> None:
+    """Serve the start page until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
+
+    Args:
+        folders: What the page may look into, and nothing outside.
+        host: The address to listen on; one that other computers can reach makes the url carry a token.
+        port: 0 picks a free port; a busy one moves up to the next free one.
+        device: Where to render and optimize, say `cpu` or `cuda`.
+        weights: Weights files; a network that none is given of is the shipped one.
+        open_browser: Open the page in the default browser.
+
+    Raises:
+        SystemExit: as `serve`.
+    """
+    log_to_stderr()
+    with EndRequest() as end:
+        try:
+            check_address(host, port)
+            site = Site(folders, host=host, port=port, device=device, weights=weights, report=_say_doing)
+        except CartsError as error:
+            print(f"error: {visible(str(error))}", file=sys.stderr)
+            raise SystemExit(2) from error
+        end.ready()
+        browser = opened_in_browser(site.url) if open_browser else nullcontext()
+        try:
+            _say(f"Ready. Open {site.url} in a browser; Ctrl-C ends.")
+            with browser:
+                end.wait()
+            _say("\nClosing.")
+        finally:
+            _close(site, lambda: site.incident)
+
+
+def _close(served: ViewerApp | Site, incident: Callable[[], str | None]) -> None:
     """Save and close.
+
+    Args:
+        served: What is open.
+        incident: Where corrections are kept instead, or why they are not; None where all is well.
 
     Raises:
         SystemExit: see `serve`.
     """
     try:
-        app.close()
-        problem = app.project.incident
+        served.close()
+        problem = incident()
     except CartsError as error:
         problem = f"error: {error}"
     if problem is not None:

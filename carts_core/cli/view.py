@@ -6,16 +6,18 @@ from typing import Annotated
 
 import tyro
 
-from ..resources import sample_sequence
+from ..errors import SettingsError
 from .selection import Network
 
 
 @dataclass(frozen=True)
 class View:
-    """Open a sequence in the browser; the shipped sample if none is named."""
+    """Open a sequence in the browser; without one, a page to choose a recording, or to begin a new one."""
 
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file."""
+    root: tuple[Path, ...] = ()
+    """Folders that the page to choose a recording may look into, and nothing outside; by default the working folder."""
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
@@ -28,10 +30,22 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from carts_viewer.serving import serve
+        from carts_viewer.serving import serve, serve_site
 
+        if self.sequence is None:
+            if self.project is not None:
+                raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
+            serve_site(
+                self.root or (Path(),),
+                host=self.host,
+                port=self.port,
+                device=self.network.device,
+                weights=self.network.weights,
+                open_browser=self.open_browser,
+            )
+            return
         serve(
-            self.sequence or sample_sequence(),
+            self.sequence,
             project=self.project,
             host=self.host,
             port=self.port,

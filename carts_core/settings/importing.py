@@ -33,6 +33,8 @@ class ImportOptions:
     """Of the table's angles."""
     length_unit: Literal["m", "mm"] | None = None
     """Of the table's lengths."""
+    flip: tuple[str, ...] = ()
+    """Joints of that table whose sign is the other way round."""
     clock: Clock | None = None
     """Unit of the table's times."""
     time_offset: float | None = None

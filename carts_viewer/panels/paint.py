@@ -50,9 +50,7 @@ class PaintPanel:
         on_input(self._size, intents.SetDiameter, emit)
         on_click(self._clear, lambda _: intents.ClearLayer(), emit)
 
-        @page.server.on_client_connect
-        async def _(client: viser.ClientHandle) -> None:
-            page.call(client, "setBrush", self._sent)
+        page.on_connect(lambda client: page.call(client, "setBrush", self._sent))
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets, and the pages' scripts, up to date."""

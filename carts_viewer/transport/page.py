@@ -13,7 +13,6 @@ import html
 import http
 import io
 import json
-import math
 import mimetypes
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,13 +24,29 @@ from websockets.http11 import Request, Response
 from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 from carts_viewer.transport import incoming
+from carts_viewer.transport.fields import on_numbers, on_text, said
 from carts_viewer.transport.gate import gated, response
 from carts_viewer.transport.guard import Guard, check_address
+from carts_viewer.transport.media import MEDIA, Media
 from carts_viewer.transport.outgoing import queue_safely
-from carts_viewer.transport.viser_private import command_id, element_id, run_script, value_of, widgets
+from carts_viewer.transport.viser_private import command_id, element_id, on_sent, run_script, value_of, widgets
 
 OWN_KEYS = ("[", "]", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
+
+_FIELDS = {
+    "drawn": "it has drawn a new overlay",
+    "released": "somebody let go of a slider or left a field",
+    "picked": "the index of a frame that somebody picked",
+    "painted": "strokes over the picture",
+    "pressed": "keys that viser's shortcuts do not know",
+    "pointed": "where somebody points in the picture",
+    "activated": "which camera's image somebody has chosen",
+    "asked": "what is asked for in words",
+    "chosen": "what somebody has chosen in a document over the page",
+    "clicked": "where somebody has clicked in the picture",
+}
+"""Invisible fields, and what a tab says in them."""
 
 _TITLE = "<title>Viser</title>"
 # The token has done its work when the page is there; nobody should copy it out of the address bar by mistake.
@@ -60,25 +75,46 @@ class Page:
         self._title = title
         self.key_groups: list[Any] = []
         """What the sheet of keys lists: names of groups, each with pairs of key and meaning."""
+        self.media = Media()
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())
-        # The page writes into this invisible field when it has drawn a new overlay.
-        self._drawn = self.server.gui.add_text("drawn", "", visible=False)
-        # And into this one when somebody lets go of a slider or leaves a field.
-        self._released = self.server.gui.add_text("released", "", visible=False)
-        # Into this one the index of a frame that somebody picked.
-        self._picked = self.server.gui.add_text("picked", "", visible=False)
-        # Into these strokes over the picture, and keys that viser's shortcuts do not know.
-        self._painted = self.server.gui.add_text("painted", "", visible=False)
-        self._pressed = self.server.gui.add_text("pressed", "", visible=False)
-        # And into this one where somebody points in the picture.
-        self._pointed = self.server.gui.add_text("pointed", "", visible=False)
-        self._activated = self.server.gui.add_text("activated", "", visible=False)
-        # And into this one what a tab asks for in words.
-        self._asked = self.server.gui.add_text("asked", "", visible=False)
+        self._fields: dict[str, viser.GuiTextHandle] = {}
+        self._add_fields()
+        self._greetings: list[Callable[[viser.ClientHandle], None]] = []
+        self.server.on_client_connect(self._greet)
+
+    def on_connect(self, callback: Callable[[viser.ClientHandle], None]) -> None:
+        """Call `callback(client)` for every tab that joins from now on, until the page is cleared."""
+        self._greetings.append(callback)
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        for callback in list(self._greetings):
+            callback(client)
+
+    def _add_fields(self) -> None:
+        """Invisible fields into which a tab writes what happened there; each does not know of the others."""
+        self._fields = {name: self.server.gui.add_text(name, "", visible=False) for name in _FIELDS}
+
+    def clear(self, title: str) -> None:
+        """Take away all widgets, commands, nodes and callbacks; tabs must be reloaded when others are there.
+
+        Args:
+            title: The browser tab's new title.
+        """
+        self._title = title
+        self._greetings.clear()
+        self.key_groups = []
+        self.server.gui.reset()
+        self.server.scene.reset()
+        self._add_fields()
+
+    def reload(self) -> None:
+        """Have every tab load the page anew."""
+        for client in self.server.get_clients().values():
+            run_script(client, "location.reload();")
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -88,7 +124,7 @@ class Page:
     def on_drawn(self, callback: Callable[[int], None]) -> None:
         """Call `callback(client_id)` on the event loop whenever a tab has drawn a newer overlay."""
 
-        @self._drawn.on_update
+        @self._fields["drawn"].on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 callback(event.client_id)
@@ -96,7 +132,7 @@ class Page:
     def on_released(self, callback: Callable[[], None]) -> None:
         """Call `callback` on the event loop whenever somebody lets go of a slider or leaves a field."""
 
-        @self._released.on_update
+        @self._fields["released"].on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 callback()
@@ -107,27 +143,35 @@ class Page:
         u and v are shares of its width and height, from its upper left corner, and the camera is an index; any numbers,
         if the tab is none of ours.
         """
-        _on_numbers(self._pointed, 3, callback)
+        on_numbers(self._fields["pointed"], 3, callback)
 
     def on_activated(self, callback: Callable[[float], None]) -> None:
         """Call `callback(camera)` on the event loop when somebody chooses a camera's image; any number, as above."""
-        _on_numbers(self._activated, 1, callback)
+        on_numbers(self._fields["activated"], 1, callback)
 
     def on_painted(self, callback: Callable[[int, str], None]) -> None:
         """Call `callback(client_id, text)` on the event loop whenever a tab says that it has painted; any text."""
-        _on_text(self._painted, callback)
+        on_text(self._fields["painted"], callback)
 
     def on_pressed(self, callback: Callable[[str], None]) -> None:
         """Call `callback(key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
-        _on_text(self._pressed, lambda _, key: callback(key))
+        on_text(self._fields["pressed"], lambda _, key: callback(key))
 
     def on_asked(self, callback: Callable[[int, str], None]) -> None:
         """Call `callback(client_id, text)` on the event loop when a tab asks for something in words; any text."""
-        _on_text(self._asked, callback)
+        on_text(self._fields["asked"], callback)
 
     def on_picked(self, callback: Callable[[float], None]) -> None:
         """Call `callback(index)` on the event loop whenever somebody picks a frame; any number, as above."""
-        _on_numbers(self._picked, 1, callback)
+        on_numbers(self._fields["picked"], 1, callback)
+
+    def on_chosen(self, callback: Callable[[str], None]) -> None:
+        """Call `callback(text)` on the event loop for everything that somebody chooses in a document; any text."""
+        on_sent(self._fields["chosen"], lambda value: callback(said(value)))
+
+    def on_clicked(self, callback: Callable[[float, float], None]) -> None:
+        """Call `callback(u, v)` on the event loop when somebody clicks in the image; shares as in `on_pointed`."""
+        on_numbers(self._fields["clicked"], 2, callback)
 
     def call(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
         """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
@@ -179,7 +223,7 @@ class Page:
     @property
     def drawn_id(self) -> str:
         """The `id` of the field in which a tab says that it has drawn an overlay."""
-        return element_id(self._drawn)
+        return element_id(self._fields["drawn"])
 
     def find(self, label: str) -> Any:
         """The widget with this label (for tests and scripts)."""
@@ -201,6 +245,8 @@ class Page:
         path = request.path.partition("?")[0]
         if path.startswith("/static/"):
             return self._static(path.removeprefix("/static/"))
+        if path.startswith(MEDIA):
+            return self.media.answer(path.removeprefix(MEDIA))
         if path in ("/", "/index.html") and request.headers.get("Upgrade") != "websocket":
             # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
             own = f"connect-src 'self' ws://{request.headers['Host']} data: blob:"
@@ -226,20 +272,8 @@ class Page:
         return response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self) -> bytes:
-        configuration = json.dumps(
-            {
-                "drawn": self.drawn_id,
-                "released": element_id(self._released),
-                "picked": element_id(self._picked),
-                "pointed": element_id(self._pointed),
-                "activated": element_id(self._activated),
-                "asked": element_id(self._asked),
-                "keyGroups": self.key_groups,
-                "painted": element_id(self._painted),
-                "pressed": element_id(self._pressed),
-                "keys": OWN_KEYS,
-            }
-        )
+        ids = {name: element_id(field) for name, field in self._fields.items()}
+        configuration = json.dumps({**ids, "keys": OWN_KEYS, "keyGroups": self.key_groups})
         return (
             _index_of_viser()
             .replace(
@@ -252,34 +286,13 @@ class Page:
                 '<script src="/static/paint.js" defer></script>'
                 '<script src="/static/marks.js" defer></script>'
                 '<script src="/static/timeline.js" defer></script>'
-                '<script src="/static/shell.js" defer></script>',
+                '<script src="/static/shell.js" defer></script>'
+                '<link rel="stylesheet" href="/static/document.css" />'
+                '<script src="/static/document.js" defer></script>',
                 1,
             )
             .encode()
         )
-
-
-def _on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:
-    """Call back with the finite numbers that a tab has written into a field behind its own name and a counter."""
-
-    @field.on_update
-    async def _(event: viser.GuiEvent) -> None:
-        try:
-            numbers = [float(part) for part in str(field.value).split()[2:]]
-        except ValueError:
-            return
-        if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
-            callback(*numbers)
-
-
-def _on_text(field: viser.GuiTextHandle, callback: Callable[[int, str], None]) -> None:
-    """Call back with the tab's number and what it has written into a field behind its own name and a counter."""
-
-    @field.on_update
-    async def _(event: viser.GuiEvent) -> None:
-        parts = str(field.value).split(maxsplit=2)
-        if event.client_id is not None and len(parts) == 3:
-            callback(event.client_id, parts[2])
 
 
 @functools.cache

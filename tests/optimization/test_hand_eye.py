@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from clicked_points import clicked
 from scipy.spatial.transform import Rotation
+from tiny import tiny_scene
 
 from carts_core.cli import main
 from carts_core.errors import RobotError, SettingsError
@@ -206,3 +207,19 @@ def test_the_command_reads_a_table_and_writes_a_sequence_file(
         main(["hand-eye", str(path), "--points", str(table), "--output", str(tmp_path / "other")])
     assert "has no column 'arm'" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "other").exists()
+
+
+def test_a_further_camera_is_found_from_four_points_that_nearly_lie_in_a_plane(shipped_psm: Robot) -> None:
+    """The tip and the shaft's end in two frames of a small motion: perspective-n-point alone finds no pose there."""
+    tiny = tiny_scene(shipped_psm, 8, ("left", "right"), 320, 240)
+    measured = {"PSM1": tiny.truth * np.array([1.0, 1, 1, 1, 1, 1, 0])}
+    names = ("tip", "wrist pitch joint", "shaft edge")
+    for seed in range(6):
+        points = clicked(tiny.scene, measured, (0, 1, 2, 5), ["left"], noise=0.5, seed=seed, names=names)
+        points += clicked(tiny.scene, measured, (0, 5), ["right"], noise=0.5, seed=seed + 50, names=names)
+        settings = HandEyeSettings(free_cameras=("right",))
+        result = solve_hand_eye(unknown(tiny.scene, cameras=True), measured, points, settings)
+        said = result.deviations["PSM1", "right"]
+        place = link_transforms(tiny.scene.arms[0], measured["PSM1"])[:, 2, :3, 3]
+        _, sideways, depth = offset(result.scene, tiny.scene, "PSM1", "right", place)
+        assert sideways < 4.0 * said.sideways_mm < 3.0 and depth < 4.0 * said.depth_mm and result.error < 1.5

@@ -70,6 +70,10 @@ class HandEyeProblem:
                     self.missing[view.camera, view.arm] = FEWEST_POINTS - count
                 continue
             poses = poses_of(view, self._intrinsics[view.camera], self.settings.pixel_error)
+            if known:
+                # Cameras of one endoscope look nearly the same way, so where the first one is, is a beginning as well.
+                beside = self._T_camera_world[self._anchor] @ self._T_world_base[view.arm]
+                poses.append((0.0, beside))
             if not poses:
                 raise SettingsError(
                     f"no pose of {self.scene.arms[view.arm].name} before {self.scene.cameras[view.camera].name} fits "

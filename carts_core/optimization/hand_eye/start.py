@@ -21,8 +21,8 @@ def poses_of(
 ) -> list[tuple[float, Float[np.ndarray, "4 4"]]]:
     """The best few poses T_camera_base with their costs, the best first.
 
-    Perspective-n-point (SQPnP) on all points, on all but each frame's and each single one, and on random subsets of
-    four, so that some subset is free of wrong points; each pose is judged by all points, wrong ones with little weight.
+    Perspective-n-point (SQPnP, EPnP) on all points, on all but each frame's and each single one, and on random few, so
+    that some subset is free of wrong points; each pose is judged by all points, wrong ones with little weight.
 
     Args:
         view: at least `FEWEST_POINTS` points.
@@ -66,15 +66,16 @@ def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterat
     fx, fy, cx, cy = intrinsics
     K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
     pixels = view.pixels[rows] - HALF_PIXEL
-    try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            np.ascontiguousarray(view.starts[rows]), pixels, K, None, flags=cv2.SOLVEPNP_SQPNP
-        )
-    except cv2.error:
-        # Points that coincide or lie on a line have no pose.
-        return
-    for rotation, translation in zip(rotations, translations, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-        if np.isfinite(T).all():
-            yield T
+    for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                np.ascontiguousarray(view.starts[rows]), pixels, K, None, flags=method
+            )
+        except cv2.error:
+            # Points that coincide or lie on a line have no pose.
+            continue
+        for rotation, translation in zip(rotations, translations, strict=True):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+            if np.isfinite(T).all():
+                yield T

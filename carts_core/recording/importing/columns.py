@@ -55,8 +55,8 @@ _TIMES = (
     "time ns",
 )
 _FRAMES = ("frame", "frame id", "frame index", "frame number", "image", "image id", "index", "id", "file", "filename")
-_DEGREES_FROM = 7.0
-"""[rad] No joint of a PSM turns that far, so larger angles are degrees."""
+_DEGREES_FROM = (3.1, 1.4, 7.0, 1.8, 1.8)
+"""[rad] Yaw, pitch, roll, wrist pitch and wrist yaw of no PSM turn that far, so larger angles are degrees."""
 _MILLIMETRES_FROM = 1.0
 """[m] No instrument is inserted that far."""
 
@@ -97,7 +97,21 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
         if column not in table.columns:
             raise SequenceError(f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
     usable = {arm: found for arm, found in arms.items() if _has_joints(found) or _has_pose(found)}
+    if not usable and not chosen:
+        usable = _numbered_family(words, (time, frame))
     return ColumnMeanings(time, frame, usable)
+
+
+def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> dict[str, dict[str, str]]:
+    """The only six or seven columns that differ in nothing but a number: joints under a name of their own."""
+    families: dict[str, dict[str, str]] = {}
+    for column, text in words.items():
+        number = re.fullmatch(r"(.*?)(\d+)(\D*)", text)
+        if number and column not in others:
+            families.setdefault(f"{number[1]}#{number[3]}", {})[f"#{int(number[2])}"] = column
+    fitting = [family for family in families.values() if len(family) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1)]
+    found = _numbers_to_joints(fitting[0]) if len(fitting) == 1 else {}
+    return {"": found} if _has_joints(found) else {}
 
 
 def _spaced(column: str) -> str:
@@ -198,7 +212,7 @@ def arm_log(
     """The log of one arm from its columns, in radians and metres.
 
     Raises:
-        SequenceError: a cell is no number.
+        SequenceError: a cell is no number, or a joint to be flipped does not exist.
     """
     if _has_joints(found):
         values = np.stack([table.numbers(found[name]).astype(np.float64) for name in JOINT_NAMES], 1)
@@ -207,11 +221,15 @@ def arm_log(
         degrees, millimetres = _units(values[:, angles], values[:, 2], columns, options)
         values[:, angles] *= np.pi / 180 if degrees else 1.0
         values[:, 2] *= 1e-3 if millimetres else 1.0
+        for joint in options.flip:
+            if joint not in JOINT_NAMES:
+                raise SequenceError(f"--flip {joint} is no joint. Joints are: {', '.join(JOINT_NAMES)}.")
+            values[:, JOINT_NAMES.index(joint)] *= -1.0
         note(Note("guessed", f"{arm}: joints are {', '.join(columns)} (change: --columns yaw COLUMN ...)."))
         log = ArmLog(arm, joints=track([(time, *row) for time, row in zip(times, values, strict=True)]))
     else:
         values = np.stack([table.numbers(found[name]).astype(np.float64) for name in _POSE_ORDER], 1)
-        degrees, millimetres = _units(np.zeros((1, 1)), values[:, :3], [found["x"]], options)
+        degrees, millimetres = _units(np.zeros((1, len(_DEGREES_FROM))), values[:, :3], [found["x"]], options)
         values[:, :3] *= 1e-3 if millimetres else 1.0
         columns = [found[name] for name in _POSE_ORDER]
         poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
@@ -235,7 +253,7 @@ def arm_log(
 def _units(angles: np.ndarray, lengths: np.ndarray, columns: list[str], options: ImportOptions) -> tuple[bool, bool]:
     """Whether angles are degrees and lengths millimetres: as given, as a column's name says, or by their size."""
     text = " ".join(columns).lower()
-    degrees = re.search(r"deg|°", text) is not None or float(np.nanmax(np.abs(angles))) > _DEGREES_FROM
+    degrees = re.search(r"deg|°", text) is not None or bool((np.nanmax(np.abs(angles), 0) > _DEGREES_FROM).any())
     millimetres = re.search(r"(^|[^a-z])mm([^a-z]|$)", text) is not None or float(np.nanmax(np.abs(lengths))) > (
         _MILLIMETRES_FROM
     )

@@ -194,7 +194,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
         {"kinematics": Path("log.csv")},
         "cells",
     ),
-    "no joints": (rewrite("log.csv", "Joint", "Motor"), {"kinematics": Path("log.csv")}, "not recognized. Name them"),
+    "no joints": (rewrite("log.csv", "Joint3", "Motor"), {"kinematics": Path("log.csv")}, "not recognized. Name them"),
     "text in a cell": (rewrite("log.csv", "\n1.0,", "\n1.0,x"), {}, "cells that are no numbers"),
     "empty table": (lambda folder: (folder / "log.csv").write_text(""), {"kinematics": Path("log.csv")}, "has no rows"),
     "binary table": (
@@ -249,3 +249,30 @@ def test_real_stereo_frames_given_as_a_folder_are_imported(shared_dir, tmp_path)
     sequence = Sequence.open(file)
     assert len(sequence) == 30 and len(sequence.scene.cameras) == 2
     assert np.abs(sequence.frame(29).measured["PSM1"][:6] - values[29]).max() < 1e-8
+
+
+def test_degrees_of_a_small_motion_are_degrees_since_no_wrist_turns_that_far_in_radians(tmp_path):
+    write_images(tmp_path / "rec/images", FRAMES)
+    angles = np.linspace(-3.5, 3.5, FRAMES)[:, None] * np.ones(6)
+    angles[:, 2] = 150.0
+    write_csv(tmp_path / "rec/log.csv", ["frame", *(f"q{n}" for n in range(1, 7))], np.column_stack([range(5), angles]))
+    found = find(tmp_path / "rec").arms[0].values
+    assert found is not None and found[0] == pytest.approx([np.radians(-3.5)] * 2 + [0.15] + [np.radians(-3.5)] * 3)
+
+
+def test_six_columns_that_differ_in_a_number_are_joints_whatever_they_are_called(tmp_path):
+    write_images(tmp_path / "rec/images", FRAMES)
+    q = joints_at(np.arange(FRAMES) / 10)
+    header = ["picture", *(f"Motor no. {n}" for n in range(6)), "temperature 1", "temperature 2"]
+    write_csv(tmp_path / "rec/log.csv", header, np.column_stack([range(5), q, q[:, :2]]))
+    found = find(tmp_path / "rec")
+    assert found.arms[0].values is not None and np.abs(found.arms[0].values - q).max() < 1e-9
+    assert any("joints are Motor no. 0, Motor no. 1" in note.text for note in found.notes)
+
+
+def test_a_sign_can_be_turned_round(folder):
+    before, after = find(folder).arms[0].values, find(folder, ImportOptions(flip=("yaw", "roll"))).arms[0].values
+    assert before is not None and after is not None
+    assert np.array_equal(after, before * [-1, 1, 1, -1, 1, 1])
+    with pytest.raises(CartsError, match=r"--flip knee is no joint. Joints are: yaw"):
+        find(folder, ImportOptions(flip=("knee",)))

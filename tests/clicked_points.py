@@ -9,7 +9,7 @@ from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import ImagePoint
 
 NAMES = ("tip", "wrist yaw joint", "wrist pitch joint", "shaft edge")
-_FROM_THE_WRIST = 0.03
+_FROM_THE_WRIST = 0.015
 """[m] How far up the shaft its edge is clicked."""
 
 

@@ -1,0 +1,113 @@
+"""Calibration over the recording as a job: it begins with the clicked points, reports, and can be stopped."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from carts_core.errors import CartsError
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult, StopReason
+from carts_core.recording import Sequence, spread
+
+FRAMES = 20
+"""Frames that take part, spread evenly."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is."""
+
+    text: str
+    """For people."""
+    share: float
+    """Of its stages, in [0, 1]."""
+    scene: Scene | None = None
+    """With the calibration so far."""
+    result: CalibrationResult | None = None
+    """At its end."""
+    error: str = ""
+    """Why it failed, for people; empty if it did not."""
+    ended: bool = False
+
+
+class CalibrationJob:
+    """One calibration on a thread of its own."""
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        scene: Scene,
+        *,
+        weights: tuple[Path, ...],
+        device: str,
+        report: Callable[[Progress], None],
+    ) -> None:
+        """Begin.
+
+        Args:
+            sequence: the recording.
+            scene: its arms and cameras, with the calibration to begin with.
+            weights: weights files.
+            device: where to compute.
+            report: called on the job's thread with every progress, the last one `ended`.
+        """
+        self._sequence, self._scene = sequence, scene
+        self._weights, self._device = weights, device
+        self._report = report
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="carts-calibration", daemon=True)
+        self._thread.start()
+
+    def cancel(self) -> None:
+        """Stop soon; what was reached is reported."""
+        self._cancelled.set()
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait until it has ended.
+
+        Args:
+            timeout: [s]
+        """
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        try:
+            result = self._calibrate()
+        except CartsError as error:
+            self._report(Progress("", 0.0, error=str(error), ended=True))
+        except Exception as error:
+            self._report(Progress("", 0.0, error=f"The calibration failed: {error!r}", ended=True))
+        else:
+            self._report(result)
+
+    def _calibrate(self) -> Progress:
+        self._report(Progress("Loading the networks", 0.0))
+        extractor = FeatureExtractor.load(*self._weights, device=self._device)
+        self._report(Progress("Reading images", 0.0))
+        frames = [self._sequence.frame(index) for index in spread(len(self._sequence), FRAMES)]
+        optimizer = CalibrationOptimizer(self._scene, frames, extractor)
+        last: CalibrationIterate | None = None
+        for iterate in optimizer:
+            last = iterate
+            text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
+            self._report(Progress(text, iterate.stage / iterate.stages, iterate.scene))
+            if self._cancelled.is_set():
+                optimizer.cancel()
+        if last is None:
+            return Progress("", 0.0, error="The calibration made no step.", ended=True)
+        if optimizer.stop_reason is StopReason.CANCELLED:
+            return Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+        result = optimizer.result()
+        return Progress("Calibrated", 1.0, result.scene, result, ended=True)
+
+
+def as_plain(scene: Scene) -> dict[str, Any]:
+    """A calibration as a draft keeps it."""
+    return {
+        "arms": {arm.name: arm.T_world_base.tolist() for arm in scene.arms},
+        "cameras": {camera.name: camera.T_camera_world.tolist() for camera in scene.cameras},
+        "intrinsics": {camera.name: list(camera.intrinsics) for camera in scene.cameras},
+    }

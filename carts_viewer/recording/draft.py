@@ -1,0 +1,161 @@
+"""An import on its way: everything that a person has said about it, kept in a file after each change."""
+
+import json
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.files import remove_file, write_text
+from carts_core.files.reading import SETTINGS, VALUES, parse_json, read_text
+from carts_core.optimization.hand_eye import ImagePoint
+from carts_core.project.place import data_dir
+from carts_core.settings.importing import ImportOptions
+
+_FORMAT = "carts-draft/1"
+_PATHS = ("calibration", "base")
+
+
+class Step(StrEnum):
+    """Where in New recording somebody is."""
+
+    FILES = "Files"
+    CHECK = "Check"
+    HAND_EYE = "Hand-eye"
+    SAVE = "Save"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What a person has said. Nothing changes it; a change makes a new one."""
+
+    step: Step = Step.FILES
+    source: str = ""
+    """Folder or file of the recording; empty before it is chosen."""
+    name: str = ""
+    """Of the sequence; by default that of the source."""
+    options: ImportOptions = field(default_factory=ImportOptions)
+    points: tuple[ImagePoint, ...] = ()
+    """In the order in which they were clicked."""
+    focal_length: bool = False
+    """Whether the focal length is solved for, too."""
+    calibration: Mapping[str, Any] | None = None
+    """Base frames, camera poses and intrinsics by arm or camera, as `carts calibrate` found them; None before."""
+
+    def to_json(self) -> str:
+        """The draft as text."""
+        plain = asdict(self)
+        plain["options"] = {
+            name: _plain(value) for name, value in plain["options"].items() if value not in (None, {}, ())
+        }
+        return json.dumps({"format": _FORMAT, **plain}, indent=1)
+
+    @staticmethod
+    def from_json(text: str) -> "Draft":
+        """The draft of a text.
+
+        Raises:
+            SettingsError: the text is no draft.
+        """
+        try:
+            plain = parse_json(text)
+            if plain.pop("format") != _FORMAT:
+                raise ValueError("it is of another version")
+            options = plain.pop("options")
+            for name in _PATHS:
+                options[name] = {key: Path(value) for key, value in options.get(name, {}).items()}
+            if options.get("kinematics") is not None:
+                options["kinematics"] = Path(options["kinematics"])
+            options["flip"] = tuple(options.get("flip", ()))
+            points = tuple(ImagePoint(**{**each, "pixel": tuple(each["pixel"])}) for each in plain.pop("points"))
+            known = {entry.name for entry in fields(Draft)}
+            rest = {name: value for name, value in plain.items() if name in known}
+            step = Step(rest.pop("step"))
+            return Draft(step=step, options=ImportOptions(**options), points=points, **rest)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
+
+    def with_options(self, **changes: Any) -> "Draft":
+        """The draft with other options; what was clicked or calibrated before stays."""
+        return replace(self, options=replace(self.options, **changes))
+
+
+@dataclass(frozen=True)
+class DraftSummary:
+    """A draft in a list."""
+
+    key: str
+    name: str
+    changed: float
+    """[s since 1970]"""
+
+
+class DraftFile:
+    """The file of one draft."""
+
+    def __init__(self, key: str | None = None) -> None:
+        """
+        Args:
+            key: of a draft that is there; None for a new one.
+
+        Raises:
+            SettingsError: there is no such draft.
+        """
+        if key is not None and key not in {draft.key for draft in drafts()}:
+            raise SettingsError("this import is not there any more. Begin a new one.")
+        self.key = key or secrets.token_hex(8)
+
+    def read(self) -> Draft:
+        """What it holds; an empty draft before anything was written.
+
+        Raises:
+            SettingsError: it is damaged.
+        """
+        path = _path(self.key)
+        return Draft.from_json(read_text(path, VALUES)) if path.is_file() else Draft()
+
+    def write(self, draft: Draft) -> None:
+        """Keep a draft; one without a source is not worth it."""
+        if draft.source:
+            write_text(_path(self.key), draft.to_json())
+
+    def delete(self) -> None:
+        """Forget it."""
+        delete_draft(self.key)
+
+
+def drafts() -> list[DraftSummary]:
+    """All drafts, the newest first."""
+    found = []
+    for path in _folder().glob("*.json"):
+        try:
+            plain = parse_json(read_text(path, SETTINGS))
+            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)
+            found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
+        except (CartsError, OSError, ValueError, AttributeError):
+            found.append(DraftSummary(path.stem, "a damaged import", time.time()))
+    return sorted(found, key=lambda draft: -draft.changed)
+
+
+def delete_draft(key: str) -> None:
+    """Forget a draft, if it is there."""
+    if key in {draft.key for draft in drafts()}:
+        remove_file(_path(key))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def _folder() -> Path:
+    return data_dir() / "drafts"
+
+
+def _path(key: str) -> Path:
+    return _folder() / f"{key}.json"

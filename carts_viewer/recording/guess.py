@@ -1,0 +1,126 @@
+"""What a draft's files hold, as far as they can be read, with each problem where it is."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from carts_core.errors import CartsError
+from carts_core.recording.importing.columns import ColumnMeanings, guess_columns
+from carts_core.recording.importing.foreign_tables import ForeignTable, read_foreign_table
+from carts_core.recording.importing.found import FoundRecording, Note
+from carts_core.recording.importing.importer import detect, find
+from carts_core.recording.importing.media import find_images
+from carts_core.settings.importing import ImportOptions
+from carts_viewer.recording.draft import Draft
+
+FOLDER = "folder"
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What was found, or why not."""
+
+    kind: str
+    """Name of the source."""
+    recording: FoundRecording | None
+    """None while something is wrong."""
+    problems: Mapping[str, str] = field(default_factory=dict)
+    """"images NAME", "calibration NAME", "kinematics", "columns" or "recording" -> what is wrong there, for people."""
+    table: ForeignTable | None = None
+    """Of the kinematics, where they are a table of named columns."""
+    meanings: ColumnMeanings | None = None
+
+    def notes(
+        self, *, about: str | None = None, kinds: tuple[str, ...] = ("warning", "missing", "guessed")
+    ) -> list[Note]:
+        """Remarks about a camera or arm, or for None about none of them."""
+        if self.recording is None:
+            return []
+        names = [each.name for each in (*self.recording.cameras, *self.recording.arms)]
+
+        def of(note: Note) -> str | None:
+            return next((name for name in names if note.text.startswith((f"{name}:", f"{name} "))), None)
+
+        return [note for note in self.recording.notes if note.kind in kinds and of(note) == about]
+
+
+def guess(draft: Draft) -> Guess:
+    """Read what a draft names; never raises for what is wrong with the files."""
+    source = Path(draft.source)
+    try:
+        kind = detect(source, draft.options.source).name
+    except CartsError as error:
+        if not source.is_dir():
+            return Guess("", None, {"recording": str(error)})
+        # Whatever is in a folder, a person may say what is what.
+        kind = FOLDER
+    options = replace(draft.options, source=kind)
+    problems = _problems_of_parts(source, options) if kind == FOLDER else {}
+    table, meanings = (None, None)
+    try:
+        recording = find(source, options)
+    except CartsError as error:
+        recording = None
+        if not problems:
+            problems[_place_of(str(error), options)] = str(error)
+    path = _table_of(source, options, recording) if kind == FOLDER else None
+    if path is not None:
+        try:
+            table = read_foreign_table(path)
+            meanings = guess_columns(table, options)
+        except CartsError as error:
+            problems.setdefault("kinematics" if table is None else "columns", str(error))
+    if table is not None and meanings is not None and not meanings.arms:
+        problems["columns"] = "Six joints are not recognized among the columns. Choose a column for each."
+    return Guess(kind, recording, problems, table, meanings)
+
+
+def _problems_of_parts(source: Path, options: ImportOptions) -> dict[str, str]:
+    """What is wrong with each file that a person has named."""
+    found: dict[str, str] = {}
+
+    def attempt(place: str, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except CartsError as error:
+            found[place] = str(error)
+
+    for camera, place in options.images.items():
+        attempt(f"images {camera}", lambda place=place: find_images(source / place))
+    return found
+
+
+def _place_of(message: str, options: ImportOptions) -> str:
+    """Which part of the form an error is about, by the files that it names."""
+    for camera, path in options.calibration.items():
+        if str(path) in message:
+            return f"calibration {camera}"
+    if options.kinematics is not None and options.kinematics.name in message:
+        return "columns" if "column" in message else "kinematics"
+    for word, place in (
+        ("--images", "images"),
+        ("camera_matrix", "calibration"),
+        ("column", "columns"),
+        ("--clock", "columns"),
+    ):
+        if word in message:
+            return place
+    return "recording"
+
+
+def _table_of(source: Path, options: ImportOptions, recording: FoundRecording | None) -> Path | None:
+    """The table of the kinematics: as named, or as found, or the only one there."""
+    if options.kinematics is not None:
+        return source / options.kinematics
+    for note in () if recording is None else recording.notes:
+        if note.text.startswith("kinematics: "):
+            path = Path(note.text.removeprefix("kinematics: ").rpartition(", ")[0])
+            return path if path.is_file() else None
+    return None
+
+
+def joint_table(recording: FoundRecording) -> Mapping[str, np.ndarray]:
+    """Arm -> joint positions that are known [rows, joints], as they were recorded."""
+    return {arm.name: arm.values for arm in recording.arms if arm.values is not None}

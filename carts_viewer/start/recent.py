@@ -1,0 +1,120 @@
+"""Which sequences were opened lately, with a small picture and how far their review is."""
+
+import json
+import math
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from carts_core.errors import CartsError
+from carts_core.files import write_bytes, write_text
+from carts_core.files.reading import TABLE, read_bytes, read_text
+from carts_core.project import ReviewState
+from carts_core.project.place import data_dir
+from carts_viewer.app import ViewerApp
+
+_KEPT = 24
+_WIDTH = 320
+"""Of a thumbnail [px]."""
+_DONE = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
+
+
+@dataclass(frozen=True)
+class RecentProject:
+    """A sequence that was opened."""
+
+    sequence: str
+    """Path of its file."""
+    name: str
+    project: str
+    """Path of its project."""
+    frames: int
+    reviewed: int
+    """Frames that a person has accepted or rejected."""
+    corrected: int
+    """Frames whose joints differ from the measured ones."""
+    changed: float
+    """When it was closed last [s since 1970]."""
+
+    @property
+    def thumbnail(self) -> Path:
+        """Where its picture is, if there is one."""
+        return _folder() / f"{sha256(self.sequence.encode()).hexdigest()[:16]}.jpg"
+
+
+def recent_projects() -> list[RecentProject]:
+    """Those whose sequence files are still there, the newest first; none where the list cannot be read."""
+    try:
+        rows = json.loads(read_text(_list(), TABLE))
+        found = [RecentProject(**row) for row in rows if isinstance(row, dict)]
+        known = [each for each in found if _plausible(each)]
+        return [each for each in known if Path(each.sequence).is_file()]
+    except (CartsError, OSError, ValueError, TypeError, RecursionError):
+        return []
+
+
+def thumbnail(project: RecentProject) -> bytes | None:
+    """A JPEG file, None without one."""
+    try:
+        return read_bytes(project.thumbnail, TABLE)
+    except (CartsError, OSError):
+        return None
+
+
+def remember(app: ViewerApp) -> None:
+    """Put the sequence of an open viewer at the head of the list."""
+    state = app.project.state
+    frames = len(app.sequence)
+    entry = RecentProject(
+        sequence=str(app.sequence.path),
+        name=app.sequence.name,
+        project=str(app.project.path),
+        frames=frames,
+        reviewed=sum(state.review(index).state in _DONE for index in range(frames)),
+        corrected=sum(bool(state.joints(index)) for index in range(frames)),
+        changed=time.time(),
+    )
+    _write([entry, *(each for each in recent_projects() if each.sequence != entry.sequence)])
+    if (picture := _picture(app)) is not None:
+        write_bytes(entry.thumbnail, picture)
+
+
+def forget(sequence: str) -> None:
+    """Take a sequence off the list; its files stay."""
+    _write(each for each in recent_projects() if each.sequence != sequence)
+
+
+def _picture(app: ViewerApp) -> bytes | None:
+    """The image that is shown, small."""
+    state = app.state
+    image = state.frame.images[state.camera]
+    height = max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
+    small = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
+    good, content = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return content.tobytes() if good else None
+
+
+def _write(projects: Iterable[RecentProject]) -> None:
+    write_text(_list(), json.dumps([asdict(each) for each in projects][:_KEPT], indent=1))
+
+
+def _plausible(project: RecentProject) -> bool:
+    """Whether what the list says has the right types; others may have written it."""
+    texts = (project.sequence, project.name, project.project)
+    numbers = (project.frames, project.reviewed, project.corrected, project.changed)
+    return all(isinstance(text, str) for text in texts) and all(
+        isinstance(number, int | float) and math.isfinite(number) and number >= 0 for number in numbers
+    )
+
+
+def _folder() -> Path:
+    return data_dir() / "recent"
+
+
+def _list() -> Path:
+    return _folder() / "recent.json"

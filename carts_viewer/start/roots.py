@@ -1,0 +1,91 @@
+"""The folders that a person has allowed the page to look into, and nothing outside of them."""
+
+import os
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from carts_core.errors import SettingsError
+
+MOST_ENTRIES = 2000
+"""Of a folder that are listed."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A folder or file in a listing."""
+
+    name: str
+    path: Path
+    is_folder: bool
+    size: int
+    """[bytes]"""
+    changed: float
+    """[s since 1970]"""
+
+
+class Roots:
+    """Allowed folders. Links are not followed, wherever they lead, so that nothing outside can be reached."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        """
+        Args:
+            folders: at least one, each a folder that is there.
+
+        Raises:
+            SettingsError: one is not there.
+        """
+        for folder in folders:
+            if not folder.is_dir():
+                raise SettingsError(f"--root {folder} is no folder. Give folders that hold recordings.")
+        # The person may have named a link; below it none is followed.
+        self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
+
+    def checked(self, text: str | Path) -> Path:
+        """An absolute path below one of the folders, on the way to which there is no link.
+
+        Raises:
+            SettingsError: it is outside, is not there, or has a link on its way.
+        """
+        path = Path(text)
+        root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
+        if "\x00" in str(text) or not path.is_absolute() or ".." in path.parts or root is None:
+            raise SettingsError(f"{text} is outside of the allowed folders. Start carts view with --root for another.")
+        place = root
+        try:
+            for part in path.relative_to(root).parts:
+                place = place / part
+                mode = os.lstat(place).st_mode
+                if stat.S_ISLNK(mode):
+                    raise SettingsError(f"{place} is a link, and links are not followed. Choose the folder itself.")
+                if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
+                    raise SettingsError(f"{place} is neither a folder nor a file. Choose another.")
+        except OSError as error:
+            raise SettingsError(f"{place} cannot be opened ({error.strerror}). Choose another.") from error
+        return path
+
+    def entries(self, folder: Path) -> list[Entry]:
+        """Folders, then files, each by name; without hidden ones and links.
+
+        Raises:
+            SettingsError: it may not be looked into, or cannot be.
+        """
+        found = []
+        try:
+            with os.scandir(self.checked(folder)) as listing:
+                for each in listing:
+                    if each.name.startswith(".") or each.is_symlink() or len(found) >= MOST_ENTRIES:
+                        continue
+                    is_folder = each.is_dir(follow_symlinks=False)
+                    if is_folder or each.is_file(follow_symlinks=False):
+                        known = each.stat(follow_symlinks=False)
+                        path = Path(folder) / each.name
+                        found.append(Entry(each.name, path, is_folder, known.st_size, known.st_mtime))
+        except OSError as error:
+            raise SettingsError(f"{folder} cannot be opened ({error.strerror}). Choose another.") from error
+        return sorted(found, key=lambda entry: (not entry.is_folder, entry.name.casefold()))
+
+    def parent(self, folder: Path) -> Path | None:
+        """The folder above; None for an allowed folder itself."""
+        return None if folder in self.folders else folder.parent

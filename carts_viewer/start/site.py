@@ -1,0 +1,195 @@
+"""One server that goes from place to place: the start page, a new recording, and the viewer of a sequence."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import viser
+
+from carts_core.errors import CartsError
+from carts_core.resources import sample_sequence
+from carts_viewer.app import ViewerApp
+from carts_viewer.recording.place import RecordingPlace
+from carts_viewer.start.host import Place
+from carts_viewer.start.recent import remember
+from carts_viewer.start.roots import Roots
+from carts_viewer.start.start_page import StartPage
+from carts_viewer.transport.document import Document, escaped
+from carts_viewer.transport.page import Page
+
+_log = logging.getLogger(__name__)
+
+
+class Site:
+    """Serves one page, whatever it shows.
+
+    Attributes:
+        page: the page.
+        document: what lies over it.
+        roots: the folders that people may look into.
+        place: what is shown; None while a sequence is open.
+        app: the viewer of the open sequence, if there is one.
+        url: where the page is.
+        incident: where corrections of a sequence that was left are kept instead, if they are not in its project.
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        device: str = "cpu",
+        weights: tuple[Path, ...] = (),
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Start serving the start page.
+
+        Args:
+            folders: what people may look into, and nothing outside.
+            host: the address to listen on; one that other computers can reach makes the url carry a token.
+            port: 0 picks a free port; a busy one moves up to the next free one.
+            device: where to render and optimize.
+            weights: weights files.
+            report: called with a line about what takes long.
+
+        Raises:
+            SettingsError: a folder is not there, or the address is not usable.
+        """
+        self.roots = Roots(folders)
+        self.device, self.weights = device, weights
+        self._report = report
+        self.page = Page(host=host, port=port, title="CaRTS")
+        self.document = Document(self.page)
+        self.url = self.page.url
+        self.app: ViewerApp | None = None
+        self.incident: str | None = None
+        self.place: Place | None = None
+        self._listening = False
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="carts-site", daemon=True)
+        self._thread.start()
+        self.post(self.show_start)
+
+    def __enter__(self) -> "Site":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def post(self, job: Callable[[], None]) -> None:
+        """Do something on the site's thread, after everything that was asked for before. Any thread may ask."""
+        self._jobs.put(job)
+
+    def wait(self, timeout: float = 60.0) -> None:
+        """Wait until everything asked for so far is done.
+
+        Args:
+            timeout: [s]
+
+        Raises:
+            TimeoutError: it is not, in that time.
+        """
+        done = threading.Event()
+        self.post(done.set)
+        if not done.wait(timeout):
+            raise TimeoutError(f"The page was still busy after {timeout} s.")
+
+    def close(self) -> None:
+        """Save what is under way, and stop the server.
+
+        Raises:
+            ProjectError: corrections could not be saved.
+        """
+        self._jobs.put(None)
+        self._thread.join(timeout=60.0)
+        try:
+            self._leave()
+        finally:
+            self.page.close()
+
+    def show_start(self, problem: str = "") -> None:
+        """Go to the start page."""
+        self._go(lambda: StartPage(self, problem))
+
+    def show_recording(self, draft: str | None = None) -> None:
+        """Go to New recording: a new one, or a draft that is there."""
+        self._go(lambda: RecordingPlace(self, draft))
+
+    def open_sample(self) -> None:
+        """Open the shipped sequence."""
+        self.open_sequence(sample_sequence())
+
+    def open_sequence(self, path: Path) -> None:
+        """Go to the viewer of a sequence; if it cannot be opened, to the start page with the reason."""
+        self.document.show(f"<h1>Opening {escaped(path.name)}</h1><p>This takes a few seconds.</p>")
+        try:
+            self._leave()
+            self._listening = False
+            self.page.clear(f"{path.stem} · CaRTS")
+            app = ViewerApp.open(path, device=self.device, weights=self.weights, report=self._report, page=self.page)
+        except CartsError as error:
+            self._report(str(error))
+            self.show_start(str(error))
+            return
+        back = self.page.server.gui.add_button("All recordings", icon=viser.Icon.ARROW_LEFT, color="gray", order=-1.0)
+        back.on_click(lambda _: self.post(self.show_start))
+        self.app = app
+        with suppress(CartsError):
+            remember(app)
+        self.document.show("")
+        self.page.reload()
+
+    def _go(self, make: Callable[[], Place]) -> None:
+        """Leave what is shown for another place."""
+        self._leave()
+        again = not self._listening
+        if again:
+            self.page.clear("CaRTS")
+            gui = self.page.server.gui
+            gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
+            self.document.on_chosen(lambda name, value: self.post(lambda: self._chosen(name, value)))
+            self.page.on_clicked(lambda u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v))))
+            self._listening = True
+        self.place = make()
+        self.place.show()
+        if again:
+            self.page.reload()
+
+    def _chosen(self, name: str, value: str) -> None:
+        self._with_place(lambda place: place.choose(name, value))
+
+    def _with_place(self, work: Callable[[Place], None]) -> None:
+        place = self.place
+        if place is None:
+            return
+        try:
+            work(place)
+        except CartsError as error:
+            place.fail(error)
+        except Exception as error:
+            _log.exception("The page met an unexpected error")
+            place.fail(error)
+
+    def _leave(self) -> None:
+        place, self.place = self.place, None
+        app, self.app = self.app, None
+        if place is not None:
+            place.close()
+        if app is not None:
+            try:
+                with suppress(CartsError):
+                    remember(app)
+            finally:
+                app.close()
+                self.incident = app.project.incident or self.incident
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except Exception:
+                _log.exception("The page met an unexpected error")

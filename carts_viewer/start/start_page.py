@@ -1,0 +1,150 @@
+"""The start page: what was worked on lately, and ways to something new."""
+
+import time
+from pathlib import Path
+
+import cv2
+
+from carts_core.recording import Sequence
+from carts_core.resources import sample_sequence
+from carts_viewer.recording.draft import DraftSummary, delete_draft, drafts
+from carts_viewer.start.browser import FileBrowser
+from carts_viewer.start.host import Host
+from carts_viewer.start.recent import RecentProject, forget, recent_projects, thumbnail
+from carts_viewer.start.roots import Entry
+from carts_viewer.transport.document import button, escaped
+
+_JPEG_QUALITY = 80
+
+
+class StartPage:
+    """Cards of recent recordings, half-made imports, the sample, and a file browser."""
+
+    def __init__(self, site: Host, problem: str = "") -> None:
+        self._site = site
+        self._problem = problem
+        self._browser: FileBrowser | None = None
+
+    def show(self) -> None:
+        """Bring the document up to date."""
+        projects = recent_projects()
+        cards = "".join(self._card(project) for project in projects)
+        shown = f'<h2>Recent</h2><div class="cards">{cards}</div>' if projects else ""
+        problem = f'<div class="problem" role="alert">{escaped(self._problem)}</div>' if self._problem else ""
+        half_made = drafts()
+        unfinished = "".join(_draft_row(draft) for draft in half_made)
+        unfinished = f'<h2>Not finished</h2><div class="files">{unfinished}</div>' if half_made else ""
+        self._site.document.show(
+            "<h1>CaRTS</h1><p>Correct a surgical robot's kinematics from its endoscope image.</p>"
+            f'<div class="bar">{button("new", "New recording", kind="main")}{button("open", "Open a sequence file …")}'
+            f"</div>{problem}{self._open()}{unfinished}{shown}"
+            f'<h2>To try</h2><div class="cards">{self._sample(projects)}</div>'
+        )
+
+    def choose(self, name: str, value: str) -> None:
+        """Do what somebody has chosen."""
+        self._problem = ""
+        browser = self._browser
+        match name:
+            case "new":
+                return self._site.show_recording()
+            case "draft":
+                return self._site.show_recording(value)
+            case "delete-draft":
+                delete_draft(value)
+            case "sample":
+                return self._site.open_sample()
+            case "recent" if value in {project.sequence for project in recent_projects()}:
+                return self._site.open_sequence(Path(value))
+            case "forget":
+                forget(value)
+            case "open":
+                purpose = "Choose a sequence file (.toml)."
+                new = FileBrowser(self._site.roots, wanted=_is_toml, folders=False, purpose=purpose)
+                self._browser = None if browser is not None else new
+            case "browse" if browser is not None:
+                browser.browse(value)
+            case "pick" if browser is not None and (path := browser.picked(value)) is not None:
+                return self._site.open_sequence(path)
+        self.show()
+
+    def click(self, u: float, v: float) -> None:
+        """There is no image here."""
+
+    def fail(self, error: Exception) -> None:
+        """Show what went wrong."""
+        self._problem = str(error) or type(error).__name__
+        self.show()
+
+    def close(self) -> None:
+        """Nothing is under way here."""
+
+    def _open(self) -> str:
+        return "" if self._browser is None else f"<h2>Open</h2>{self._browser.html()}"
+
+    def _card(self, project: RecentProject) -> str:
+        share = project.reviewed / max(project.frames, 1)
+        progress = (
+            f'<progress max="1" value="{share:.3f}"></progress><small>{project.reviewed} of {project.frames} frames '
+            f"reviewed, {project.corrected} corrected · {_ago(project.changed)}</small>"
+        )
+        actions = button("recent", "Open", project.sequence, kind="main") + button(
+            "forget", "Remove from this list", project.sequence, kind="quiet"
+        )
+        return (
+            f'<div class="card">{self._picture(thumbnail(project))}<div><b>{escaped(project.name)}</b>'
+            f'<small title="{escaped(project.sequence)}">{escaped(project.sequence)}</small>{progress}'
+            f'<div class="bar">{actions}</div></div></div>'
+        )
+
+    def _sample(self, projects: list[RecentProject]) -> str:
+        path = sample_sequence()
+        known = next((thumbnail(project) for project in projects if project.sequence == str(path)), None)
+        picture = known if known is not None else _first_image(path)
+        return (
+            f'<div class="card">{self._picture(picture)}<div><b>The shipped sample</b>'
+            "<small>Two arms with their true positions</small>"
+            f'<div class="bar">{button("sample", "Open the sample", kind="main")}</div></div></div>'
+        )
+
+    def _picture(self, jpeg: bytes | None) -> str:
+        if jpeg is None:
+            return '<div class="blank"></div>'
+        return f'<img src="{self._site.page.media.publish(jpeg)}" alt="">'
+
+
+def _draft_row(draft: DraftSummary) -> str:
+    delete = button("delete-draft", "Delete", draft.key, kind="quiet")
+    go_on = button("draft", f"Go on with {draft.name or 'an import without a name'}", draft.key)
+    return f'<div class="bar" style="padding: 0 10px">{go_on}<small>{_ago(draft.changed)}</small>{delete}</div>'
+
+
+def _first_image(path: Path) -> bytes | None:
+    """The sample's first image, small."""
+    image = _SAMPLE.get(path)
+    if image is None:
+        sequence = Sequence.open(path)
+        frame = next(iter(sequence.frame(0, cameras=[sequence.scene.cameras[0].name]).images.values()))
+        small = cv2.resize(frame, (320, round(320 * frame.shape[0] / frame.shape[1])), interpolation=cv2.INTER_AREA)
+        image = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        _SAMPLE[path] = image
+    return image
+
+
+_SAMPLE: dict[Path, bytes] = {}
+
+
+def _is_toml(entry: Entry) -> bool:
+    return entry.path.suffix.lower() == ".toml"
+
+
+def _ago(seconds: float) -> str:
+    """When something was, as people say it."""
+    minutes = max(time.time() - seconds, 0.0) / 60
+    if minutes < 2:
+        return "just now"
+    if minutes < 90:
+        return f"{minutes:.0f} minutes ago"
+    if minutes < 36 * 60:
+        return f"{minutes / 60:.0f} hours ago"
+    return time.strftime("%Y-%m-%d", time.localtime(seconds))

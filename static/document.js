@@ -1,0 +1,71 @@
+// A document over the page: HTML from the server, and what people choose in it. Also says where the picture is clicked.
+(() => {
+  "use strict";
+
+  let box = null;
+
+  function element() {
+    if (!box?.isConnected) {
+      box = document.createElement("main");
+      document.body.append(box);
+      box.addEventListener("click", (event) => {
+        const chosen = event.target.closest("button[data-do]");
+        if (chosen && !chosen.disabled) say(chosen.dataset.do, chosen.dataset.value ?? "");
+      });
+      box.addEventListener("change", (event) => {
+        const field = event.target.closest("select[data-do], input[data-do]");
+        if (!field) return;
+        say(field.dataset.do, field.type === "checkbox" ? (field.checked ? "1" : "0") : field.value);
+      });
+      // What is typed here is no shortcut of the page behind.
+      for (const kind of ["keydown", "keyup", "pointerdown", "wheel", "dblclick"]) {
+        box.addEventListener(kind, (event) => event.stopPropagation());
+      }
+    }
+    return box;
+  }
+
+  const say = (name, value) => window.carts.report("chosen", JSON.stringify([name, value]));
+
+  /** Put new content in place of the old one; focus and scrolling stay where they are. */
+  function showDocument(content, place) {
+    const target = element();
+    const focused = target.contains(document.activeElement) ? document.activeElement : null;
+    const key = focused?.dataset?.do && [focused.dataset.do, focused.dataset.value ?? ""];
+    const scrolled = [...target.querySelectorAll("[data-scroll]")].map((part) => [part.dataset.scroll, part.scrollTop]);
+    target.className = content ? `carts-document carts-document-${place}` : "";
+    target.hidden = !content;
+    const top = target.scrollTop;
+    target.innerHTML = content;
+    target.scrollTop = top;
+    for (const [name, position] of scrolled) {
+      const part = [...target.querySelectorAll("[data-scroll]")].find((other) => other.dataset.scroll === name);
+      if (part) part.scrollTop = position;
+    }
+    if (key) {
+      [...target.querySelectorAll("[data-do]")]
+        .find((other) => other.dataset.do === key[0] && (other.dataset.value ?? "") === key[1])?.focus();
+    }
+    document.documentElement.classList.toggle("carts-covered", Boolean(content) && place === "page");
+  }
+
+  // A click in the picture is a press that did not move.
+  let pressed = null;
+  const canvas = () => window.__viserMutable?.canvas;
+  window.addEventListener("pointerdown", (event) => {
+    pressed = event.button === 0 && !event.shiftKey && event.target === canvas() ? [event.clientX, event.clientY] : null;
+  }, { capture: true });
+  window.addEventListener("pointerup", (event) => {
+    const start = pressed;
+    pressed = null;
+    if (!start || Math.hypot(event.clientX - start[0], event.clientY - start[1]) > 3) return;
+    const image = window.carts.imageOnScreen();
+    if (!image) return;
+    const frame = canvas().getBoundingClientRect();
+    const u = (event.clientX - frame.left - image.left) / image.width;
+    const v = (event.clientY - frame.top - image.top) / image.height;
+    if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("clicked", `${u} ${v}`);
+  }, { capture: true });
+
+  window.carts.showDocument = showDocument;
+})();

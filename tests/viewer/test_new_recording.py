@@ -1,0 +1,208 @@
+"""From raw files to a calibrated overlay, in a browser, as a person does it."""
+
+import csv
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clicked_points import clicked
+from playwright.sync_api import Browser
+from visitor import Visitor, write_lab_files
+
+from carts_core.evaluation.metrics import dice
+from carts_core.model.camera import HALF_PIXEL
+from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.model.scene import Scene
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+from carts_viewer.recording.place import RecordingPlace
+from carts_viewer.start.site import Site
+
+pytestmark = pytest.mark.browser
+SHIFT = np.array([[0.0, 0.0, HALF_PIXEL], [0.0, 0.0, HALF_PIXEL], [0.0, 0.0, 0.0]])
+"""From our K to OpenCV's."""
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[Callable[[Path], Visitor]]:
+    """Opens the start page for the recordings below a folder, in a window of 1280 x 800."""
+    with ExitStack() as stack:
+
+        def make(root: Path) -> Visitor:
+            site = stack.enter_context(Site([root], port=0))
+            context = browser.new_context(viewport={"width": 1280, "height": 800})
+            stack.callback(context.close)
+            return Visitor(site, context.new_page())
+
+        yield make
+
+
+def place_of(visitor: Visitor) -> RecordingPlace:
+    visitor.site.wait()
+    assert isinstance(visitor.site.place, RecordingPlace)
+    return visitor.site.place
+
+
+def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, np.ndarray], noise: float) -> None:
+    """Click each landmark where a calibration says that it is, until no more is asked for."""
+    for number in range(60):
+        place = place_of(visitor)
+        wish = place.wish
+        if wish is None:
+            return
+        camera = scene.camera(wish.camera)
+        points = clicked(scene, measured, [wish.frame], [wish.camera], noise=noise, seed=number, names=(wish.landmark,))
+        point = next(point for point in points if point.arm == wish.arm)
+        before = len(place.draft.points)
+        visitor.point_at(point.pixel, (camera.width, camera.height))
+        visitor.page.wait_for_timeout(100)
+        visitor.site.wait()
+        assert len(place_of(visitor).draft.points) == before + 1
+    raise AssertionError("there is no end to what is asked for")
+
+
+def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_place(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
+) -> None:
+    made = Sequence.open(tiny_sequence(frames=8, cameras=("left", "right"), width=320, height=240))
+    assert made.truth is not None
+    true = {"PSM1": made.truth["PSM1"]}
+    root = tmp_path / "labs"
+    for camera in ("left", "right"):
+        shutil.copytree(made.path.parent / "regular" / camera, root / "day 3" / f"{camera}_images")
+    lenses = [(camera.name, (camera.width, camera.height), camera.K - SHIFT) for camera in made.scene.cameras]
+    write_lab_files(root / "day 3", range(1, 9), true["PSM1"], lenses)
+    visitor = visit(root)
+    visitor.press("New recording")
+    visitor.press_entry("day 3")
+    visitor.press("Choose this folder")
+    visitor.reads("Each row belongs to one image.", 90)
+    visitor.press("Continue to hand-eye")
+    visitor.reads("Click the tip")
+    visitor.dismiss_warning()
+    click_what_is_asked_for(visitor, made.scene, true, 0.5)
+    visitor.reads("All points are there")
+    # Taken back and done again, and still there after a restart.
+    points = place_of(visitor).draft.points
+    visitor.press("Undo")
+    visitor.reads("Click the shaft edge")
+    assert place_of(visitor).draft.points == points[:-1]
+    visitor.press("All recordings")
+    visitor.press("Go on with day 3")
+    visitor.reads("Click the shaft edge")
+    click_what_is_asked_for(visitor, made.scene, true, 0.5)
+    visitor.press("Calibrate")
+    visitor.press("Stop")
+    visitor.reads("Stopped; the calibration from your points is as it was.", 120)
+    visitor.press("Save and open")
+    visitor.page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+    visitor.site.wait()
+    assert visitor.site.app is not None
+    saved = visitor.site.app.sequence
+    assert saved.path == root / "day 3_sequence" / "sequence.toml"
+    overlap = [agreement(saved.scene, made, camera) for camera in ("left", "right")]
+    assert min(overlap) > 0.85, overlap
+    text = saved.path.read_text()
+    assert "points clicked in carts view" in text and "no base frame" not in text
+    visitor.page.get_by_role("button", name="All recordings", exact=True).click()
+    visitor.reads("0 of 8 frames reviewed")
+    assert not (tmp_path / "data" / "drafts").exists() or not list((tmp_path / "data" / "drafts").glob("*.json"))
+
+
+def agreement(found: Scene, truth: Sequence, camera: str) -> float:
+    """Mean Dice of rendered masks of two calibrations over all frames."""
+    renderers = [Renderer(scene, cameras=[camera]) for scene in (found, truth.scene)]
+    scores = []
+    for index in range(len(truth)):
+        joints = {arm: rows[index] for arm, rows in (truth.truth or {}).items()}
+        masks = [
+            renderer.segment(scene.state(joints))[0] >= 0
+            for renderer, scene in zip(renderers, (found, truth.scene), strict=True)
+        ]
+        scores.append(dice(*masks))
+    return float(np.mean(scores))
+
+
+def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
+) -> None:
+    made = Sequence.open(tiny_sequence(frames=3, cameras=("left",), width=96, height=72))
+    root = tmp_path / "labs"
+    shutil.copytree(made.path.parent / "regular" / "left", root / "run")
+    write_lab_files(root, range(1, 4), made.measured["PSM1"], [])
+    table = root / "robot_log.csv"
+    table.write_text(table.read_text().replace("axis_3", "depth of insertion").replace("axis_4", "spin"))
+    visitor = visit(root)
+    visitor.press("New recording")
+    visitor.press("Choose this folder")
+    visitor.press("Other table …")
+    visitor.press_entry("robot_log.csv")
+    visitor.reads("Six joints are not recognized")
+    assert visitor.button("Continue to hand-eye").is_disabled()
+    names = dict(zip(JOINT_NAMES, ("axis_1", "axis_2", "depth of insertion", "spin", "axis_5", "axis_6"), strict=True))
+    for joint, column in names.items():
+        visitor.page.get_by_label(joint.replace("_", " "), exact=True).select_option(column)
+        visitor.site.wait()
+    visitor.page.wait_for_function("!document.querySelector('main').innerText.includes('not recognized')")
+    place = place_of(visitor)
+    assert place.draft.options.columns == names
+    assert visitor.button("Continue to hand-eye").is_enabled()
+    # A sign that is the other way round.
+    visitor.page.get_by_label("other sign").first.check()
+    visitor.site.wait()
+    assert place.draft.options.flip == ("yaw",)
+    visitor.press("Undo")
+    visitor.site.wait()
+    assert place.draft.options.flip == ()
+
+
+@pytest.mark.slow
+def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks(
+    shared_dir: Path, tmp_path: Path, visit: Callable[[Path], Visitor]
+) -> None:
+    data = shared_dir / "data" / "dvrk_stereo"
+    reference = Sequence.open(Path(__file__).parent.parent / "sequences" / "dvrk_stereo.toml")
+    root = tmp_path / "labs"
+    for side in ("left", "right"):
+        shutil.copytree(data / side, root / "day 3" / f"{side}_camera")
+    with (data / "kinematics.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    values = np.array([[float(row[name]) for name in JOINT_NAMES] for row in rows])
+    lenses = [(camera.name, (camera.width, camera.height), camera.K - SHIFT) for camera in reference.scene.cameras]
+    write_lab_files(root / "day 3", range(1, 31), values, lenses)
+    visitor = visit(root)
+    visitor.press("New recording")
+    visitor.press_entry("day 3")
+    visitor.press("Choose this folder")
+    visitor.press("Continue to hand-eye", 90)
+    visitor.reads("Click the tip", 90)
+    visitor.dismiss_warning()
+    click_what_is_asked_for(visitor, reference.scene, dict(reference.measured), 2.0)
+    visitor.press("Calibrate")
+    visitor.reads("Calibrated", 900)
+    assert visitor.clicks <= 25
+    place = place_of(visitor)
+    shown = place.shown_scene
+    assert shown is not None
+    scores = {camera: masks_agreement(shown, reference, camera) for camera in ("left", "right")}
+    print(f"{visitor.clicks} clicks, Dice {scores}")
+    assert scores["left"] >= 0.94 and scores["right"] >= 0.95, scores
+    visitor.press("Save and open")
+    visitor.page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+    visitor.site.wait()
+    assert visitor.site.app is not None
+    saved = visitor.site.app.sequence.scene
+    assert masks_agreement(saved, reference, "left") == pytest.approx(scores["left"], abs=0.002)
+
+
+def masks_agreement(scene: Scene, reference: Sequence, camera: str) -> float:
+    """Mean Dice against the masks of all frames, joints as measured."""
+    renderer, scores = Renderer(scene, cameras=[camera]), []
+    for index in range(len(reference)):
+        frame = reference.frame(index, cameras=[camera])
+        assert frame.masks is not None
+        scores.append(dice(renderer.segment(scene.state(frame.measured))[0] >= 0, frame.masks[camera]))
+    return float(np.mean(scores))
