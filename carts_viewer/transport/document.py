@@ -37,6 +37,11 @@ class Document:
         for client in self._page.server.get_clients().values():
             self._send(client)
 
+    @property
+    def content(self) -> str:
+        """The HTML that is shown; empty if none is."""
+        return self._shown[0]
+
     def on_chosen(self, callback: Callable[[str, str], None]) -> None:
         """Call `callback(name, value)` on the event loop for what is chosen; any two texts."""
 
