@@ -25,8 +25,8 @@ class PageState:
         self._server = uuid.uuid4().hex
         self._sent: dict[str, Any] = {}
 
-        @page.server.on_client_connect
-        async def _(client: viser.ClientHandle) -> None:
+        @page.on_connect
+        def _(client: viser.ClientHandle) -> None:
             if self._sent:
                 page.call(client, "setPage", self._sent)
 

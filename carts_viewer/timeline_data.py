@@ -40,8 +40,8 @@ class TimelineData:
         self._codes: dict[int, int] = {}
         self._solving: list[int] | None = None
 
-        @page.server.on_client_connect
-        async def _(client: viser.ClientHandle) -> None:
+        @page.on_connect
+        def _(client: viser.ClientHandle) -> None:
             page.call(client, "setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:

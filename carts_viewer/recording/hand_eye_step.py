@@ -14,7 +14,7 @@ from carts_viewer.recording.clicking import Clicking, Wish
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.panel import hand_eye_panel
 from carts_viewer.recording.picture import FramePicture
-from carts_viewer.recording.saving import calibrated_recording, save, target_folder
+from carts_viewer.recording.saving import calibrated_recording, target_folder, write_saved
 from carts_viewer.recording.scenes import calibrated_scene
 from carts_viewer.start.host import Host
 
@@ -120,7 +120,7 @@ class HandEyeStep:
             self._calibrate()
         return draft
 
-    def save(self, draft: Draft) -> Path:
+    def write(self, draft: Draft) -> Path:
         """Write the sequence; gives its file.
 
         Raises:
@@ -136,9 +136,9 @@ class HandEyeStep:
         elif self._clicking.result is not None:
             text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)
         else:
-            return save(self._recording, folder, draft.name)
+            return write_saved(self._recording, folder, draft.name)
         recording = calibrated_recording(self._recording, self._sequence.scene, calibration, text)
-        return save(recording, folder, draft.name)
+        return write_saved(recording, folder, draft.name)
 
     def _solve(self, draft: Draft) -> None:
         wanted = (draft.points, draft.focal_length)

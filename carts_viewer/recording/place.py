@@ -258,7 +258,7 @@ class RecordingPlace:
     def _in_hand_eye(self, name: str, value: str) -> None:
         assert self._step is not None
         if name == "save":
-            path = self._step.save(self._draft)
+            path = self._step.write(self._draft)
             self._file.delete()
             self._host.open_sequence(path)
             return

@@ -64,7 +64,7 @@ def target_folder(roots: Roots, source: Path, name: str) -> Path:
     return folder
 
 
-def save(recording: FoundRecording, folder: Path, name: str) -> Path:
+def write_saved(recording: FoundRecording, folder: Path, name: str) -> Path:
     """Write the sequence file with its tables; gives the file.
 
     Raises:

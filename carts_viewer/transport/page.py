@@ -8,25 +8,23 @@ The browser tests drive all of this end to end.
 """
 
 import contextlib
-import functools
 import html
 import http
 import io
 import json
 import mimetypes
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import viser
 from websockets.http11 import Request, Response
 
-from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 from carts_viewer.transport import incoming
 from carts_viewer.transport.fields import on_numbers, on_text, said
 from carts_viewer.transport.gate import gated, response
 from carts_viewer.transport.guard import Guard, check_address
+from carts_viewer.transport.index import TITLE, index_of_viser
 from carts_viewer.transport.media import MEDIA, Media
 from carts_viewer.transport.outgoing import queue_safely
 from carts_viewer.transport.viser_private import command_id, element_id, on_sent, run_script, value_of, widgets
@@ -48,7 +46,6 @@ _FIELDS = {
 }
 """Invisible fields, and what a tab says in them."""
 
-_TITLE = "<title>Viser</title>"
 # The token has done its work when the page is there; nobody should copy it out of the address bar by mistake.
 _FORGET_TOKEN = (
     "const address = new URL(location.href); address.searchParams.delete('token');"
@@ -275,9 +272,9 @@ class Page:
         ids = {name: element_id(field) for name, field in self._fields.items()}
         configuration = json.dumps({**ids, "keys": OWN_KEYS, "keyGroups": self.key_groups})
         return (
-            _index_of_viser()
+            index_of_viser()
             .replace(
-                _TITLE,
+                TITLE,
                 f"<title>{html.escape(self._title)}</title>"
                 '<link rel="icon" href="/static/icon.svg" />'
                 '<link rel="stylesheet" href="/static/page.css" />'
@@ -293,14 +290,3 @@ class Page:
             )
             .encode()
         )
-
-
-@functools.cache
-def _index_of_viser() -> str:
-    index = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    text = index.read_text(encoding="utf-8")
-    if _TITLE not in text:
-        raise CartsError(
-            f"{index} is not the page of viser 1.1. Install the pinned version: pip install 'viser~=1.1.1'"
-        )
-    return text

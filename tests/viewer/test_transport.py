@@ -29,7 +29,8 @@ REPLACED = {
     "transport/gate.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
-IN_THE_PAGE = {name: {"__viserMutable"} for name in ("page.js", "paint.js", "marks.js", "timeline.js", "shell.js")}
+SCRIPTS = ("page.js", "paint.js", "marks.js", "timeline.js", "shell.js", "document.js")
+IN_THE_PAGE = {name: {"__viserMutable"} for name in SCRIPTS}
 """What our scripts use of viser's page that it does not document."""
 
 

@@ -56,8 +56,8 @@ def open_and_tell(sequence: Path, weights: Path, tell: Connection) -> ViewerApp:
     (exports,) = (panel for panel in app.display._panels if isinstance(panel, ExportPanel))
     labels = "Note", "Accept", "Reject", "Run", "Format", "Export", "Go to"
     found = [
-        app.page._released,
-        app.page._painted,
+        app.page._fields["released"],
+        app.page._fields["painted"],
         saved._text,
         exports._result,
         app.page.find("Frame"),
