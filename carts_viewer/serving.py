@@ -79,6 +79,7 @@ def serve_site(
     host: str = "127.0.0.1",
     port: int = 8080,
     device: str = "cpu",
+    inference: Inference = "auto",
     weights: tuple[Path, ...] = (),
     open_browser: bool = False,
 ) -> None:
@@ -89,6 +90,7 @@ def serve_site(
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
+        inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
         open_browser: Open the page in the default browser.
 
@@ -99,7 +101,9 @@ def serve_site(
     with EndRequest() as end:
         try:
             check_address(host, port)
-            site = Site(folders, host=host, port=port, device=device, weights=weights, report=_say_doing)
+            site = Site(
+                folders, host=host, port=port, device=device, inference=inference, weights=weights, report=_say_doing
+            )
         except CartsError as error:
             print(f"error: {visible(str(error))}", file=sys.stderr)
             raise SystemExit(2) from error

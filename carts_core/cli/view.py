@@ -40,6 +40,7 @@ class View:
                 host=self.host,
                 port=self.port,
                 device=self.network.device,
+                inference=self.network.inference,
                 weights=self.network.weights,
                 open_browser=self.open_browser,
             )

@@ -11,6 +11,7 @@ from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult, StopReason
 from carts_core.recording import Sequence, spread
+from carts_core.settings.inference import Inference
 
 FRAMES = 20
 """Frames that take part, spread evenly."""
@@ -43,6 +44,7 @@ class CalibrationJob:
         *,
         weights: tuple[Path, ...],
         device: str,
+        inference: Inference,
         report: Callable[[Progress], None],
     ) -> None:
         """Begin.
@@ -52,10 +54,12 @@ class CalibrationJob:
             scene: its arms and cameras, with the calibration to begin with.
             weights: weights files.
             device: where to compute.
+            inference: who runs the surface network.
             report: called on the job's thread with every progress, the last one `ended`.
         """
         self._sequence, self._scene = sequence, scene
         self._weights, self._device = weights, device
+        self._inference: Inference = inference
         self._report = report
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="carts-calibration", daemon=True)
@@ -85,7 +89,7 @@ class CalibrationJob:
 
     def _calibrate(self) -> Progress:
         self._report(Progress("Loading the networks", 0.0))
-        extractor = FeatureExtractor.load(*self._weights, device=self._device)
+        extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
         self._report(Progress("Reading images", 0.0))
         frames = [self._sequence.frame(index) for index in spread(len(self._sequence), FRAMES)]
         optimizer = CalibrationOptimizer(self._scene, frames, extractor)

@@ -204,6 +204,7 @@ class HandEyeStep:
             self._clicking.result.scene,
             weights=self._host.weights,
             device=self._host.device,
+            inference=self._host.inference,
             report=report,
         )
 

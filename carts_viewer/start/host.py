@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+from carts_core.settings.inference import Inference
 from carts_viewer.start.roots import Roots
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page
@@ -35,6 +36,7 @@ class Host(Protocol):
     document: Document
     roots: Roots
     device: str
+    inference: Inference
     weights: tuple[Path, ...]
 
     def post(self, job: Callable[[], None]) -> None:

@@ -11,6 +11,7 @@ import viser
 
 from carts_core.errors import CartsError
 from carts_core.resources import sample_sequence
+from carts_core.settings.inference import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.host import Place
@@ -43,6 +44,7 @@ class Site:
         host: str = "127.0.0.1",
         port: int = 8080,
         device: str = "cpu",
+        inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Callable[[str], None] = lambda line: None,
     ) -> None:
@@ -53,6 +55,7 @@ class Site:
             host: the address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: where to render and optimize.
+            inference: who runs the surface network.
             weights: weights files.
             report: called with a line about what takes long.
 
@@ -61,6 +64,7 @@ class Site:
         """
         self.roots = Roots(folders)
         self.device, self.weights = device, weights
+        self.inference: Inference = inference
         self._report = report
         self.page = Page(host=host, port=port, title="CaRTS")
         self.document = Document(self.page)
@@ -130,7 +134,14 @@ class Site:
             self._leave()
             self._listening = False
             self.page.clear(f"{path.stem} · CaRTS")
-            app = ViewerApp.open(path, device=self.device, weights=self.weights, report=self._report, page=self.page)
+            app = ViewerApp.open(
+                path,
+                device=self.device,
+                inference=self.inference,
+                weights=self.weights,
+                report=self._report,
+                page=self.page,
+            )
         except CartsError as error:
             self._report(str(error))
             self.show_start(str(error))
