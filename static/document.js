@@ -46,6 +46,7 @@
       [...target.querySelectorAll("[data-do]")]
         .find((other) => other.dataset.do === key[0] && (other.dataset.value ?? "") === key[1])?.focus();
     }
+    document.documentElement.classList.toggle("carts-documented", Boolean(content));
     document.documentElement.classList.toggle("carts-covered", Boolean(content) && place === "page");
   }
 

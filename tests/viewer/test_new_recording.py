@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from clicked_points import clicked
 from playwright.sync_api import Browser
+from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
 
 from carts_core.evaluation.metrics import dice
@@ -58,9 +59,7 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
         point = next(point for point in points if point.arm == wish.arm)
         before = len(place.draft.points)
         visitor.point_at(point.pixel, (camera.width, camera.height))
-        visitor.page.wait_for_timeout(100)
-        visitor.site.wait()
-        assert len(place_of(visitor).draft.points) == before + 1
+        eventually(lambda: len(place_of(visitor).draft.points), lambda count, before=before: count == before + 1)
     raise AssertionError("there is no end to what is asked for")
 
 
@@ -88,8 +87,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     # Taken back and done again, and still there after a restart.
     points = place_of(visitor).draft.points
     visitor.press("Undo")
-    visitor.reads("Click the shaft edge")
-    assert place_of(visitor).draft.points == points[:-1]
+    eventually(lambda: place_of(visitor).draft.points, lambda now: now == points[:-1])
     visitor.press("All recordings")
     visitor.press("Go on with day 3")
     visitor.reads("Click the shaft edge")
@@ -145,18 +143,18 @@ def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
     names = dict(zip(JOINT_NAMES, ("axis_1", "axis_2", "depth of insertion", "spin", "axis_5", "axis_6"), strict=True))
     for joint, column in names.items():
         visitor.page.get_by_label(joint.replace("_", " "), exact=True).select_option(column)
-        visitor.site.wait()
+        eventually(
+            lambda joint=joint: place_of(visitor).draft.options.columns.get(joint), lambda found: found is not None
+        )
     visitor.page.wait_for_function("!document.querySelector('main').innerText.includes('not recognized')")
     place = place_of(visitor)
     assert place.draft.options.columns == names
     assert visitor.button("Continue to hand-eye").is_enabled()
     # A sign that is the other way round.
     visitor.page.get_by_label("other sign").first.check()
-    visitor.site.wait()
-    assert place.draft.options.flip == ("yaw",)
+    eventually(lambda: place.draft.options.flip, lambda flip: flip == ("yaw",))
     visitor.press("Undo")
-    visitor.site.wait()
-    assert place.draft.options.flip == ()
+    eventually(lambda: place.draft.options.flip, lambda flip: flip == ())
 
 
 @pytest.mark.slow
