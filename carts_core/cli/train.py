@@ -18,6 +18,9 @@ class Train:
 
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""
+    for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
+    """Sequence file to adapt the shipped network to: its robots, cameras, distances and empty backgrounds. It ends when
+    it no longer gains, or after --minutes, 15 by default."""
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
 
     def run(self) -> None:
@@ -26,6 +29,9 @@ class Train:
 
         check_device(self.training.device)
         console = Terminal()
+        if self.for_ is not None:
+            self._adapt(self.for_, console)
+            return
         with Bar(*Bar.get_default_columns()[:-1], TimeRemainingColumn(), console=console) as bar:
             task = bar.add_task("training", total=self.training.steps)
 
@@ -35,3 +41,27 @@ class Train:
 
             result = train(self.training, self.output, report)
         console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")
+
+    def _adapt(self, recording: Path, console: Terminal) -> None:
+        """Adapt the shipped network to a recording, saying each minute what is reached."""
+        from ..files import locked_folder
+        from ..lab.training.adaptation import adapted_to, gain
+        from ..lab.training.training import TrainingProgress, train
+
+        with locked_folder(self.output):
+            config = adapted_to(recording, self.output, self.training)
+        first: dict[str, float] | None = None
+        said: dict[str, float] | None = None
+
+        def report(progress: TrainingProgress) -> None:
+            nonlocal first, said
+            if progress.validation is None or progress.validation is said:
+                return
+            first, said = first or progress.validation, progress.validation
+            console.print(f"step {progress.step}: {gain(first, said)}", soft_wrap=True)
+
+        result = train(config, self.output, report)
+        console.print(f"weights: {result.weights}\nreport:  {result.report}")
+        if first is not None:
+            console.print(f"kept, the best: {gain(first, result.validation)}", soft_wrap=True)
+        console.print(f"Use: carts optimize {recording} --weights {result.weights}", soft_wrap=True)

@@ -21,7 +21,7 @@ class TrainingConfig:
     network: NetworkName = "feature"
     """Which network is trained: `feature` for the paper's loss, `surface` for Gauss-Newton."""
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
-    """URDF files of the robots whose images are made."""
+    """URDF files of the robots whose images are made, or `builtin:NAME`."""
     start: Path | None = None
     """Weights file to start from, for fine-tuning; random weights without it. The network is as large as these,
     unless another architecture is asked for, into which it then grows."""
@@ -43,6 +43,10 @@ class TrainingConfig:
     """Decay per step of the running average of the weights, which is what is saved."""
     validation_every: int = 250
     """Steps between validations."""
+    validation_minutes: float | None = None
+    """Time between validations [min], in place of `validation_every`."""
+    patience: int | None = None
+    """Validations in a row without a gain after which a run ends, and whose weights are not kept."""
     validation_samples: int = 32
     """Samples of the fixed validation set."""
     checkpoint_every: int = 100
@@ -86,6 +90,12 @@ class TrainingConfig:
             )
         if self.minutes is not None and not self.minutes > 0:
             raise SettingsError(f"minutes is {self.minutes}; give a positive time, or leave it out.")
+        if self.validation_minutes is not None and not self.validation_minutes > 0:
+            raise SettingsError(
+                f"validation_minutes is {self.validation_minutes}; give a positive time, or leave it out."
+            )
+        if self.patience is not None and self.patience < 1:
+            raise SettingsError(f"patience is {self.patience}; give 1 or more, or leave it out.")
         if not 0 <= self.average < 1:
             raise SettingsError(f"average is {self.average}; give a decay from 0 (no average) to below 1.")
         if not self.robots:

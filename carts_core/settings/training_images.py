@@ -35,6 +35,8 @@ class ImageSettings:
     """Folder of photographs; `from_photographs` of the backgrounds are parts of them."""
     from_photographs: float = 0.2
     """Share of backgrounds that are parts of photographs, if a folder of them is given."""
+    recording: Path | None = None
+    """Sequence file; arms are then where its cameras see them, about, and not 5 to 25 cm from the camera."""
     coverage: tuple[float, float] = (0.004, 0.5)
     """Allowed share of the image that shows arms."""
     appearance: AppearanceRanges = field(default_factory=AppearanceRanges)

@@ -17,6 +17,7 @@ from .lens import photograph
 from .occluders import occlude
 from .photographs import Photographs
 from .placement import Placement, random_intrinsics, random_placement
+from .recorded import RecordedPlacements
 from .shading import shade
 from .things import add_things
 from .variants import Variant, random_variant
@@ -74,6 +75,7 @@ class Observer:
         self.settings = settings
         self._robots = robots
         self._photographs = Photographs(settings.photographs) if settings.photographs else None
+        self._recorded = RecordedPlacements(settings.recording) if settings.recording else None
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
     def __call__(self, number: int | None = None) -> Observation:
@@ -117,8 +119,11 @@ class Observer:
         size = settings.width, settings.height
         tries = 0
         while True:
-            intrinsics = random_intrinsics(rng, *size, settings.field_width)
-            placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
+            if self._recorded is not None:
+                intrinsics, placements = self._recorded(rng, variant.geometries, size, settings.field_width)
+            else:
+                intrinsics = random_intrinsics(rng, *size, settings.field_width)
+                placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
             view = look(variant.geometries, placements, intrinsics, *size)
             share = len(view.rows) / (settings.width * settings.height)
             tries += 1

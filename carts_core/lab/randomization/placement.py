@@ -70,8 +70,10 @@ def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Plac
     shaft_link = geometry.part_link[geometry.shaft]
     T_camera_shaft = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
     T_camera_shaft_moved = placement.T_camera_base @ geometry.link_transforms(joints)[shaft_link]
-    turn = _rotation(rng.normal(0, np.deg2rad(2.0) * scale, 3))
-    wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3] + rng.normal(0, 0.003 * scale, 3)
+    turn = turned(rng.normal(0, np.deg2rad(2.0) * scale, 3))
+    wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3]
+    # Farther away, what moves the image by as much is a larger distance.
+    wrist = wrist + rng.normal(0, 0.003 * scale, 3) * max(1.0, np.linalg.norm(wrist) / DEPTH[1])
     R = turn @ T_camera_shaft[:3, :3]
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, wrist - R @ geometry.shaft_end
@@ -95,7 +97,8 @@ def _frame(axis: np.ndarray, helper: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
+def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation about a vector by its length [rad]."""
     angle = np.linalg.norm(vector)
     if angle == 0:
         return np.eye(3)

@@ -26,6 +26,7 @@ class FeatureTask:
         "similarity_aligned": "cosine, aligned",
         "similarity_misaligned": "cosine, misaligned",
     }
+    score: ClassVar[str] = "dice_observed"
 
     def network(self, config: TrainingConfig) -> FeatureNetwork:
         """A network with random weights."""

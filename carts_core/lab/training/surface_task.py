@@ -31,6 +31,7 @@ class SurfaceTask:
         "part_accuracy": "pixels with the right part",
         "normal_error_deg": "error of normals [deg]",
     }
+    score: ClassVar[str] = "dice"
 
     def network(self, config: TrainingConfig) -> SurfaceNetwork:
         """A network with random weights."""

@@ -18,6 +18,8 @@ class Task(Protocol):
 
     columns: ClassVar[dict[str, str]]
     """Validation figures: name -> heading in the report."""
+    score: ClassVar[str]
+    """The figure that tells whether a network has become better; higher is better."""
 
     def network(self, config: TrainingConfig) -> nn.Module:
         """A network with random weights."""

@@ -26,7 +26,17 @@ from .tasks import task_of
 
 _LOG_EVERY = 10
 _EXAMPLES = 6
-_MAY_CHANGE = ("steps", "minutes", "workers", "threads", "device", "validation_every", "checkpoint_every")
+_MAY_CHANGE = (
+    "steps",
+    "minutes",
+    "workers",
+    "threads",
+    "device",
+    "validation_every",
+    "checkpoint_every",
+    "validation_minutes",
+    "patience",
+)
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,7 @@ class _Run:
         self.step, self.history = 0, History()
         self._resume()
         self._saved = self.step
-        self._clock = time.perf_counter()
+        self._clock = self._validated = time.perf_counter()
 
     def _resume(self) -> None:
         checkpoint = load_checkpoint(self.output)
@@ -119,7 +129,11 @@ class _Run:
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
         samples = validation_set(self.config)
         validation = None
-        if self.step < self._planned():
+        if self.config.patience is not None and not self.history.validations:
+            # What the start reaches is what has to be beaten.
+            validation = self._validate(samples)
+            progress(TrainingProgress(self.step, self._planned(), math.nan, math.nan, validation))
+        if self.step < self._planned() and not self._has_ended_gaining():
             batches = training_batches(self.config, self.step)
             sums: dict[str, float] = {}
             count, self._clock = 0, time.perf_counter()
@@ -132,8 +146,9 @@ class _Run:
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
                 last = self.step == self._planned()
-                if last or self.step % self.config.validation_every == 0:
+                if last or self._validation_due():
                     validation = self._validate(samples)
+                    last = last or self._has_ended_gaining()
                 if last or count == _LOG_EVERY:
                     means = {name: value / count for name, value in sums.items()}
                     self.history.losses.append({"step": self.step, **means})
@@ -143,7 +158,9 @@ class _Run:
                     sums, count, self._clock = {}, 0, time.perf_counter()
                 if last or self.step % self.config.checkpoint_every == 0:
                     self._checkpoint()
-        if validation is None:
+        if self.config.patience is not None:
+            validation = max(self.history.validations, key=lambda entry: entry[self.task.score])
+        elif validation is None:
             validation = self.task.validate(self._averaged().folded(), samples)
             self._save(validation)
         examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
@@ -190,11 +207,27 @@ class _Run:
         assert isinstance(network, UNet)
         return network
 
+    def _validation_due(self) -> bool:
+        if self.config.validation_minutes is None:
+            return self.step % self.config.validation_every == 0
+        return time.perf_counter() - self._validated >= 60 * self.config.validation_minutes
+
     def _validate(self, samples: Batch) -> dict[str, float]:
         validation = self.task.validate(self._averaged().folded(), samples)
+        best = max((entry[self.task.score] for entry in self.history.validations), default=-math.inf)
         self.history.validations.append({"step": self.step, **validation})
-        self._save(validation)
+        if self.config.patience is None or validation[self.task.score] > best:
+            self._save(validation)
+        self._validated = time.perf_counter()
         return validation
+
+    def _has_ended_gaining(self) -> bool:
+        """Whether the newest validations, as many as `patience` says, are no better than one before them."""
+        patience = self.config.patience
+        scores = [entry[self.task.score] for entry in self.history.validations]
+        if patience is None or len(scores) <= patience:
+            return False
+        return max(scores[-patience:]) <= max(scores[:-patience])
 
     def _save(self, validation: dict[str, float]) -> None:
         training = {"step": self.step, "validation": validation, "config": json.loads(config_json(self.config))}
@@ -258,4 +291,6 @@ def config_json(config: TrainingConfig) -> str:
     settings["robots"] = [path.name for path in config.robots]
     folder = config.images.photographs
     settings["images"]["photographs"] = folder.name if folder else None
+    recording = config.images.recording
+    settings["images"]["recording"] = recording.name if recording else None
     return json.dumps(settings)

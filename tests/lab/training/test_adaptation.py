@@ -1,0 +1,137 @@
+"""`carts train --for`: a network is adapted to the robots, cameras and distances of a recording."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.errors import SettingsError
+from carts_core.lab.randomization.geometry import RobotGeometry
+from carts_core.lab.randomization.recorded import RecordedPlacements
+from carts_core.lab.training.adaptation import BACKGROUNDS, adapted_to, gain
+from carts_core.lab.training.checkpoint import load_checkpoint
+from carts_core.lab.training.training import train
+from carts_core.model.robot import Robot
+from carts_core.networks.weights import read_weights
+from carts_core.recording import Sequence
+from carts_core.resources import sample_sequence, shipped_weights
+from carts_core.settings import TrainingConfig
+
+ARM = """<robot name="arm"><link name="base"/>
+<link name="upper"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.1 0.6"/></geometry></visual></link>
+<link name="lower"><visual><origin xyz="0 0 0.2"/><geometry><box size="0.08 0.08 0.4"/></geometry></visual></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.6"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+SEQUENCE = """format = "carts-sequence/1"
+[kinematics]
+table = "kinematics.csv"
+[[cameras]]
+name = "overview"
+images = "{frame}.png"
+size = [64, 48]
+K = { fx = 70.0, fy = 70.0, cx = 32.0, cy = 24.0 }
+T_camera_world = [[1, 0, 0, 0], [0, 0, -1, 0.5], [0, 1, 0, 1.5], [0, 0, 0, 1]]
+[[arms]]
+name = "arm"
+robot = "arm.urdf"
+[arms.joints]
+shoulder = "shoulder"
+elbow = "elbow"
+"""
+
+
+@pytest.fixture(autouse=True)
+def _threads_as_before():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def far_away(tmp_path: Path) -> Path:
+    """A recording of a robot that is 1.5 m away."""
+    (tmp_path / "arm.urdf").write_text(ARM)
+    (tmp_path / "sequence.toml").write_text(SEQUENCE)
+    for frame in range(4):
+        cv2.imwrite(str(tmp_path / f"{frame}.png"), np.zeros((48, 64, 3), np.uint8))
+    rows = [f"{frame},{0.1 * frame},{-0.2 * frame}" for frame in range(4)]
+    (tmp_path / "kinematics.csv").write_text("\n".join(["frame,shoulder,elbow", *rows]) + "\n")
+    return tmp_path / "sequence.toml"
+
+
+def test_arms_are_placed_at_the_distance_of_the_recording_and_in_the_image(far_away: Path):
+    robot = Robot.load(far_away.parent / "arm.urdf")
+    geometry = RobotGeometry(robot)
+    placements, rng = RecordedPlacements(far_away), np.random.default_rng(0)
+    distances, inside = [], 0
+    for _ in range(40):
+        (fx, fy, cx, cy), (placement,) = placements(rng, (geometry,), (48, 32), 80)
+        assert 0.6 < fx / 80 / (70 / 64) < 1.6
+        Ts = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)
+        x, y, z = geometry.posed(Ts).vertices.T
+        distances.append(np.median(z))
+        u, v = fx * x / z + cx, fy * y / z + cy
+        inside += bool(((u > 0) & (u < 48) & (v > 0) & (v < 32)).any())
+        low, high = robot.joint_limits.numpy().T
+        assert ((placement.joint_positions >= low) & (placement.joint_positions <= high)).all()
+    assert 1.2 < np.median(distances) < 1.9
+    assert inside == 40
+
+
+def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
+    with pytest.raises(SettingsError, match="none of the recording's"):
+        RecordedPlacements(far_away)(
+            np.random.default_rng(0), (RobotGeometry(Robot.load("builtin:psm_lnd")),), (48, 32), 80
+        )
+
+
+def test_settings_come_from_the_recording_and_the_shipped_weights(tmp_path: Path):
+    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
+    assert config.start == shipped_weights()[1]
+    assert config.minutes == 15.0
+    assert [path.name for path in config.robots] == ["psm_lnd.urdf"]
+    assert config.images.recording == sample_sequence().absolute()
+    assert config.images.photographs == tmp_path / BACKGROUNDS
+    cameras = len(Sequence.open(sample_sequence()).scene.cameras)
+    assert len(list((tmp_path / BACKGROUNDS).glob("*.png"))) == cameras
+
+
+def test_options_that_are_given_are_kept(tmp_path: Path):
+    given = TrainingConfig(minutes=3.0, learning_rate=1e-4, start=Path("other.safetensors"))
+    config = adapted_to(sample_sequence(), tmp_path, given)
+    assert (config.minutes, config.learning_rate, config.start) == (3.0, 1e-4, Path("other.safetensors"))
+
+
+def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(tmp_path: Path):
+    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1))
+    # At so small a rate only the batch statistics change.
+    config = replace(config, learning_rate=1e-12, weight_decay=0.0, validation_samples=2, patience=2, average=0.0,
+                     validation_minutes=1e-4)  # fmt: skip
+    result = train(config, tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None
+    scores = [entry["dice"] for entry in checkpoint.history.validations]
+    assert checkpoint.history.validations[0]["step"] == 0
+    assert max(scores[:-2]) == result.validation["dice"]
+    assert len(scores) == 1 + scores.index(max(scores)) + 2
+    assert read_weights(result.weights).training["step"] == result.validation["step"]
+    again = train(config, tmp_path)
+    assert again.validation == result.validation
+
+
+def test_what_is_left_of_the_error_is_said():
+    text = gain({"dice": 0.8, "normal_error_deg": 20.0}, {"dice": 0.9, "normal_error_deg": 10.0})
+    assert "Dice 0.800 -> 0.900, 50% of the error is left" in text
+
+
+def test_a_missing_recording_is_said_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main(["train", str(tmp_path / "run"), "--for", str(tmp_path / "none.toml")])
+    assert ended.value.code == BAD_INPUT
+    assert "none.toml is missing" in " ".join(capsys.readouterr().err.split())
