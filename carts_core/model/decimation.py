@@ -54,10 +54,10 @@ def decimated(
     given = io.BytesIO()
     seconds = _SECONDS + _SECONDS_PER_FACE * len(faces)
     np.savez(given, vertices=vertices, faces=faces, tolerance=tolerance, seconds=seconds)
+    patience = seconds * _PATIENCE
     # The file alone: importing the package would take longer than most meshes.
     command = [sys.executable, "-P", __file__]
     try:
-        patience = seconds * _PATIENCE
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=patience, check=True)
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as result:
             return result["vertices"], result["faces"], float(result["deviation"])
