@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..files import MARKER, OutputPath, published, write_text
+from ..files import MARKER, OutputPath, published, published_file, write_text
 from ..settings import FormatName
 from .coco import write_coco
 from .cvat import write_cvat
@@ -74,12 +74,15 @@ def export(
         CartsError: the output exists, cannot be written, or what it needs is missing.
     """
     chosen = FORMATS[name]
-    if chosen.suffix and Path(output).suffix.lower() != chosen.suffix:
-        output = output.parent / (output.name + chosen.suffix)
+    if chosen.suffix:
+        if Path(output).suffix.lower() != chosen.suffix:
+            output = output.parent / (output.name + chosen.suffix)
+        with published_file(output, overwrite=overwrite) as path:
+            chosen.write(dataset, path, monitor or Monitor())
+        return Path(output)
     with published(output, overwrite=overwrite) as path:
         chosen.write(dataset, path, monitor or Monitor())
-        if not chosen.suffix:
-            write_text(path / MARKER, _summary(dataset, name))
+        write_text(path / MARKER, _summary(dataset, name))
     return Path(output)
 
 

@@ -20,6 +20,7 @@ from .paths import output_path as output_path
 from .paths import unique_file_names as unique_file_names
 from .publish import MARKER as MARKER
 from .publish import published as published
+from .publish import published_file as published_file
 from .writing import append_line as append_line
 from .writing import holds_file as holds_file
 from .writing import output_stream as output_stream

@@ -56,6 +56,23 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
             staging.close()
 
 
+@contextmanager
+def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
+    """Where to write a single file by `write_bytes` or `output_stream`, which have it there whole or not at all.
+
+    Args:
+        target: the file; no link itself.
+        overwrite: replace a file that is there.
+
+    Raises:
+        OutputError: the target exists and may not be replaced, or the disk refuses.
+    """
+    output = as_output(target)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        _check_free(folder, output, overwrite)
+        yield output
+
+
 def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
     """The folder to write in: a new one, or what is left of the same work. What is left of other work is removed."""
     taken = make_staging(folder, output.name, key)
