@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from ...errors import SettingsError
 from ...files import holds_file, output_path
+from ...files.reading import IMAGE, SEQUENCE, read_bytes
 from ...model.mesh_cache import cache_dir
 from ...model.scene import Scene
 from ...recording import Frame, MeanBackground, Sequence
@@ -148,7 +149,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
     code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
-    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code)).encode())
+    fingerprint = hashlib.sha256(repr((read_bytes(path, SEQUENCE), seed, code)).encode())
     consecutive = masked[: scope.consecutive]
     calibrating = spread(len(sequence), scope.calibration_frames)
     for index in sorted({*frames, *consecutive, *calibrating}):
@@ -188,9 +189,9 @@ def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST
     """
     sequence = Sequence.open(path)
     rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
-    fingerprint = hashlib.sha256(repr((path.read_bytes(), seed, code_fingerprint(_ROOMS_CODE))).encode())
+    fingerprint = hashlib.sha256(repr((read_bytes(path, SEQUENCE), seed, code_fingerprint(_ROOMS_CODE))).encode())
     for photograph in sorted(folder.glob("*")) if folder else []:
-        fingerprint.update(photograph.name.encode() + photograph.read_bytes())
+        fingerprint.update(photograph.name.encode() + read_bytes(photograph, IMAGE))
     sources = []
     for camera in (known.name for known in sequence.scene.cameras):
         masked = [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]

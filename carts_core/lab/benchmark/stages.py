@@ -5,6 +5,7 @@ import json
 import torch
 
 from ...files import OutputPath, write_text
+from ...files.reading import VALUES, parse_json, read_bytes
 from ...model.scene import Scene
 from ...networks.extractor import FeatureExtractor
 from ...optimization.inputs import working_size
@@ -22,7 +23,7 @@ _RUNS = 10
 def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
     """Figures that this machine and this code have written to `path`; none if there are no such."""
     try:
-        stored = json.loads(path.path.read_bytes())
+        stored = parse_json(read_bytes(path.path, VALUES))
         return stored["ms"] if stored["of"] == _of(extractor) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -4,6 +4,7 @@ import json
 
 from ...errors import CartsError
 from ...files import OutputPath, append_line
+from ...files.reading import TABLE, read_bytes
 from .measurement import Measurement
 from .scope import Run
 
@@ -24,9 +25,11 @@ class ResultsFile:
         self.unreadable = 0
         """Lines that are not measurements: torn, or of another version."""
         try:
-            lines = path.path.read_bytes().splitlines() if path.path.exists() else []
+            lines = read_bytes(path.path, TABLE).splitlines() if path.path.exists() else []
         except OSError as error:
-            raise CartsError(f"{path} cannot be read ({error.strerror}). Name another output folder.") from error
+            raise CartsError(
+                f"{path} cannot be read ({error.strerror or error}). Name another output folder."
+            ) from error
         for line in lines:
             try:
                 entry = json.loads(line)
