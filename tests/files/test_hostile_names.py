@@ -26,7 +26,6 @@ COMMANDS: dict[str, list[str]] = {
     "export csv": ["export", "out/table.csv", "--format", "csv"],
     "evaluate": ["evaluate", "--frames", "0", "--solver", "none", "--json", "out/scores.json"],
     "calibrate": ["calibrate", "--frames", "0", "--settings", "iterations=1"],
-    "import": ["import", "--output", "out/imported", "--overwrite"],
 }
 OUTPUTS = ("runs", "out")
 """Where commands write: the default, and what the command lines above name."""
