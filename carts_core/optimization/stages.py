@@ -129,15 +129,17 @@ def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
 def _(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
     problem = _one_frame(fit)
     before = problem.evidence_at(fit.offsets)
-    if before.overlap_with_change is None or assess(before).verdict is Verdict.GOOD:
+    known = assess(before)
+    if before.overlap_with_change is None or known.verdict is not Verdict.FAILED or known.nothing_there:
         return
     kept, observation = fit.found(), problem.observation
     problem.treat_background_otherwise()
     fit.begin_again(problem.start)
     yield from run_stages(stage.then, fit)
-    after = problem.evidence_at(fit.offsets).overlap_with_change
-    assert after is not None
-    if after <= before.overlap_with_change:
+    after = problem.evidence_at(fit.offsets)
+    assert after.overlap_with_change is not None
+    better = after.overlap_with_change > before.overlap_with_change and assess(after).verdict is not Verdict.FAILED
+    if not better:
         problem.treat_background_otherwise()
         problem.observation = observation
         fit.recall(kept)

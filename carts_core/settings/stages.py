@@ -154,9 +154,9 @@ class PreferStart:
 
 @dataclass(frozen=True)
 class OtherBackground:
-    """Where the verdict is not good and the empty background is known: run again with that background treated the other
-    way (replaced in the image, or taken off what the network predicts). Kept is the run whose arms overlap more with
-    what differs from the background, which false detections cannot help."""
+    """Where the fit has failed and the empty background is known: run again with that background treated the other way
+    (replaced in the image, or taken off what the network predicts). Kept is the second run if it has not failed, and
+    its arms overlap more with what differs from the background, which false detections cannot help."""
 
     then: tuple["Stage", ...]
     """What runs from the start again."""

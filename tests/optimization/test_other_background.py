@@ -1,4 +1,4 @@
-"""A frame whose verdict is not good is run again with its empty background treated the other way."""
+"""A frame that failed is run again with its empty background treated the other way."""
 
 from collections.abc import Callable
 from dataclasses import replace
