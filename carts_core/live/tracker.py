@@ -176,7 +176,7 @@ class LiveTracker:
         self._searched = now
         errors = self._error_model(variables)
         prior = errors.correction(errors.initial())
-        return Effort.SEARCH, full.cold(frame, variables, prior)
+        return Effort.SEARCH, small.cold(frame, variables, prior)
 
     def _bad(self, measurement: Measurement) -> bool:
         usual = statistics.median(self._losses) if self._losses else math.inf

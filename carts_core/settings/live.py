@@ -16,7 +16,7 @@ class LiveSettings:
     full: tuple[Stage, ...] = presets.WARM
     """Stages where the small ones end in a bad fit."""
     search: tuple[Stage, ...] = presets.reduced(presets.COLD, 1.0)
-    """Stages where the arms are lost; `full` follows."""
+    """Stages where the arms are lost; `small` follows."""
     bad_loss: float = 0.06
     """Loss from which a fit is bad [1]."""
     bad_factor: float = 2.5
