@@ -16,6 +16,7 @@ from .selection import output_folder
 if TYPE_CHECKING:
     from ..batch.manifest import Job
     from ..files import OutputPath
+    from ..settings.inference import Engine
 
 _NAMED = 5
 """Failed jobs that are named in the end."""
@@ -85,7 +86,7 @@ class Batch:
         from ..extras import needs_extra
         from .batch_job import BatchWork
 
-        workers, work = self.workers or os.cpu_count() or 1, BatchWork(folder, self.again)
+        workers, work = self.workers or os.cpu_count() or 1, BatchWork(folder, self.again, _inference(folder))
         if self.scheduler is None:
             engine = Pool(work, min(workers, len(jobs)), self.threads)
         else:
@@ -106,6 +107,17 @@ class Batch:
         words = {"done": "done", "known": "already there", "busy": "left to another process", "failed": "failed"}
         console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
         return failed
+
+
+def _inference(folder: "OutputPath") -> "Engine":
+    """Who runs the surface network in all jobs: what was measured where the batch was begun."""
+    from ..files import write_new
+    from ..files.reading import SETTINGS, read_text
+    from ..networks.extractor import FeatureExtractor
+
+    path = folder / "inference.txt"
+    write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
+    return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"
 
 
 def _last_line(text: str) -> str:

@@ -20,6 +20,7 @@ from ..errors import CartsError, SettingsError
 from ..files import OutputPath, write_text
 from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
+from ..settings.inference import Inference
 from .calibrate import Calibrate
 from .evaluate import Evaluate
 from .export import Export
@@ -46,10 +47,12 @@ class BatchWork:
     Args:
         folder: of the batch.
         again: whether steps that are done are taken again, whatever they were made from.
+        inference: who runs the surface network where a step's options do not say; the same on all machines.
     """
 
     folder: OutputPath
     again: bool = False
+    inference: Inference = "auto"
 
     def __call__(self, job: Job) -> Outcome:
         """Do a job; what is done of it is not done again."""
@@ -59,7 +62,7 @@ class BatchWork:
             if state is None:
                 return Outcome(job.name, "busy")
             try:
-                done = _steps(job, folder, state, self.again)
+                done = _steps(job, folder, state, self)
             except KeyboardInterrupt:
                 state.change(status="stopped")
                 raise
@@ -108,17 +111,17 @@ def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
     return Outcome(job.name, "failed", error, time.perf_counter() - began)
 
 
-def _steps(job: Job, folder: OutputPath, state: RunningJob, again: bool) -> int:
+def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> int:
     """Take the steps that are not done; how many these were."""
     tune_process(keep_memory=True)
     log_to_stderr()
     done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
     sequence = job.recording
     for step in job.steps:
-        options = job.options.get(step, ())
+        options = (*job.options.get(step, ()), *_inference(step, job, work.inference))
         key = fingerprint(key, step, job.camera, job.domain, options, [_inputs(Path(text)) for text in options])
         known = state.state.steps.get(step)
-        if again or known is None or known.key != key:
+        if work.again or known is None or known.key != key:
             began = time.perf_counter()
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
@@ -129,6 +132,14 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, again: bool) -> int:
     if done:
         write_findings(job, folder, sequence)
     return done
+
+
+def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
+    """The option that has every machine run the network alike, for steps that run it on a CPU."""
+    given = {option.partition("=")[0] for option in job.options.get(step, ())}
+    if step in ("import", "export") or given & {"--inference", "--device"}:
+        return ()
+    return ("--inference", inference)
 
 
 _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}

@@ -21,6 +21,8 @@ from carts_core.cli import main
 from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError
 from carts_core.files import output_path
+from carts_core.networks import FeatureExtractor
+from carts_core.settings.inference import Inference
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 
@@ -68,6 +70,7 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
     command = ["batch", str(manifest(sequence)), "--output", str(batch), "--workers", "1"]
     main(command)
     assert "2 done" in capsys.readouterr().out
+    assert (batch / "inference.txt").read_text() in ("torch", "onnx")
     for domain in ("regular", "dark"):
         plain = tmp_path / "plain" / domain
         chosen = ["--domain", domain, "--frames", "0"]
@@ -131,6 +134,18 @@ def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: 
     assert statuses() == ["done", "done"]
     (batch / "jobs" / read_manifest(path)[0].name / FILE).path.write_text("{")
     assert statuses() == ["done", "known"]
+
+
+@pytest.mark.parametrize("engine", ["torch", "onnx"])
+def test_every_step_that_runs_the_network_is_told_with_what(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Inference
+) -> None:
+    told = []
+    monkeypatch.setattr(FeatureExtractor, "load", lambda *files, **options: told.append(options) or pytest.skip("told"))
+    (job, *_) = read_manifest(manifest(sequence, steps='"optimize"'))
+    with pytest.raises(pytest.skip.Exception):
+        BatchWork(output_path(tmp_path / "b"), inference=engine)(job)
+    assert [options["inference"] for options in told] == [engine]
 
 
 def test_a_wrong_manifest_is_reported_and_nothing_is_made(
