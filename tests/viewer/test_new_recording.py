@@ -158,6 +158,7 @@ def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks(
     shared_dir: Path, tmp_path: Path, visit: Callable[[Path], Visitor]
 ) -> None:
