@@ -100,7 +100,9 @@ class _Chart:
         full = uplot.Series_Points(show=True, size=9, fill=color, stroke=color)
         return (
             uplot.Series(label="Iteration"),
-            uplot.Series(label=f"{self._name} [{self._unit}]", stroke=color, width=2),
+            uplot.Series(
+                label=f"{self._name} [{self._unit}]", stroke=color, width=2, points=uplot.Series_Points(show=False)
+            ),
             uplot.Series(label="○", stroke=color, width=0, auto=False, points=hollow),
             uplot.Series(label="●", stroke=color, width=0, auto=False, points=full),
         )

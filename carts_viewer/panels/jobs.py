@@ -36,7 +36,7 @@ class JobsPanel:
             self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
             self._again = gui.add_button("Start again", icon=viser.Icon.REFRESH, color="gray")
             self._forget = gui.add_button("Clear ended", color="gray")
-            page.row(self._cancel, self._again, self._forget)
+            page.row(self._cancel, self._again)
             self._log = gui.add_html("")
         on_click(optimize, lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")), emit)  # type: ignore[arg-type]
         on_click(calibrate, lambda _: intents.Calibrate(int(self._count.value)), emit)

@@ -155,6 +155,11 @@ def test_a_phone_shows_what_reading_and_reviewing_needs(
     for button in tab.page.locator(".carts-review-bar button").all():
         box = button.bounding_box()
         assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 391 and box["height"] >= 44
+    # The other controls are behind a button, and hide nothing before.
+    assert tab.page.get_by_role("button", name="Undo", exact=True).is_hidden()
+    tab.page.get_by_role("button", name="All controls").click()
+    expect(tab.page.get_by_role("button", name="Undo", exact=True)).to_be_visible()
+    tab.page.get_by_role("button", name="All controls").click()
     accept.click()
     eventually(lambda: app.state.project.review(0).state, lambda state: state == "accepted")
     expect(tab.page.locator(".carts-review-line")).to_contain_text("Frame 002")
