@@ -22,9 +22,11 @@ class JobsPanel:
         self._numbers: dict[str, int] = {}
         self._shown: tuple[Job, ...] | None = None
         with gui.add_folder("New job"):
-            self._frames = gui.add_dropdown("Frames", list(_FRAMES))
+            self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
             optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
-            self._count = gui.add_number("Frames", 20, min=1, max=500, step=1, hint="Spread evenly over the sequence")
+            self._count = gui.add_number(
+                "Calibrate on", 20, min=1, max=500, step=1, hint="Spread evenly over the sequence"
+            )
             calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
             gui.add_html(
                 '<p class="carts-caption">Solving (Review) and exports queue up here, too. A calibration fits base '
