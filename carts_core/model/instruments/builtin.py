@@ -5,10 +5,10 @@ Needle Driver, are those of the shipped robot.
 """
 
 import difflib
-import tempfile
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 import trimesh
@@ -75,7 +75,13 @@ def builtin_urdf(name: str) -> Path:
         return _written(name, folder)
     except OutputError:
         # A cache that cannot be written to is no error.
-        return _written(name, Path(tempfile.mkdtemp(prefix="carts-")) / name)
+        return _written(name, Path(_scratch().name) / name)
+
+
+@cache
+def _scratch() -> TemporaryDirectory:
+    """Where files lie until the program ends."""
+    return TemporaryDirectory(prefix="carts-")
 
 
 def instrument_of(name: str) -> tuple[Instrument, PsmGeometry]:

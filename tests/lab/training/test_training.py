@@ -113,7 +113,7 @@ def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(
     config = small_config(steps=100_000, minutes=0.1, validation_every=1_000)
     result = train(config, tmp_path, events.append)
     assert 5 <= result.seconds < 30
-    assert 10 < events[-1].step == events[-1].steps < 100_000
+    assert 1 < events[-1].step == events[-1].steps < 100_000
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None and checkpoint.step == events[-1].step
     assert checkpoint.history.losses[-1]["step"] == checkpoint.step
