@@ -11,7 +11,7 @@ from carts_core.cli import calibrate
 from carts_core.cli.command_line import main
 from carts_core.lab.benchmark import Measurement, Run, Score, runner, stages
 from carts_core.lab.synthesis import synthesize
-from carts_core.lab.synthesis.synthesize import _Painter
+from carts_core.lab.synthesis.synthesize import _Tracing
 from carts_core.lab.training.training import train
 from carts_core.settings import Architecture, ImageSettings, SynthesisConfig, TrainingConfig
 
@@ -74,7 +74,7 @@ def _train(work: Path) -> None:
 
 
 def _synthesize(work: Path) -> None:
-    with mock.patch.object(_Painter, "_view", _once(_Painter._view, lambda _, frame, camera: (frame, camera))):
+    with mock.patch.object(_Tracing, "_view", _once(_Tracing._view, lambda _, frame, camera: (frame, camera))):
         synthesize(SYNTHESIS, work / "out")
 
 
