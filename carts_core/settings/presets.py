@@ -21,7 +21,7 @@ from .stages import (
 _FAR = Observe(margin=27, attention=27, haze=False)
 """An observation that has to find arms which are several degrees off."""
 
-_COARSE = Descend(blur=8.0, tolerance=0.06)
+_COARSE = Descend(blur=8.0, robust=2.0, tolerance=0.06)
 _MEDIUM = Descend(blur=3.0, tolerance=0.06)
 _FINE = Descend(blur=1.6, tolerance=0.06)
 

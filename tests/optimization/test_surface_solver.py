@@ -166,9 +166,10 @@ def test_first_steps_are_longer_where_the_coarsest_stage_has_a_wide_robust_scale
     mask = renderer.segment(sequence.scene.state({"PSM1": truth}))[0] >= 0
     overlaps = []
     for robust in (0.5, 2.0):
-        first, coarse, *rest = presets.FRAME
-        assert isinstance(coarse, Descend)
-        settings = SurfaceSolver(stages=(first, replace(coarse, robust=robust), *rest))
+        stages = list(presets.FRAME)
+        place, coarse = next((i, stage) for i, stage in enumerate(stages) if isinstance(stage, Descend))
+        stages[place] = replace(coarse, robust=robust)
+        settings = SurfaceSolver(stages=tuple(stages))
         optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=start, settings=settings)
         second = [optimizer.step() for _ in range(3)][-1]
         assert second is not None

@@ -114,6 +114,7 @@ class Lives:
                 viewer_victim.check_whole(path, FRAMES)
                 self.tally.whole_exports += 1
         project_files = {self._project_path.name + end for end in ("", "-wal", "-shm")}
+        project_files.add(f"{self._project_path.stem}_jobs.json")
         new = {path.name for path in self._sequence_path.parent.iterdir()} - self._beside
         assert new <= project_files, new
 
