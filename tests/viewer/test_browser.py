@@ -21,12 +21,7 @@ from carts_viewer.state import Phase
 pytestmark = pytest.mark.browser
 
 
-_CUT_OFF = pytest.mark.xfail(
-    reason="in a wide, low window the uppermost 11 px of the picture are not drawn", strict=True
-)
-
-
-@pytest.mark.parametrize("window", [(1280, 800), (1000, 950), pytest.param((1700, 620), marks=_CUT_OFF)])
+@pytest.mark.parametrize("window", [(1280, 800), (1000, 950), (1700, 620)])
 def test_the_overlay_lies_on_the_frame_at_any_window_shape(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
 ) -> None:
