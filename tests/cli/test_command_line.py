@@ -208,15 +208,15 @@ def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: p
     main(command)
     main(["evaluate", sequence, "--frames", "0", "--settings", "iterations=1"])
     main(["export", sequence, str(tmp_path / "export"), "--frames", "0", "--format", "masks"])
-    told = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
     for words in (
         "1 of 1 frame already there",
         "kinematics.csv of 1 frame to",
         "tiny: 1 frame, means",
         "masks, 1 frame ",
     ):
-        assert words in told
-    assert "1 frames" not in told
+        assert words in printed
+    assert "1 frames" not in printed
 
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -99,7 +99,7 @@ def mesh_changed(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "printed"),
     [
         (image_changed, "1 of 3 frames redone: the images changed"),
         (intrinsics_changed, "3 of 3 frames redone: the calibration changed"),
@@ -112,12 +112,12 @@ def mesh_changed(folder: Path) -> None:
     ],
 )
 def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(
-    change: Callable[[Path], None], told: str, optimize: Outcome, tmp_path: Path
+    change: Callable[[Path], None], printed: str, optimize: Outcome, tmp_path: Path
 ) -> None:
     optimize()
     assert "3 of 3 frames already there" in optimize()
     change(tmp_path)
-    assert told in optimize()
+    assert printed in optimize()
     assert "3 of 3 frames already there" in optimize()
 
 
@@ -154,13 +154,13 @@ def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
     optimize()
     folder = tmp_path / "out" / "regular" / "left"
     before = (folder / "masks" / "003.png").read_bytes()
-    told = optimize("--perturb-deg", "2", "--frames", "0-1")
-    assert "2 of 2 frames redone: the settings changed" in told
-    assert "1 frame not chosen now would have to be redone: the settings changed" in told
+    printed = optimize("--perturb-deg", "2", "--frames", "0-1")
+    assert "2 of 2 frames redone: the settings changed" in printed
+    assert "1 frame not chosen now would have to be redone: the settings changed" in printed
     assert (folder / "masks" / "003.png").read_bytes() == before
     assert json.loads((folder / "settings.json").read_text())["perturb_deg"] == 2
-    told = optimize("--perturb-deg", "2")
-    assert "2 of 3 frames already there" in told and "1 of 3 frames redone: the settings changed" in told
+    printed = optimize("--perturb-deg", "2")
+    assert "2 of 3 frames already there" in printed and "1 of 3 frames redone: the settings changed" in printed
 
 
 def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path) -> None:
@@ -190,9 +190,9 @@ def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     main(command)
     assert "3 of 3 frames redone: the images changed" in re.sub(r"\s+", " ", capsys.readouterr().out)
     main([*command, "--frames", "0-1"])
-    told = re.sub(r"\s+", " ", capsys.readouterr().out)
-    assert "2 of 2 frames redone: " in told and "they were solved together with other frames" in told
-    assert "1 frame not chosen now would have to be redone: they were solved together with other frames" in told
+    printed = re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert "2 of 2 frames redone: " in printed and "they were solved together with other frames" in printed
+    assert "1 frame not chosen now would have to be redone: they were solved together with other frames" in printed
 
 
 def emptied(path: Path) -> None:
@@ -213,9 +213,9 @@ def test_a_damaged_mask_is_made_again(damage: Callable[[Path], None], optimize: 
     mask = tmp_path / "out" / "regular" / "left" / "masks" / "002.png"
     before = mask.read_bytes()
     damage(mask)
-    told = optimize()
-    assert "2 of 3 frames already there" in told
-    assert "1 of 3 frames redone: their masks are missing or damaged" in told
+    printed = optimize()
+    assert "2 of 3 frames already there" in printed
+    assert "1 of 3 frames redone: their masks are missing or damaged" in printed
     assert mask.read_bytes() == before
 
 
@@ -233,8 +233,8 @@ def test_a_row_that_was_altered_and_results_of_unknown_origin_are_redone(optimiz
 
 def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcome, tmp_path: Path) -> None:
     optimize()
-    told = optimize("--overwrite", "--frames", "0")
-    assert "--overwrite starts over: results of 2 other frames are removed" in told
+    printed = optimize("--overwrite", "--frames", "0")
+    assert "--overwrite starts over: results of 2 other frames are removed" in printed
     folder = tmp_path / "out" / "regular" / "left"
     assert [path.name for path in (folder / "masks").iterdir()] == ["001.png"]
     assert list(json.loads((folder / "results.json").read_text())["frames"]) == ["001"]
@@ -244,9 +244,9 @@ def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcom
 def test_frames_that_are_out_of_date_and_not_chosen_are_told(optimize: Outcome, tmp_path: Path) -> None:
     optimize()
     intrinsics_changed(tmp_path)
-    told = optimize("--frames", "0")
-    assert "1 of 1 frame redone: the calibration changed" in told
-    assert "2 frames not chosen now would have to be redone: the calibration changed" in told
+    printed = optimize("--frames", "0")
+    assert "1 of 1 frame redone: the calibration changed" in printed
+    assert "2 frames not chosen now would have to be redone: the calibration changed" in printed
 
 
 def test_a_second_run_into_the_same_folder_is_refused(

@@ -92,14 +92,14 @@ def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_bee
     folder = tmp_path / "stopped" / "regular" / "left"
     sign = folder / ("results.json" if mode == "frame" else "checkpoint.txt")
     stopped = [*command, str(tmp_path / "stopped")]
-    status, told = run(stopped, number=number, sign=sign)
-    assert status == 128 + number, told
-    assert f"stopped by {number.name}; " in told and "the same command goes on from there" in told
-    said = re.search(r"(\d+) (?:frame|of \d+ frames)", told)
+    status, printed = run(stopped, number=number, sign=sign)
+    assert status == 128 + number, printed
+    assert f"stopped by {number.name}; " in printed and "the same command goes on from there" in printed
+    said = re.search(r"(\d+) (?:frame|of \d+ frames)", printed)
     assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
     assert run(stopped, number=signal.SIGKILL, sign=sign)[0] == -signal.SIGKILL
-    status, told = run(stopped)
-    assert status == 0 and ("already there" in told if mode == "frame" else "went on from where" in told), told
+    status, printed = run(stopped)
+    assert status == 0 and ("already there" in printed if mode == "frame" else "went on from where" in printed), printed
     assert contents(tmp_path / "stopped") == contents(tmp_path / "whole")
 
 
@@ -130,9 +130,9 @@ def campaigns(sequence: Path, folder: Path) -> dict[str, Campaign]:
 def stop_often(run: Run, campaign: Campaign, times: int, randoms: random.Random) -> None:
     """Stop and start again until it was stopped that often; whenever it comes to its end, compare and start over."""
     began = time.monotonic()
-    status, told = run(campaign.arguments)
+    status, printed = run(campaign.arguments)
     length = time.monotonic() - began
-    assert status == 0, told
+    assert status == 0, printed
     campaign.whole = contents(campaign.output)
     acknowledged, overwrite = 0, ["--overwrite"] if campaign.name in ("calibrate", "export") else []
     for path in sorted(campaign.output.rglob("*"), reverse=True):
@@ -141,7 +141,7 @@ def stop_often(run: Run, campaign: Campaign, times: int, randoms: random.Random)
     while campaign.stops < times:
         number = randoms.choice([*POLITE, signal.SIGKILL])
         began = time.monotonic()
-        status, told = run([*campaign.arguments, *overwrite], randoms.uniform(0.0, length), number)
+        status, printed = run([*campaign.arguments, *overwrite], randoms.uniform(0.0, length), number)
         if status == 0:
             if fresh:
                 length = min(length, time.monotonic() - began)
@@ -155,17 +155,17 @@ def stop_often(run: Run, campaign: Campaign, times: int, randoms: random.Random)
             continue
         campaign.stops, fresh = campaign.stops + 1, bool(overwrite)
         # Before `main` has set up its handlers a signal ends the process as it would any other.
-        assert status in ((-number,) if number == signal.SIGKILL else (128 + number, -number)), told
+        assert status in ((-number,) if number == signal.SIGKILL else (128 + number, -number)), printed
         if overwrite:
             assert contents(campaign.output) in ({}, campaign.whole), "neither nothing nor the whole"
             continue
         kept = check_results(campaign.output / "regular" / "left")
         assert kept >= acknowledged, "a frame that was there is gone"
         acknowledged = kept
-        if said := re.search(r"left holds (\d+) frame", told):
-            assert int(said[1]) == kept, told
-    status, told = run([*campaign.arguments, *overwrite])
-    assert status == 0 and contents(campaign.output) == campaign.whole, told
+        if said := re.search(r"left holds (\d+) frame", printed):
+            assert int(said[1]) == kept, printed
+    status, printed = run([*campaign.arguments, *overwrite])
+    assert status == 0 and contents(campaign.output) == campaign.whole, printed
     campaign.ends += 1
 
 
@@ -187,14 +187,14 @@ def test_training_stopped_at_28_random_moments_loses_no_step_that_it_said_it_has
     step, said = 0, 0
     for _ in range(STOPS):
         number = randoms.choice([*POLITE, signal.SIGKILL])
-        status, told = run(["train", str(output), *SMALL_RUN], randoms.uniform(0.0, 12.0), number)
-        assert status in (0, 128 + number, -number), told
+        status, printed = run(["train", str(output), *SMALL_RUN], randoms.uniform(0.0, 12.0), number)
+        assert status in (0, 128 + number, -number), printed
         checkpoint = load_checkpoint(output)
         now = checkpoint.step if checkpoint else 0
         assert now >= step
-        if found := re.search(r"holds (\d+) step", told):
+        if found := re.search(r"holds (\d+) step", printed):
             said += 1
-            assert now == int(found[1]), told
+            assert now == int(found[1]), printed
         step = now
     print(f"train: {STOPS} stops, {said} times it said what it holds, {step} steps at last")
     for weights in output.glob("*.safetensors"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evidence import CONVINCING
 
 from carts_core.cli.hints import verdict_hints
 from carts_core.evaluation import evaluate
@@ -14,17 +15,6 @@ from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, Su
 from carts_core.optimization.verdict import assess
 from carts_core.recording import Sequence
 
-CONVINCING = Evidence(
-    area=0.05,
-    start_area=0.05,
-    loss=0.01,
-    residual=0.05,
-    agreement=0.95,
-    unconditioned=0.93,
-    predicted=0.95,
-    changed=0.97,
-    overlap_with_change=0.85,
-)
 CONTRADICTED = replace(
     CONVINCING,
     loss=0.2,

@@ -3,23 +3,14 @@
 from dataclasses import replace
 
 import pytest
+from evidence import CONVINCING
 
 from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_counts
-from carts_core.optimization import Assessment, Evidence, StopReason, Verdict
+from carts_core.optimization import Assessment, StopReason, Verdict
 from carts_core.optimization.verdict import assess
 from carts_core.optimization.verdict_of_many import assess_calibration, assess_sequence, mean_evidence, worse_in
 
-RIGHT = Evidence(
-    area=0.05,
-    start_area=0.05,
-    loss=0.01,
-    residual=0.05,
-    agreement=0.95,
-    unconditioned=0.93,
-    predicted=0.95,
-    changed=None,
-    overlap_with_change=None,
-)
+RIGHT = replace(CONVINCING, changed=None, overlap_with_change=None)
 WRONG = replace(RIGHT, loss=0.2, residual=0.8, agreement=0.4, unconditioned=0.1, predicted=0.1)
 
 
