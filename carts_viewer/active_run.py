@@ -105,5 +105,6 @@ class ActiveRun:
         if free.intrinsics:
             intrinsics[self._rows] = state.intrinsics
         bases = state.T_world_base if free.base_frames else start.T_world_base
-        scene = replace(state, T_world_base=bases, T_camera_world=extrinsics, intrinsics=intrinsics)
+        moved = {"T_camera_world": extrinsics, "T_mount_world": start.T_mount_world}
+        scene = replace(state, T_world_base=bases, intrinsics=intrinsics, **moved)
         return Pose(scene, Source.OPTIMIZER)

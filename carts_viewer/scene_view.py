@@ -138,7 +138,7 @@ class SceneView:
     def show_pose(self, state: SceneState, camera: str) -> None:
         """Move arms and cameras to where they are, seen from this camera."""
         extrinsics = {
-            own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_camera_world, strict=True)
+            own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
         }
         _place(self._world, extrinsics[camera])
         for name, outline in self._outlines.items():
@@ -251,7 +251,7 @@ def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
     row = [own.name for own in scene.cameras].index(camera)
     depths = []
     for arm, T_world_base, joints in zip(scene.arms, state.T_world_base, state.joint_positions, strict=True):
-        Ts = state.T_camera_world[row] @ T_world_base @ arm.robot.forward_kinematics(joints)
+        Ts = state.T_view_world[row] @ T_world_base @ arm.robot.forward_kinematics(joints)
         depths += [float(z) for z in Ts[..., 2, 3] if z > 0.0]
     return min(depths, default=0.1)
 

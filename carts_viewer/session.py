@@ -112,7 +112,7 @@ class Session:
         corrections = project.joints(frame.index)
         measured = {name: frame.measured[name] for name in project.identity.arms}
         joints = {**measured, **{name: c.joint_positions for name, c in corrections.items()}}
-        state = _calibrated(self.scene, self.scene.state(joints), project)
+        state = _calibrated(self.scene, self.scene.state(joints, mounts=frame.mounts), project)
         sources = {correction.provenance.source for correction in corrections.values()}
         return Pose(state, next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED))
 
@@ -123,7 +123,7 @@ class Session:
 
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
-        return _calibrated(self.scene, self.scene.state(frame.measured), self.editor.view)
+        return _calibrated(self.scene, self.scene.state(frame.measured, mounts=frame.mounts), self.editor.view)
 
     def edits(
         self,
@@ -143,7 +143,7 @@ class Session:
             joint_std: arm -> standard deviations [rad, m], NaN where not known.
         """
         saved = self.editor.project.state
-        before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured)
+        before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, mounts=frame.mounts)
         edits: dict[Key[Any], Any] = {}
         for row, arm in enumerate(self.scene.arms):
             key, values = Key.joints(frame.index, arm.name), state.joint_positions[row]

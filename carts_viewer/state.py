@@ -43,7 +43,7 @@ class Pose:
 
 
 def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
-    return (*scene.joint_positions, scene.T_world_base, scene.T_camera_world, scene.intrinsics)
+    return (*scene.joint_positions, scene.T_world_base, scene.T_camera_world, scene.intrinsics, scene.T_mount_world)
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,10 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
     scene, found = sequence.scene, Findings(str(job.recording))
     for arm in scene.arms:
         for camera in scene.cameras:
-            T_camera_base = camera.T_camera_world @ arm.T_world_base
-            found.base_frames[f"{arm.name} in {camera.name}"] = np.asarray(T_camera_base).tolist()
+            T_mount_world = sequence.mounts(0).get(camera.name)
+            moved = np.eye(4) if T_mount_world is None else T_mount_world
+            seen_in = camera.name if T_mount_world is None else f"the first frame of {camera.name}"
+            found.base_frames[f"{arm.name} in {seen_in}"] = (camera.T_camera_world @ moved @ arm.T_world_base).tolist()
     steps = [step for step in ("sequence", "optimize") if step in job.steps]
     parts = sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
     for table in parts:

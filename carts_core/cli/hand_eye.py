@@ -1,7 +1,7 @@
 """`carts hand-eye`: base frames from points that a person has found in a few images."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,14 +40,23 @@ class HandEye:
     def run(self) -> None:
         """Solve and write; nothing is written after an error."""
         from ..files import MARKER, published, write_text
-        from ..optimization.hand_eye import HandEyeSettings, read_points, result_json, solve_hand_eye
+        from ..optimization.hand_eye import (
+            HandEyeSettings,
+            mounts_of_points,
+            moved_cameras,
+            read_points,
+            result_json,
+            solve_hand_eye,
+        )
         from ..recording import Sequence, calibrated_sequence_file
 
         console = Terminal()
         settings = HandEyeSettings(self.pixel_error, self.focal_length, self.free_cameras)
         sequence = Sequence.open(self.sequence, progress=console.print)
         points = read_points(self.points, sequence)
-        result = solve_hand_eye(sequence.scene, sequence.measured, points, settings)
+        mounts = mounts_of_points(sequence, points)
+        result = solve_hand_eye(moved_cameras(sequence.scene, mounts), sequence.measured, points, settings)
+        result = replace(result, scene=moved_cameras(result.scene, mounts, back=True))
         output = output_folder(self.output, sequence.name, "hand_eye")
         with published(output, overwrite=self.overwrite) as folder:
             text = calibrated_sequence_file(sequence.path, output.path, sequence.scene, result.scene, "hand-eye")

@@ -86,6 +86,7 @@ class Origins:
         frame = self._load(index)
         arms = self._sequence.measured
         joints = [(name, frame.measured[name], arms[name][index]) for name in sorted(frame.measured)]
+        joints += sorted(frame.mounts.items())
         images = [(name, frame.images[name]) for name in sorted(frame.images)]
         origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
         return origin | ({"masks": fingerprint(sorted((frame.masks or {}).items()))} if self._masked else {})

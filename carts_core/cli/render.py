@@ -45,7 +45,7 @@ class Render:
                     for index in track(frames, f"{domain}, {camera}", console=console):
                         frame = sequence.frame(index, domain, [camera])
                         start = start_positions(sequence, frame, self.start.perturb_deg, self.start.seed)
-                        state = sequence.scene.state(start)
+                        state = sequence.scene.state(start, mounts=frame.mounts)
                         if self.style == "mask":
                             png = mask_png(renderer.segment(state)[0] >= 0)
                         else:

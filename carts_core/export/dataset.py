@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, unique_file_names, write_bytes
 from ..model.camera import Camera
-from ..model.scene import Scene
+from ..model.scene import Scene, SceneState
 from ..recording import Sequence
 from ..rendering import Renderer
 from ..settings import Parts
@@ -105,6 +105,10 @@ class Dataset:
             for camera in self.scene.cameras
         }
 
+    def state(self, frame: ExportFrame) -> SceneState:
+        """The scene at a frame's joint positions, seen from where its cameras are."""
+        return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
+
     def views(self, monitor: Monitor) -> Iterator[View]:
         """Every frame through every camera, labelled; a step of `monitor` each.
 
@@ -112,7 +116,7 @@ class Dataset:
             CartsError: a mask is of another size than its camera, or of pixels that no arm is near.
         """
         for number, (name, frame, camera) in enumerate(monitor.track(self.steps), start=1):
-            link_ids = self.renderers[camera.name].segment_links(self.scene.state(frame.joint_positions))[0]
+            link_ids = self.renderers[camera.name].segment_links(self.state(frame))[0]
             if camera.name in frame.masks:
                 link_ids = labelled(frame.masks[camera.name], link_ids, f"frame {frame.frame_id}, camera {camera.name}")
             yield View(number, frame, camera, name, link_ids)

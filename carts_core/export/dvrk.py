@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import CartsError
 from ..files import OutputPath, write_text
 from ..model.camera import Camera
 from ..model.scene import Arm
@@ -49,6 +50,11 @@ def _write(
     dataset: Dataset, path: OutputPath, monitor: Monitor, entry: Callable[[str, list[list[float]]], dict[str, Any]]
 ) -> None:
     camera = dataset.scene.cameras[0]
+    if camera.name in dataset.sequence.moving_cameras:
+        raise CartsError(
+            f"camera {camera.name!r} moves, and a base frame of the dVRK holds for one place of it. Export the base "
+            "frames of a recording in which the endoscope stands still."
+        )
     arms = [
         {"name": arm.name, **entry(camera.name, base_frame_transform(arm, camera).tolist())}
         for arm in monitor.track(dataset.scene.arms)

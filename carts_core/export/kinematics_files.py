@@ -2,13 +2,26 @@
 
 import json
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ..files import OutputPath, output_stream, write_text
 from .dataset import Dataset
+from .frames import ExportFrame
 from .kinematics import joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .monitor import Monitor
+
+
+def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
+    """Camera -> T_camera_world of every frame [m], of the cameras that move."""
+    mounts = [dataset.sequence.mounts(frame.index) for frame in frames]
+    return {
+        camera.name: np.stack([camera.T_camera_world @ one[camera.name] for one in mounts])
+        for camera in dataset.scene.cameras
+        if camera.name in dataset.sequence.moving_cameras
+    }
 
 
 def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
@@ -21,9 +34,12 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
 
     Arrays: `frame_id` and `source` (text) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
     `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a `joint_std` that is not known
-    is NaN.
+    is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] and `camera` (text) say where they were.
     """
     frames = list(monitor.track(dataset.frames))
+    moving, poses = _camera_poses(dataset, frames), {}
+    if moving:
+        poses = {"camera": np.array(list(moving)), "T_camera_world": np.stack([*moving.values()], 1)}
     with output_stream(path) as file:
         np.savez_compressed(
             file,
@@ -34,12 +50,13 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
             unit=np.array(joint_units(dataset.scene)),
             joint_positions=np.array([position_values(dataset.scene, frame) for frame in frames]),
             joint_std=np.array([std_values(dataset.scene, frame) for frame in frames]),
+            **poses,  # pyright: ignore[reportArgumentType]
         )
 
 
 def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if unknown."""
-    columns = joint_columns(dataset.scene)
+    columns, moving = joint_columns(dataset.scene), _camera_poses(dataset, dataset.frames)
     frames = [
         {
             "frame": frame.frame_id,
@@ -50,8 +67,9 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
                 column: None if math.isnan(value) else value
                 for column, value in zip(columns, std_values(dataset.scene, frame).tolist(), strict=True)
             },
+            **({"T_camera_world": {name: Ts[place].tolist() for name, Ts in moving.items()}} if moving else {}),
         }
-        for frame in monitor.track(dataset.frames)
+        for place, frame in enumerate(monitor.track(dataset.frames))
     ]
     content = {
         "sequence": dataset.sequence.name,

@@ -52,7 +52,7 @@ def frame_rate(dataset: Dataset) -> float:
 
 
 def _picture(dataset: Dataset, view: View) -> UInt8[np.ndarray, "height width 3"]:
-    state = dataset.scene.state(view.frame.joint_positions)
+    state = dataset.state(view.frame)
     image, rendered = image_and_mask(dataset.renderers[view.camera.name], state)
     mask = view.link_ids >= 0
     return outlined(overlay(dataset.image(view), image, rendered & mask, _OPACITY), mask)

@@ -111,7 +111,7 @@ class Results:
         """The message of a result."""
         estimate, joints, frames = tracked.estimate, {}, {}
         T_world_base, T_camera_world = (
-            values.double().cpu().numpy() for values in (estimate.state.T_world_base, estimate.state.T_camera_world)
+            values.double().cpu().numpy() for values in (estimate.state.T_world_base, estimate.state.T_view_world)
         )
         for index, arm in enumerate(self._scene.arms):
             known = zip(estimate.joint_positions[arm.name], estimate.joint_std[arm.name], strict=True)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
@@ -128,7 +127,7 @@ class LiveTracker:
         """
         began = time.perf_counter()
         variables = self._variables(frame, camera_poses or {})
-        self._moving = bool(camera_poses)
+        self._moving = bool(camera_poses or frame.mounts)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
         state, gap = errors.initial(), math.inf
         if self._filtered is not None:
@@ -199,10 +198,12 @@ class LiveTracker:
         return FrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, backgrounds)
 
     def _variables(self, frame: Frame, camera_poses: Mapping[str, np.ndarray]) -> Variables:
-        state = self._scene.state(frame.measured, self._predictor.device)
-        if camera_poses:
-            poses = np.stack([camera_poses.get(camera.name, camera.T_camera_world) for camera in self._scene.cameras])
-            state = replace(state, T_camera_world=torch.from_numpy(poses).to(state.T_camera_world))
+        mounts = {
+            camera.name: np.linalg.inv(camera.T_camera_world) @ camera_poses[camera.name]
+            for camera in self._scene.cameras
+            if camera.name in camera_poses
+        }
+        state = self._scene.state(frame.measured, self._predictor.device, {**frame.mounts, **mounts})
         return Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _error_model(self, variables: Variables) -> ErrorModel:

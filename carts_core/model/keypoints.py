@@ -62,7 +62,8 @@ def project_keypoints(
     }
     pixels = []
     for point in points:
-        T_camera_link = state.T_camera_world[view] @ state.T_world_base[arms[point.arm]] @ links[point.arm][point.link]
+        T_camera_base = state.T_view_world[view] @ state.T_world_base[arms[point.arm]]
+        T_camera_link = T_camera_base @ links[point.arm][point.link]
         p_camera = T_camera_link[:3, :3] @ T_camera_link.new_tensor(point.position) + T_camera_link[:3, 3]
         fx_fy, cx_cy = state.intrinsics[view].split(2)
         depth = torch.where(p_camera[2] > 0, p_camera[2], torch.nan)

@@ -121,11 +121,11 @@ def forward(joints: Float[np.ndarray, "*batch 6"], geometry: PsmGeometry = CLASS
     )
     T = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
     for alpha, a, theta, d in rows:
-        T = T @ _modified_dh(alpha, a, np.broadcast_to(theta, q.shape[:-1]), np.broadcast_to(d, q.shape[:-1]))
+        T = T @ modified_dh(alpha, a, np.broadcast_to(theta, q.shape[:-1]), np.broadcast_to(d, q.shape[:-1]))
     return T
 
 
-def _modified_dh(alpha: float, a: float, theta: np.ndarray, d: np.ndarray) -> np.ndarray:
+def modified_dh(alpha: float, a: float, theta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Rx(alpha) Tx(a) Rz(theta) Tz(d), [*batch, 4, 4]."""
     c, s = np.cos(theta), np.sin(theta)
     ca, sa = np.cos(alpha), np.sin(alpha)

@@ -52,9 +52,16 @@ class SceneState:
     T_world_base: Float[Tensor, "*batch arms 4 4"]
     """Base frames (F_B of the paper)."""
     T_camera_world: Float[Tensor, "*batch cameras 4 4"]
-    """Camera extrinsics (C of the paper)."""
+    """Camera extrinsics (C of the paper); of a camera that moves, its place on its mount, `T_camera_mount`."""
     intrinsics: Float[Tensor, "*batch cameras 4"]
     """fx, fy, cx, cy of the full-size image [px]."""
+    T_mount_world: Float[Tensor, "*batch cameras 4 4"]
+    """Where the mounts of cameras are at this moment, as measured; the identity for cameras that stay."""
+
+    @property
+    def T_view_world(self) -> Float[Tensor, "*batch cameras 4 4"]:
+        """From the world to what each camera sees at this moment."""
+        return self.T_camera_world @ self.T_mount_world
 
     def map(self, function) -> "SceneState":
         """The state with `function` applied to every tensor."""
@@ -63,6 +70,7 @@ class SceneState:
             function(self.T_world_base),
             function(self.T_camera_world),
             function(self.intrinsics),
+            function(self.T_mount_world),
         )
 
     def detached(self) -> "SceneState":
@@ -120,7 +128,7 @@ class Scene:
         """Median distance of the middles of all links from the cameras [m], at one state (no batch)."""
         found = []
         for arm, joints, T_world_base in zip(self.arms, state.joint_positions, state.T_world_base, strict=True):
-            Ts = state.T_camera_world[:, None] @ (T_world_base @ arm.robot.forward_kinematics(joints))
+            Ts = state.T_view_world[:, None] @ (T_world_base @ arm.robot.forward_kinematics(joints))
             middles = [
                 Ts[:, mesh.link, :3, :3] @ torch.tensor(mesh.vertices.mean(0)).to(Ts) + Ts[:, mesh.link, :3, 3]
                 for mesh in arm.robot.meshes
@@ -128,12 +136,18 @@ class Scene:
             found += [middle.norm(dim=-1) for middle in middles]
         return float(torch.cat(found).median())
 
-    def state(self, joint_positions: Mapping[str, ArrayLike], device: str | torch.device = "cpu") -> SceneState:
+    def state(
+        self,
+        joint_positions: Mapping[str, ArrayLike],
+        device: str | torch.device = "cpu",
+        mounts: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+    ) -> SceneState:
         """The scene's state at the given joint positions, with the calibration as given.
 
         Args:
             joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
             device: where the tensors live.
+            mounts: camera name -> T_mount_world [m], of cameras that move.
 
         Raises:
             RobotError: an arm has no joint positions, or the wrong number of them.
@@ -160,4 +174,5 @@ class Scene:
             constant(np.stack([arm.T_world_base for arm in self.arms])),
             constant(np.stack([camera.T_camera_world for camera in self.cameras])),
             constant(np.array([camera.intrinsics for camera in self.cameras])),
+            constant(np.stack([(mounts or {}).get(camera.name, np.eye(4)) for camera in self.cameras])),
         )

@@ -24,6 +24,9 @@ from .variables import Variables
 from .verdict import Assessment, Verdict
 from .verdict_of_many import assess_calibration, worse_in
 
+_STANDS = 1e-3
+"""Mounts whose transforms differ by less are at the same place [rad, m]."""
+
 
 @dataclass(frozen=True)
 class CalibrationIterate:
@@ -80,8 +83,8 @@ class CalibrationResult:
 class CalibrationOptimizer:
     """Calibration over many frames, one iterate at a time; the counterpart of `FrameOptimizer`.
 
-    Where cameras and the base frames of all arms are free, only their product can be seen. Then the first camera keeps
-    its extrinsics, and the base frames move.
+    Where cameras and the base frames of all arms are free and no camera moves, only their product can be seen. Then the
+    first camera keeps its extrinsics, and the base frames move.
 
     Args:
         scene: arms and cameras.
@@ -118,7 +121,7 @@ class CalibrationOptimizer:
         if not (free.base_frames or free.extrinsics or free.intrinsics):
             raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
-        self.free = with_fixed_gauge(self._scene, free)
+        self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)
         predictor = predictor_of(networks)
         self._problem = CalibrationProblem(self._scene, frames, predictor, self.free, settings, joint_prior_deg, ignore)
         self.variables = self._problem.variables
@@ -210,6 +213,16 @@ class CalibrationOptimizer:
             stop_reason=self.stop_reason or StopReason.CANCELLED,
             assessment=self.assessment,
         )
+
+
+def _some_camera_moves(frames: Sequence[Frame]) -> bool:
+    """Whether frames were taken from different places, so that cameras and base frames can be found together."""
+    first = frames[0].mounts
+    return any(
+        not np.allclose(T, first.get(camera, np.eye(4)), atol=_STANDS)
+        for frame in frames
+        for camera, T in frame.mounts.items()
+    )
 
 
 def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:

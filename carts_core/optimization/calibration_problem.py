@@ -113,7 +113,7 @@ class CalibrationProblem:
         joint_prior_deg: float,
         ignore: Ignored | None = None,
     ) -> None:
-        starts = [scene.state(frame.measured, predictor.device) for frame in frames]
+        starts = [scene.state(frame.measured, predictor.device, frame.mounts) for frame in frames]
         self.variables = Variables(scene, starts[0], replace(free, joints=False), settings.length_scale)
         self._parts: list[_FramePart] = []
         for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):

@@ -88,7 +88,7 @@ def familiarity(
         dehaze=settings.dehaze,
         predictor=predictor,
     )
-    rendered = images.renderer(scene.state(frame.measured, predictor.device))
+    rendered = images.renderer(scene.state(frame.measured, predictor.device, frame.mounts))
     nothing = images.images.new_zeros(len(images.images), SURFACE_CHANNELS, *images.images.shape[-2:])
     whole = Window(0, 0, *images.size)
 

@@ -256,7 +256,7 @@ class SequenceOptimizer:
 
     def _open(self, index: int) -> tuple[Frame, Variables]:
         frame = self._load(index)
-        state = self._scene.state(frame.measured, self._predictor.device)
+        state = self._scene.state(frame.measured, self._predictor.device, frame.mounts)
         return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:

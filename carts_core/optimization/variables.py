@@ -234,7 +234,7 @@ class Variables:
                 T_camera_world = _update(T_camera_world, block.index, lambda T, s=part: self._rigid(s) @ T)
             else:
                 intrinsics = _update(intrinsics, block.index, lambda K, s=part: _scaled_intrinsics(K, s), matrix=False)
-        return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics)
+        return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics, start.T_mount_world)
 
     def around(self, offsets: Float[Tensor, " n"]) -> SceneState:
         """A batch of 1 + 2 n states: that at the offsets, those `STEP` below it, one unknown each, and those above."""

@@ -1,6 +1,6 @@
 """The mean background BG_m of the paper, estimated from a recording when it is not given."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
-from ..model.scene import Scene
+from ..model.scene import Scene, SceneState
 from ..rendering import Renderer
 
 FRAMES = 30
@@ -54,7 +54,7 @@ def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Boo
 def background_of_recording(
     scene: Scene,
     camera: str,
-    measured: Items[Mapping[str, np.ndarray]],
+    states: Items[SceneState],
     image: Callable[[int], UInt8[np.ndarray, "height width 3"]],
 ) -> MeanBackground:
     """The mean background of a recording: see `estimate_background`.
@@ -64,14 +64,14 @@ def background_of_recording(
     Args:
         scene: with that camera and others.
         camera: its name.
-        measured: arm -> joint positions, of each frame that is looked at.
-        image: of the frame at a place in `measured`.
+        states: the scene as measured, of each frame that is looked at.
+        image: of the frame at a place in `states`.
 
     Raises:
         SequenceError: the whole image is covered in every view.
     """
     renderer = Renderer(scene, cameras=[camera])
-    arms = [renderer.segment(scene.state(positions))[0] >= 0 for positions in measured]
+    arms = [renderer.segment(state)[0] >= 0 for state in states]
     covers = [widen(silhouette) for silhouette in arms]
     clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
     used = len(arms) - np.sum(covers, axis=0)

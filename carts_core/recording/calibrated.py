@@ -52,6 +52,10 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
             table["T_world_base"] = _matrix(new.T_world_base)
     for table, old, new in zip(document["cameras"], before.cameras, after.cameras, strict=True):
         move(table, "images", "masks", "background", "size", "K", "distortion", "T_camera_world")
+        if isinstance(table.get("motion"), dict):
+            move(table["motion"], "table")
+        else:
+            move(table, "motion")
         if not np.array_equal(old.T_camera_world, new.T_camera_world):
             table["T_camera_world"] = _matrix(new.T_camera_world)
         if old.intrinsics != new.intrinsics:

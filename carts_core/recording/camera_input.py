@@ -8,11 +8,14 @@ from ..errors import SequenceError
 from ..files.reading import is_regular
 from ..model.camera import Camera
 from .calibration import take_camera
+from .camera_motion import take_camera_motion
 from .frame_files import check_present, frame_files
 from .frame_list import FrameList, numbers_of_frames
 from .image_sources import BagImages, Cropped
 from .images import ImageFiles, ImageSource
+from .matching import PoseSamples
 from .patterns import expand, is_glob, is_per_frame
+from .rows import Rows
 from .toml_table import TomlTable, closest
 from .video import SUFFIXES, Video
 
@@ -26,15 +29,18 @@ class CameraInput:
     masks: Mapping[str, tuple[Path | None, ...]]
     """Mask file of every frame, None for a frame that has none; empty when the sequence has no masks."""
     background: Mapping[str, Path]
+    motion: PoseSamples | None
+    """Of what carries it; None for a camera that stays."""
 
 
-def take_camera_input(table: TomlTable, frames: FrameList, domains: tuple[str, ...]) -> CameraInput:
+def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
     """The camera that one `[[cameras]]` table describes, every file of it present.
 
     Raises:
         SequenceError: a value is missing or wrong, or a file is missing.
     """
-    camera = take_camera(table)
+    camera, frames = take_camera(table), rows.frames
+    motion = take_camera_motion(table, rows)
     images = {
         domain: _images(table, pattern, frames, domain, camera.name)
         for domain, pattern in _by_domain(table, "images", domains, required=True).items()
@@ -50,8 +56,10 @@ def take_camera_input(table: TomlTable, frames: FrameList, domains: tuple[str, .
         if not is_regular(path):
             raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
         background[domain] = path
+    if background and motion is not None:
+        raise table.error("background", "does not go with `motion`: it would be another one in every frame. Remove it.")
     table.finish()
-    return CameraInput(camera, images, masks, background)
+    return CameraInput(camera, images, masks, background, motion)
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:

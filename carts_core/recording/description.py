@@ -59,6 +59,19 @@ class Description:
         """
         return samples.positions if self.matching is None else samples.at_times(self.frames, self.matching)
 
+    def mounts(self) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
+        """Camera -> T_mount_world of every frame [m], of the cameras that move.
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        moving = {name: camera.motion for name, camera in self.cameras.items() if camera.motion is not None}
+        poses = {
+            name: motion.Ts_world_mount if self.matching is None else motion.at_times(self.frames, self.matching)
+            for name, motion in moving.items()
+        }
+        return {name: np.linalg.inv(Ts) for name, Ts in poses.items()}
+
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
     """Read a sequence file and everything that it points at, images excepted.
@@ -82,7 +95,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     light = _take_light(root.take_table("light"))
     robots: dict[tuple[Path, str | None], Robot] = {}
     arms = [_take_arm(table, rows, robots, progress) for table in root.take_tables("arms")]
-    cameras = [take_camera_input(table, rows.frames, domains) for table in root.take_tables("cameras")]
+    cameras = [take_camera_input(table, rows, domains) for table in root.take_tables("cameras")]
     root.finish()
     scene = Scene(tuple(entry.arm for entry in arms), tuple(entry.camera for entry in cameras), light)
     return Description(

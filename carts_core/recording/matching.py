@@ -1,10 +1,11 @@
-"""Joint positions at the times of the frames, from a table whose rows have times of their own."""
+"""Joint positions and camera poses at the times of the frames, from tables whose rows have times of their own."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
 from ..wording import counted
@@ -46,11 +47,19 @@ def take_matching(section: TomlTable) -> TimeMatching:
 
 
 @dataclass(frozen=True)
-class JointSamples:
-    """Joint positions as a table has them."""
+class Neighbours:
+    """Between which rows of a table each frame lies."""
 
-    positions: Float[np.ndarray, "rows dofs"]
-    """[rad, m]"""
+    before: Int[np.ndarray, " frames"]
+    after: Int[np.ndarray, " frames"]
+    share: Float[np.ndarray, " frames"]
+    """How far each frame is on the way from the row before to the row after, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class RowTimes:
+    """Where the rows of a table come from, and when they were logged."""
+
     path: Path
     """The table, for errors."""
     lines: tuple[int, ...]
@@ -58,8 +67,13 @@ class JointSamples:
     times: Float[np.ndarray, " rows"] | None
     """Of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
 
-    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames dofs"]:
-        """The joint positions of every frame [rad, m].
+    def neighbours(self, frames: FrameList, matching: TimeMatching, what: str) -> Neighbours:
+        """The rows that each frame lies between.
+
+        Args:
+            frames: with their times.
+            matching: how times are compared.
+            what: the rows hold, for errors.
 
         Raises:
             SequenceError: a frame has no row near enough in time.
@@ -79,10 +93,10 @@ class JointSamples:
             distance = np.maximum(to_before, to_after)
             share = np.where(before == after, 0.0, to_before / np.maximum(to_before + to_after, _ROUNDING))
         if (far := np.flatnonzero(distance > matching.max_gap + _ROUNDING)).size:
-            raise self._too_far(frames, matching, far)
-        return (1.0 - share)[:, None] * self.positions[before] + share[:, None] * self.positions[after]
+            raise self._too_far(frames, matching, far, what)
+        return Neighbours(before, after, share)
 
-    def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray) -> SequenceError:
+    def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray, what: str) -> SequenceError:
         assert self.times is not None and frames.timestamps is not None
         row = far[0]
         wanted = frames.timestamps + matching.time_offset
@@ -93,13 +107,59 @@ class JointSamples:
             if 0 <= index < len(self.times)
         )
         return SequenceError(
-            f"{self.path} has no joint positions for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
+            f"{self.path} has no {what} for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
             f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
             f"{matching.time_offset:g} s), next to {near}; a row that is used may be {matching.max_gap:g} s away. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
             f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave the frames "
             "out by a table of the others, or allow a larger `max_gap`."
         )
+
+
+@dataclass(frozen=True)
+class JointSamples:
+    """Joint positions as a table has them."""
+
+    positions: Float[np.ndarray, "rows dofs"]
+    """[rad, m]"""
+    rows: RowTimes
+
+    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames dofs"]:
+        """The joint positions of every frame [rad, m].
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        found = self.rows.neighbours(frames, matching, "joint positions")
+        share = found.share[:, None]
+        return (1.0 - share) * self.positions[found.before] + share * self.positions[found.after]
+
+
+@dataclass(frozen=True)
+class PoseSamples:
+    """Poses of a camera's mount as a table has them."""
+
+    Ts_world_mount: Float[np.ndarray, "rows 4 4"]
+    """[m]"""
+    rows: RowTimes
+
+    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames 4 4"]:
+        """T_world_mount of every frame [m]: places between rows linearly, rotations about a fixed axis.
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        found = self.rows.neighbours(frames, matching, "camera poses")
+        if len(self.Ts_world_mount) == 1:
+            return self.Ts_world_mount[found.before]
+        Ts = np.tile(np.eye(4), (len(found.share), 1, 1))
+        # Rows are numbered evenly, so a place among them is a row's number with a fraction.
+        places = found.before + found.share * (found.after - found.before)
+        turns = Slerp(np.arange(len(self.Ts_world_mount)), Rotation.from_matrix(self.Ts_world_mount[:, :3, :3]))
+        Ts[:, :3, :3] = turns(places).as_matrix()
+        share, points = found.share[:, None], self.Ts_world_mount[:, :3, 3]
+        Ts[:, :3, 3] = (1.0 - share) * points[found.before] + share * points[found.after]
+        return Ts
 
 
 def row_times(table: Table, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:

@@ -7,7 +7,7 @@ from ..errors import SequenceError
 from ..wording import counted
 from .frame_list import FrameList, FrameNames, list_of_rows, take_delimiter, take_frame_list, take_frame_names
 from .joints import JointColumns
-from .matching import JointSamples, TimeMatching, row_times, take_matching
+from .matching import JointSamples, RowTimes, TimeMatching, row_times, take_matching
 from .table import Table, read_table
 from .toml_table import TomlTable
 
@@ -36,7 +36,7 @@ class Rows:
             SequenceError: the table is missing, wrong, or has other frames.
         """
         own = arm.take("table", str, "")
-        return self._samples(self._read(arm.path(own)) if own else self.table, columns)
+        return self._samples(self.read(arm.path(own)) if own else self.table, columns)
 
     def truth_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples | None:
         """The true joint positions of an arm, from its own `truth` or that of the sequence; None without either.
@@ -46,17 +46,30 @@ class Rows:
         """
         own = arm.take("truth", str, "")
         path = arm.path(own) if own else self.truth
-        return None if path is None else self._samples(self._read(path), columns)
+        return None if path is None else self._samples(self.read(path), columns)
 
-    def _read(self, path: Path) -> Table:
+    def read(self, path: Path) -> Table:
+        """Another table with the same frames, or of the same clock.
+
+        Raises:
+            SequenceError: the table is missing, wrong, or has other frames.
+        """
         table = read_table(path, self.delimiter)
         if self.names is not None:
             _check_same_frames(table, self.names.of(table), self.frames.frame_ids)
         return table
 
-    def _samples(self, table: Table, columns: JointColumns) -> JointSamples:
+    def times_of(self, table: Table) -> RowTimes:
+        """When the rows of a table were logged.
+
+        Raises:
+            SequenceError: there is no such column, or the times do not increase.
+        """
         times = None if self.matching is None else row_times(table, self.timestamp, "`timestamp` in [kinematics]")
-        return JointSamples(columns.read(table), table.path, table.lines, times)
+        return RowTimes(table.path, table.lines, times)
+
+    def _samples(self, table: Table, columns: JointColumns) -> JointSamples:
+        return JointSamples(columns.read(table), self.times_of(table))
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:

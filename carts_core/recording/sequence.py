@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,8 @@ class Frame:
     """Camera -> instrument mask, undistorted; None where no camera has a mask in this frame."""
     timestamp: float | None
     """[s]"""
+    mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    """Camera -> T_mount_world [m], of the cameras that move."""
 
 
 class Sequence:
@@ -73,6 +75,7 @@ class Sequence:
         self.truth = {
             name: description.at_frames(arm.truth) for name, arm in description.arms.items() if arm.truth is not None
         } or None
+        self._mounts = description.mounts()
         self._description = description
         self._cameras = description.cameras
         self._cache = ByteCache(CACHE_BYTES)
@@ -141,7 +144,17 @@ class Sequence:
             truth=None if self.truth is None else {arm: rows[index].copy() for arm, rows in self.truth.items()},
             masks=masks or None,
             timestamp=None if self.timestamps is None else float(self.timestamps[index]),
+            mounts=self.mounts(index),
         )
+
+    @property
+    def moving_cameras(self) -> tuple[str, ...]:
+        """The cameras whose mounts move."""
+        return tuple(self._mounts)
+
+    def mounts(self, index: int) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Camera -> T_mount_world of a frame [m], of the cameras that move."""
+        return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
 
     def recorded_camera(self, name: str) -> Camera:
         """A camera as its images were recorded, with their distortion; `scene` has it without.
@@ -187,13 +200,20 @@ class Sequence:
             self._check_size(image, camera.name, f"background {path}")
             return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
         indices = spread(len(self))
-        measured = [{arm: rows[index] for arm, rows in self.measured.items()} for index in indices]
+        states = [
+            self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}, mounts=self.mounts(index))
+            for index in indices
+        ]
         try:
-            return background_of_recording(
-                self.scene, camera.name, measured, lambda place: self._image(camera.name, domain, indices[place])
+            found = background_of_recording(
+                self.scene, camera.name, states, lambda place: self._image(camera.name, domain, indices[place])
             )
         except SequenceError as error:
             raise SequenceError(f"{self.path}: camera {camera.name!r}: {error}") from error
+        if camera.name not in self._mounts:
+            return found
+        moves = f"camera {camera.name!r} moves, so what is behind the arms is another thing in every frame"
+        return replace(found, known=np.zeros_like(found.known), problem=f"{moves}, and no background is used.")
 
     def _image(self, camera: str, domain: str, index: int) -> np.ndarray:
         entry = self._camera(camera)

@@ -106,7 +106,7 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
         Ts_base_link.update(zip(same, Ts, strict=True))
     bases = state.T_world_base.unbind(-3)
     Ts_world_link = torch.cat([base[..., None, :, :] @ Ts_base_link[index] for index, base in enumerate(bases)], -3)
-    return state.T_camera_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
+    return state.T_view_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
 
 
 def vertices_in_camera(

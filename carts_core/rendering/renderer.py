@@ -203,6 +203,7 @@ class Renderer:
                 state.T_world_base,
                 state.T_camera_world[..., self._indices, :, :],
                 state.intrinsics[..., self._indices, :],
+                state.T_mount_world[..., self._indices, :, :],
             )
         return link_transforms(self.scene, state), state.intrinsics * self._scale - self._shift
 

@@ -27,7 +27,7 @@ class FramePicture:
         self._renderer = OverlayRenderer(sequence, device)
         self._shown: tuple[int, str] | None = None
         frame = sequence.frame(0)
-        state = sequence.scene.state(frame.measured)
+        state = sequence.scene.state(frame.measured, mounts=frame.mounts)
         self._view = SceneView(page.server, sequence.scene, state, sequence.scene.cameras[0].name)
 
     def show(
@@ -52,7 +52,7 @@ class FramePicture:
         if scene is None:
             picture = layers.nothing(own.height, own.width)
         else:
-            ids = self._renderer.arm_ids(scene.state(frame.measured), camera)
+            ids = self._renderer.arm_ids(scene.state(frame.measured, mounts=frame.mounts), camera)
             picture = layers.contour(ids, _OPACITY)
         for row, point in enumerate(points):
             if point.frame == index and point.camera == camera:

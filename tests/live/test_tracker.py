@@ -139,7 +139,7 @@ def test_a_camera_that_moves_is_followed(stream: Stream) -> None:
     found = stream.tracker.track(replace(frame, timestamp=0.2), {"left": T_moved @ T})
     assert found.verdict is LiveVerdict.GOOD
     assert np.rad2deg(np.abs(found.joint_positions["PSM1"] - frame.truth["PSM1"])[:2].max()) < 0.3
-    np.testing.assert_allclose(found.state.T_camera_world[0].numpy(), T_moved @ T, atol=1e-6)
+    np.testing.assert_allclose(found.state.T_view_world[0].numpy(), T_moved @ T, atol=1e-6)
 
 
 def test_before_anything_is_seen_the_verdict_is_lost_and_values_are_as_measured(stream: Stream) -> None:

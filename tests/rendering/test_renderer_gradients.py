@@ -52,6 +52,7 @@ def moved(state: SceneState, step: torch.Tensor) -> SceneState:
         (state.T_world_base[0] @ _rigid(step[7:13]))[None],
         (_rigid(step[13:19]) @ state.T_camera_world[0])[None],
         state.intrinsics + step[19:][None],
+        state.T_mount_world,
     )
 
 
@@ -106,6 +107,7 @@ def test_a_batch_of_hypotheses_renders_as_each_alone(scene_and_state: tuple[Scen
         state.T_world_base.expand(3, -1, -1, -1),
         state.T_camera_world.expand(3, -1, -1, -1),
         state.intrinsics.expand(3, -1, -1),
+        state.T_mount_world.expand(3, -1, -1, -1),
     )
     renderer = Renderer(scene, width=128, height=96)
     together = renderer(batch)

@@ -96,9 +96,9 @@ class AnotherRoom:
 
     def _make_background(self, room: str, camera: str) -> MeanBackground:
         indices = spread(len(self))
-        measured = [self._sequence.frame(index, cameras=()).measured for index in indices]
+        states = [self.scene.state(self._sequence.frame(index, cameras=()).measured) for index in indices]
         return background_of_recording(
-            self.scene, camera, measured, lambda place: self.frame(indices[place], room, [camera]).images[camera]
+            self.scene, camera, states, lambda place: self.frame(indices[place], room, [camera]).images[camera]
         )
 
     def _photographed(

@@ -66,7 +66,7 @@ def correct_together(
         pass
     found = []
     for index, estimate in sorted(optimizer.estimates.items()):
-        truth, state = truths[index], scene.state(frame_at(index).measured)
+        truth, state = truths[index], scene.state(frame_at(index).measured, mounts=frame_at(index).mounts)
         before = truth.score(state, None, None, renderer, 0.0)
         after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
         found.append(Measurement(by_frame[index], after, (), (), estimate.start, machine(extractor.device), before))

@@ -91,6 +91,7 @@ class PairGenerator:
             torch.tensor(np.stack([placement.T_camera_base for placement in placements]), dtype=torch.float32),
             torch.eye(4)[None],
             torch.tensor(intrinsics, dtype=torch.float32)[None],
+            torch.eye(4)[None],
         )
         with torch.no_grad():
             rendering = variant.renderer(state)

@@ -2,6 +2,8 @@
 
 from .files import read_points as read_points
 from .files import result_json as result_json
+from .moving_cameras import mounts_of_points as mounts_of_points
+from .moving_cameras import moved_cameras as moved_cameras
 from .points import ImagePoint as ImagePoint
 from .result import HandEyeResult as HandEyeResult
 from .result import PoseDeviation as PoseDeviation
