@@ -25,6 +25,7 @@ from .render import Render
 from .robot import RobotCommand
 from .robots import Robots
 from .synthesize import Synthesize
+from .time_offset import TimeOffset
 from .train import Train
 from .view import View
 
@@ -41,6 +42,7 @@ Command = (
     Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[HandEye, tyro.conf.subcommand("hand-eye")]
+    | Annotated[TimeOffset, tyro.conf.subcommand("time-offset")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Live, tyro.conf.subcommand("live")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

@@ -38,6 +38,8 @@ class Import:
         path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
         print_report(console, recording)
         console.print(f"wrote {path}. Look at it: carts view {path}", markup=False, soft_wrap=True)
+        if any(arm.times is not None for arm in recording.arms):
+            console.print(f"Are images and log late? carts time-offset {path}", markup=False, soft_wrap=True)
 
 
 def print_report(console: Console, recording: "FoundRecording") -> None:

@@ -7,3 +7,5 @@ from .calibrated import calibrated_sequence_file as calibrated_sequence_file
 from .frame_reader import FrameReader as FrameReader
 from .sequence import Frame as Frame
 from .sequence import Sequence as Sequence
+from .time_delay import TimeOffsetEstimate as TimeOffsetEstimate
+from .time_delay import estimate_time_offset as estimate_time_offset

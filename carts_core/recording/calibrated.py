@@ -13,7 +13,9 @@ from ..model.instruments import SCHEME
 from ..model.scene import Scene
 
 
-def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate") -> str:
+def calibrated_sequence_file(
+    path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate", time_offset: float | None = None
+) -> str:
     """The text of a sequence file like the one at `path`, for another folder and with another calibration.
 
     What differs between the scenes is written as numbers; everything else, comments included, stays. Paths, which are
@@ -25,6 +27,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
         command: the `carts` command that found them, for the heading.
+        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
@@ -44,6 +47,8 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
 
     move(document["kinematics"], "table", "truth")
     move(document.get("frames", {}), "table", "video")
+    if time_offset is not None:
+        document["frames"]["time_offset"] = time_offset
     for table, old, new in zip(document["arms"], before.arms, after.arms, strict=True):
         move(table, "table", "truth", "T_world_base")
         if not table["robot"].startswith(SCHEME):
@@ -61,7 +66,7 @@ def calibrated_sequence_file(path: Path, folder: Path, before: Scene, after: Sce
         if old.intrinsics != new.intrinsics:
             table["K"] = dict(zip(("fx", "fy", "cx", "cy"), new.intrinsics, strict=True))
             table["pixel_center"] = HALF_PIXEL
-    heading = f"# A calibration that carts {command} found is filled in. Other comments are those of the original file."
+    heading = f"# What carts {command} found is filled in. Other comments are those of the original file."
     return f"{heading}\n{tomlkit.dumps(document)}"
 
 

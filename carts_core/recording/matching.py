@@ -134,6 +134,12 @@ class JointSamples:
         share = found.share[:, None]
         return (1.0 - share) * self.positions[found.before] + share * self.positions[found.after]
 
+    def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times dofs"]:
+        """The joint positions at times of the table's clock [rad, m]; NaN before its first and after its last row."""
+        assert self.rows.times is not None
+        known = self.rows.times
+        return np.stack([np.interp(times, known, one, left=np.nan, right=np.nan) for one in self.positions.T], 1)
+
 
 @dataclass(frozen=True)
 class PoseSamples:
@@ -150,15 +156,26 @@ class PoseSamples:
             SequenceError: a frame has no row near enough in time.
         """
         found = self.rows.neighbours(frames, matching, "camera poses")
-        if len(self.Ts_world_mount) == 1:
-            return self.Ts_world_mount[found.before]
-        Ts = np.tile(np.eye(4), (len(found.share), 1, 1))
         # Rows are numbered evenly, so a place among them is a row's number with a fraction.
-        places = found.before + found.share * (found.after - found.before)
-        turns = Slerp(np.arange(len(self.Ts_world_mount)), Rotation.from_matrix(self.Ts_world_mount[:, :3, :3]))
-        Ts[:, :3, :3] = turns(places).as_matrix()
-        share, points = found.share[:, None], self.Ts_world_mount[:, :3, 3]
-        Ts[:, :3, 3] = (1.0 - share) * points[found.before] + share * points[found.after]
+        return self._between(found.before + found.share * (found.after - found.before))
+
+    def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4 4"]:
+        """T_world_mount at times of the table's clock [m]; NaN before its first and after its last row."""
+        assert self.rows.times is not None
+        numbers = np.arange(len(self.rows.times), dtype=np.float64)
+        places = np.interp(times, self.rows.times, numbers, left=np.nan, right=np.nan)
+        Ts = self._between(np.nan_to_num(places))
+        Ts[np.isnan(places)] = np.nan
+        return Ts
+
+    def _between(self, places: Float[np.ndarray, " places"]) -> Float[np.ndarray, "places 4 4"]:
+        """Poses at places among the rows, numbered from 0."""
+        if len(self.Ts_world_mount) == 1:
+            return np.tile(self.Ts_world_mount, (len(places), 1, 1))
+        rows, points = np.arange(len(self.Ts_world_mount)), self.Ts_world_mount[:, :3, 3]
+        Ts = np.tile(np.eye(4), (len(places), 1, 1))
+        Ts[:, :3, :3] = Slerp(rows, Rotation.from_matrix(self.Ts_world_mount[:, :3, :3]))(places).as_matrix()
+        Ts[:, :3, 3] = np.stack([np.interp(places, rows, one) for one in points.T], 1)
         return Ts
 
 

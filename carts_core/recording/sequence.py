@@ -17,6 +17,7 @@ from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
 from .images import read_image, read_mask
+from .matching import TimeMatching
 from .toml_table import closest
 
 CACHE_BYTES = 192 * 2**20
@@ -44,6 +45,16 @@ class Frame:
     """[s]"""
     mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Camera -> T_mount_world [m], of the cameras that move."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What the tables say at times of their own clock; NaN before their first and after their last row."""
+
+    joints: dict[str, Float[np.ndarray, "times dofs"]]
+    """Arm -> joint positions [rad, m]."""
+    mounts: dict[str, Float[np.ndarray, "times 4 4"]]
+    """Camera -> T_world_mount [m], of the cameras that move."""
 
 
 class Sequence:
@@ -106,12 +117,7 @@ class Sequence:
         Raises:
             SequenceError: rows are not matched by time, or a frame has no row near enough.
         """
-        if self.matching is None:
-            raise SequenceError(
-                f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
-                "Describe the images' times under [frames] (docs/reference/sequence_format.md)."
-            )
-        matching = replace(self.matching, time_offset=time_offset)
+        matching = replace(self.checked_matching(), time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))
         # Images and masks do not depend on it.
         moved._cache = self._cache
@@ -155,6 +161,30 @@ class Sequence:
     def mounts(self, index: int) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Camera -> T_mount_world of a frame [m], of the cameras that move."""
         return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
+
+    def logged_at(self, times: Float[np.ndarray, " times"]) -> Logged:
+        """What the tables have at times of their own clock [s].
+
+        Raises:
+            SequenceError: rows are not matched by time.
+        """
+        self.checked_matching()
+        arms = {name: arm.measured.logged_at(times) for name, arm in self._description.arms.items()}
+        cameras = {name: camera.motion for name, camera in self._cameras.items() if camera.motion is not None}
+        return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
+
+    def checked_matching(self) -> TimeMatching:
+        """How joint positions are matched with frames by time.
+
+        Raises:
+            SequenceError: they are not.
+        """
+        if self.matching is None:
+            raise SequenceError(
+                f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
+                "Describe the images' times under [frames] (docs/reference/sequence_format.md)."
+            )
+        return self.matching
 
     def recorded_camera(self, name: str) -> Camera:
         """A camera as its images were recorded, with their distortion; `scene` has it without.

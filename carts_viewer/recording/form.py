@@ -4,7 +4,9 @@ import re
 from pathlib import Path
 
 from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.recording import TimeOffsetEstimate
 from carts_core.recording.importing.found import FoundArm, FoundCamera
+from carts_viewer.recording.delay import delay_note
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.guess import FOLDER, Guess
 from carts_viewer.recording.plots import joints_plot
@@ -16,13 +18,16 @@ _NONE = "none"
 _AS_GUESSED = "as guessed"
 
 
-def check_form(draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]]) -> str:
+def check_form(
+    draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: TimeOffsetEstimate | None = None
+) -> str:
     """All that was found, part by part, with its problems and with what can be changed.
 
     Args:
         draft: what a person has said.
         guess: what follows from it.
         pictures: camera -> name and address of its previews.
+        delay: between images and table, where it was estimated.
     """
     recording = guess.recording
     cameras = () if recording is None else recording.cameras
@@ -32,7 +37,7 @@ def check_form(draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, s
         left = "".join(_named_images(draft, guess, camera) for camera in draft.options.images)
     wrong = _problem(guess, "images") + _problem(guess, "calibration")
     left = f"<section><h2>Cameras</h2>{wrong}{left}{_add_camera(guess)}</section>"
-    return f'{head}<div class="columns">{left}{_kinematics(draft, guess)}</div>'
+    return f'{head}<div class="columns">{left}{_kinematics(draft, guess, delay)}</div>'
 
 
 def _camera(draft: Draft, guess: Guess, camera: FoundCamera, pictures: list[tuple[str, str]]) -> str:
@@ -87,7 +92,7 @@ def _change(part: str, label: str, guess: Guess) -> str:
     return button("change", label, part, kind="quiet") if possible else ""
 
 
-def _kinematics(draft: Draft, guess: Guess) -> str:
+def _kinematics(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) -> str:
     arms = () if guess.recording is None else guess.recording.arms
     table = "" if guess.table is None else f"<code>{escaped(guess.table.path)}</code>, {len(guess.table)} rows"
     parts = [
@@ -97,7 +102,7 @@ def _kinematics(draft: Draft, guess: Guess) -> str:
         *(_arm(draft, guess, arm) for arm in arms),
         _problem(guess, "columns"),
         _columns(draft, guess),
-        _times(draft, guess),
+        _times(draft, guess, delay),
         "</section>",
     ]
     return "".join(parts)
@@ -153,7 +158,7 @@ def _units(draft: Draft) -> str:
     )
 
 
-def _times(draft: Draft, guess: Guess) -> str:
+def _times(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) -> str:
     """The clock of the table, the time between its rows and the images, and a rate for images without times."""
     options = draft.options
     by_row = guess.recording is not None and guess.recording.frame_times is None
@@ -166,7 +171,9 @@ def _times(draft: Draft, guess: Guess) -> str:
         "<div class='bar'>Clock of the table " + choices("clock", clocks, options.clock or "") + "</div>"
         "<div class='bar'>Time in the table minus time of the image [s] "
         + text_field("time_offset", offset, hint="as guessed")
-        + "</div><div class='bar'>Images per second, if they have no times "
+        + "</div>"
+        + (delay_note(delay) if guess.recording is not None and not by_row else "")
+        + "<div class='bar'>Images per second, if they have no times "
         + text_field("frame_rate", rate, hint="from the images")
         + "</div>"
     )

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.model.scene import Scene
+from carts_core.recording import TimeOffsetEstimate
 from carts_core.recording.video import SUFFIXES
 from carts_viewer.recording import plots
 from carts_viewer.recording.changes import changed, picked
 from carts_viewer.recording.clicking import Wish
+from carts_viewer.recording.delay import estimated_delay
 from carts_viewer.recording.draft import Draft, DraftFile, Step
 from carts_viewer.recording.form import check_form
 from carts_viewer.recording.guess import Guess, guess
@@ -43,6 +45,7 @@ class RecordingPlace:
         self._browser: FileBrowser | None = None
         self._undo: list[Draft] = []
         self._guess: Guess | None = None
+        self._delay: TimeOffsetEstimate | None = None
         self._pictures: dict[str, list[tuple[str, str]]] = {}
         self._step: HandEyeStep | None = None
         try:
@@ -87,6 +90,8 @@ class RecordingPlace:
             "continue": lambda: self._set(replace(self._draft, step=Step.HAND_EYE)),
             "back": lambda: self._set(replace(self._draft, step=Step.CHECK)),
             "delete": self._delete,
+            "estimate-delay": self._estimate_delay,
+            "accept-delay": self._accept_delay,
         }
         if name in ("leave", "delete"):
             return actions[name]()
@@ -132,7 +137,7 @@ class RecordingPlace:
         anew = (draft.source, draft.options) != (self._draft.source, self._draft.options)
         self._draft = draft
         if anew:
-            self._guess = None
+            self._guess = self._delay = None
         if anew or draft.step is not Step.HAND_EYE:
             self._leave_hand_eye()
         self._file.write(draft)
@@ -209,7 +214,7 @@ class RecordingPlace:
         return (
             f"{_steps(Step.CHECK)}<h1>{escaped(self._draft.name)}</h1><p class='quiet-text'><code>"
             f"{escaped(self._draft.source)}</code> {escaped(what)}</p><div class='bar'>{bar}</div>{self._alert()}"
-            f"{check_form(self._draft, found, self._pictures)}"
+            f"{check_form(self._draft, found, self._pictures, self._delay)}"
         )
 
     def _guessed(self) -> Guess:
@@ -222,6 +227,17 @@ class RecordingPlace:
                 with suppress(CartsError):
                     self._add_pictures(self._guess)
         return self._guess
+
+    def _estimate_delay(self) -> None:
+        """Compare the motion in images and table."""
+        recording = self._guessed().recording
+        if recording is not None:
+            self._host.document.show("<h1>Time</h1><p>Comparing the motion in the images with the table …</p>")
+            self._delay = estimated_delay(recording)
+
+    def _accept_delay(self) -> None:
+        if self._delay is not None and self._delay.proposed is not None:
+            self._set(changed(self._draft, "time_offset", str(self._delay.proposed), {}) or self._draft)
 
     def _add_pictures(self, found: Guess) -> None:
         assert found.recording is not None

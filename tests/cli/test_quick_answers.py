@@ -14,6 +14,7 @@ COMMANDS = (
     *("view", "optimize", "evaluate", "calibrate", "hand-eye", "render", "export", "synthesize", "train", "bench"),
     "batch",
     "live",
+    "time-offset",
 )
 
 

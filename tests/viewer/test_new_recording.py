@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from clicked_points import clicked
 from playwright.sync_api import Browser
+from swaying import write_log, write_swaying
 from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
 
 from carts_core.evaluation.metrics import dice
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -155,6 +157,28 @@ def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
     eventually(lambda: place.draft.options.flip, lambda flip: flip == ("yaw",))
     visitor.press("Undo")
     eventually(lambda: place.draft.options.flip, lambda flip: flip == ())
+
+
+def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(
+    tmp_path: Path, shipped_psm: Robot, visit: Callable[[Path], Visitor]
+) -> None:
+    folder = write_swaying(tmp_path / "labs" / "run", shipped_psm, 3, 7.0).parent
+    write_log(folder / "log.csv", shipped_psm, 3, 7.0, late=0.12)
+    (folder / "sequence.toml").unlink()
+    visitor = visit(tmp_path / "labs")
+    visitor.press("New recording")
+    visitor.press_entry("run")
+    visitor.press("Choose this folder")
+    visitor.press("Estimate from the motion", 90)
+    visitor.reads("Proposed.", 90)
+    place = place_of(visitor)
+    assert place.draft.options.time_offset is None
+    visitor.page.locator("main").get_by_role("button", name="Use 0.1").click()
+    eventually(lambda: place.draft.options.time_offset or 0.0, lambda offset: abs(offset - 0.12) < 0.010)
+    visitor.press("Estimate from the motion", 90)
+    visitor.reads("Images and kinematics fit as they are", 90)
+    visitor.press("Undo")
+    eventually(lambda: place.draft.options.time_offset, lambda offset: offset is None)
 
 
 @pytest.mark.slow

@@ -1,0 +1,300 @@
+"""The delay between images and kinematics, from the motion that both show.
+
+Optical flow says how each part of the image moved from one frame to the next, and the kinematics how points of the arms
+moved between the same two times. One is nearly a linear function of the other, whatever the hand-eye calibration is. So
+neither camera poses nor a network is needed: flow is regressed on motion at many delays, and the delay that explains
+most of it is the one. How far it can be relied on is the jackknife's answer over parts of the recording.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from ..model.robot import Robot
+from .sequence import Sequence
+
+WIDTH = 192
+"""[px] Images are compared at this width."""
+_CELLS = 6, 5
+"""Columns and rows of the grid over which flow is averaged."""
+_MOST_FRAMES, _STRETCHES = 600, 4
+"""Frames that are read at most, in so many stretches spread over a long recording."""
+_FEWEST_STEPS = 60
+"""Steps between frames that an estimate needs."""
+_LONGEST_STEP = 0.25
+"""[s] Frames that are farther apart do not show one motion."""
+_BLOCKS = 10
+"""Parts of the recording, each of which the jackknife leaves out once."""
+_GRID = 0.02
+"""[s] Distance of the delays that are tried first."""
+_KEPT = 1e-4
+"""Share of the largest variance, below which a direction of motion is left out."""
+_POSTURES = 3
+"""Directions of the arms' places that how motion shows in the image depends on."""
+_RIDGE = 1e-3
+_LEVER = 0.1
+"""[m] What a camera turns about counts as so far away."""
+_FEWEST_KNOWN = 0.5
+"""Share of the steps for which there must be rows."""
+_STILL = 0.02
+"""[px] A recording with less flow than this shows no motion."""
+_FEWEST_EXPLAINED, _FEWEST_GAIN = 0.15, 0.1
+"""Share of the flow that the best delay must predict, and by how much more than delays usually do."""
+_MOST_DEVIATION = 0.04
+"""[s] No estimate that is less certain can be relied on."""
+_LEAST_DEVIATION = 0.001
+"""[s] No estimate is said to be more certain than this."""
+_WORTH_A_CHANGE = 3.0, 0.008
+"""A delay is proposed where it is so many deviations and so many seconds off the present one."""
+
+
+@dataclass(frozen=True)
+class TimeOffsetEstimate:
+    """What the motion says about `time_offset`."""
+
+    present: float
+    """The sequence's `time_offset` [s]."""
+    seconds: float
+    """The best one [s]."""
+    deviation: float
+    """Its standard deviation [s]."""
+    explained: float
+    """Share of the flow that it predicts in parts of the recording that were left out [1]."""
+    explained_now: float
+    """Share that the present one predicts; below 0 if it misleads [1]."""
+    problem: str | None
+    """Why it cannot be relied on, for people; None where it can."""
+
+    @property
+    def proposed(self) -> float | None:
+        """The offset that should take the place of the present one [s]; None where it should stay."""
+        deviations, least = _WORTH_A_CHANGE
+        off = abs(self.seconds - self.present)
+        return None if self.problem or off < max(deviations * self.deviation, least) else round(self.seconds, 4)
+
+    def sentence(self) -> str:
+        """For people."""
+        if self.problem:
+            return f"The delay between images and kinematics is not known: {self.problem}"
+        found = f"{self.seconds:.3f} s ± {self.deviation:.3f} s"
+        if self.proposed is None:
+            return f"Images and kinematics fit as they are: the motion gives {found}, now it is {self.present:.3f} s."
+        return (
+            f"time_offset = {self.proposed:.3f} is proposed ({found}; now it is {self.present:.3f} s): it explains "
+            f"{100 * self.explained:.0f} % of the motion in the images instead of "
+            f"{max(100 * self.explained_now, 0.0):.0f} %."
+        )
+
+
+def estimate_time_offset(
+    sequence: Sequence,
+    camera: str | None = None,
+    *,
+    domain: str | None = None,
+    largest: float = 0.5,
+    progress: Callable[[int, int], None] | None = None,
+) -> TimeOffsetEstimate:
+    """Find the `time_offset` of a sequence from the motion in its images; nothing is changed.
+
+    Args:
+        sequence: rows of its tables are matched with frames by time.
+        camera: whose images count; the first one by default.
+        domain: of the images; the first one by default.
+        largest: how far from the present offset it is looked for [s].
+        progress: called with how many frames are read, and how many there are.
+
+    Raises:
+        SequenceError: rows are not matched by time, or an image is not usable.
+    """
+    present = sequence.checked_matching().time_offset
+    assert sequence.timestamps is not None
+    frames, steps = _chosen(sequence.timestamps)
+    if len(steps) < _FEWEST_STEPS:
+        return _unknown(present, f"{len(steps)} steps between frames are few; at least {_FEWEST_STEPS} are needed.")
+    flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
+    if np.sqrt((flows**2).mean()) < _STILL:
+        return _unknown(present, "nothing moves in the images.")
+    return _Delays(sequence, sequence.timestamps, steps, flows).estimate(present, largest)
+
+
+def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
+    return TimeOffsetEstimate(present, present, float("inf"), 0.0, 0.0, problem)
+
+
+def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
+    """Frames to read, and the pairs of neighbours among them that are near enough in time."""
+    count, long = len(times), len(times) > _MOST_FRAMES
+    length = _MOST_FRAMES // _STRETCHES if long else count
+    starts = np.linspace(0, count - length, _STRETCHES if long else 1).astype(int)
+    frames = sorted({int(start) + index for start in starts for index in range(length)})
+    pairs = [(a, b) for a, b in pairwise(frames) if b == a + 1]
+    near = [(a, b) for a, b in pairs if 0.0 < times[b] - times[a] <= _LONGEST_STEP]
+    return frames, np.array(near, int).reshape(-1, 2)
+
+
+def _flows(
+    sequence: Sequence,
+    camera: str,
+    domain: str | None,
+    frames: list[int],
+    steps: np.ndarray,
+    progress: Callable[[int, int], None] | None,
+) -> Float[np.ndarray, "steps outputs"]:
+    """Mean flow in each cell of a grid [px at `WIDTH`], by step."""
+    found = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    wanted = {int(after) for _, after in steps}
+    before: np.ndarray | None = None
+    flows = []
+    for done, index in enumerate(frames):
+        image = sequence.frame(index, domain, [camera]).images[camera]
+        height = max(32, round(image.shape[0] * WIDTH / image.shape[1]))
+        now = cv2.cvtColor(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        if index in wanted and before is not None:
+            flow = found.calc(before, now, np.zeros((*now.shape, 2), np.float32))
+            flows.append(cv2.resize(flow, _CELLS, interpolation=cv2.INTER_AREA).ravel())
+        before = now
+        if progress is not None:
+            progress(done + 1, len(frames))
+    return np.array(flows, np.float64)
+
+
+class _Delays:
+    """Flow regressed on motion, at any delay.
+
+    Args:
+        sequence: whose arms move.
+        times: of its frames [s].
+        steps: pairs of frames.
+        flows: what the images show of each step.
+    """
+
+    def __init__(self, sequence: Sequence, times: np.ndarray, steps: np.ndarray, flows: np.ndarray) -> None:
+        self._sequence, self._begin, self._end = sequence, times[steps[:, 0]], times[steps[:, 1]]
+        largest = np.quantile(np.abs(flows), 0.995, axis=0)
+        self._flows = np.clip(flows, -largest, largest)
+        self._blocks = np.arange(len(steps)) * _BLOCKS // len(steps)
+        self._all = np.ones(_BLOCKS, bool)
+        self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
+        """The best offset around the present one [s]."""
+        steps = round(largest / _GRID)
+        grid = [present + step * _GRID for step in range(-steps, steps + 1)]
+        tried = {offset: parts for offset in grid if (parts := self._parts(offset)) is not None}
+        if not tried:
+            return _unknown(present, "the table has no rows at the times of the frames.")
+        if not next(iter(tried.values()))[0].size:
+            return _unknown(present, "nothing moves in the table.")
+        curve = {offset: _predicted(parts) for offset, parts in tried.items()}
+        best = max(curve, key=lambda offset: curve[offset])
+        seconds = self._refined(best, np.ones(_BLOCKS, bool))
+        without = [self._refined(seconds, np.arange(_BLOCKS) != left) for left in range(_BLOCKS)]
+        deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(without - np.mean(without)).sum()))
+        return TimeOffsetEstimate(
+            present,
+            seconds,
+            max(deviation, _LEAST_DEVIATION),
+            curve[best],
+            curve.get(present, 0.0),
+            _problem(curve[best], list(curve.values()), abs(best - present) > largest - 1.5 * _GRID, deviation),
+        )
+
+    def _refined(self, around: float, blocks: np.ndarray) -> float:
+        """The offset near another one that explains most of some blocks [s]."""
+
+        def unexplained(offset: float) -> float:
+            parts = self._parts(offset)
+            return 1.0 if parts is None else 1.0 - _explained(parts, blocks)
+
+        bounds = around - 1.5 * _GRID, around + 1.5 * _GRID
+        found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
+        return float(found.x)
+
+    def _parts(self, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """By block, products of motion at an offset X and flow Y: X^T X, X^T Y, |Y|^2; None where rows are missing."""
+        places, motion = self._motion(offset)
+        there = np.asarray(np.isfinite(motion).all(1))
+        if there.mean() < _FEWEST_KNOWN:
+            return None
+        if self._bases is None:
+            # Once for all offsets, so that these compare.
+            middle = places[there].mean(0)
+            postures = _basis(places[there] - middle)[:, :_POSTURES]
+            self._bases = _basis(motion[there]), middle, postures
+        moves, middle, postures = self._bases
+        X, around = np.nan_to_num(motion) @ moves, np.nan_to_num(places - middle) @ postures
+        # How motion shows in the image depends on where the arms are: a linear function of that as well.
+        X = np.concatenate([X, *(X * posture[:, None] for posture in around.T)], 1)
+        Y = np.where(there[:, None], self._flows, 0.0)
+        inside = [self._blocks == block for block in range(_BLOCKS)]
+        return (
+            np.stack([X[rows].T @ X[rows] for rows in inside]),
+            np.stack([X[rows].T @ Y[rows] for rows in inside]),
+            np.array([np.square(Y[rows]).sum() for rows in inside]),
+        )
+
+    def _motion(self, offset: float) -> tuple[Float[np.ndarray, "steps inputs"], Float[np.ndarray, "steps inputs"]]:
+        """Where points of arms are, and how they and mounts of cameras move in each step [m]; NaN if not logged."""
+        begin, end = (self._sequence.logged_at(times + offset) for times in (self._begin, self._end))
+        places, moved = [], []
+        for arm in self._sequence.scene.arms:
+            first, last = (_points(arm.robot, at.joints[arm.name]) for at in (begin, end))
+            places.append(0.5 * (first + last))
+            moved.append(last - first)
+        for camera in begin.mounts:
+            Ts = np.linalg.inv(begin.mounts[camera]) @ end.mounts[camera]
+            turns = np.stack([Ts[:, 2, 1], Ts[:, 0, 2], Ts[:, 1, 0]], 1)
+            moved.append(np.concatenate([Ts[:, :3, 3], _LEVER * turns], 1))
+        return np.concatenate(places, 1), np.concatenate(moved, 1)
+
+
+def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns directions"]:
+    """The directions in which rows differ, scaled so that they do by 1 in each."""
+    _, sizes, directions = np.linalg.svd(values, full_matrices=False)
+    kept = sizes**2 > _KEPT * sizes[0] ** 2
+    return directions[kept].T / (sizes[kept] / np.sqrt(len(values)))
+
+
+def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.ndarray, "rows coordinates"]:
+    """Middles of the links in the arm's base frame [m]."""
+    Ts = robot.forward_kinematics(torch.from_numpy(np.nan_to_num(joints))).numpy()
+    middles = [Ts[:, mesh.link, :3, :3] @ mesh.vertices.mean(0) + Ts[:, mesh.link, :3, 3] for mesh in robot.meshes]
+    return np.where(np.isfinite(joints).all(1, keepdims=True), np.concatenate(middles, 1), np.nan)
+
+
+def _explained(parts: tuple[np.ndarray, np.ndarray, np.ndarray], blocks: np.ndarray) -> float:
+    """Share of the flow of some blocks that a linear function of the motion explains, fitted to it [1]."""
+    XX, XY, YY = (part[blocks].sum(0) for part in parts)
+    return float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
+
+
+def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Share of the flow of every block that a function fitted to the others predicts; below 0 if it is misled [1]."""
+    XX, XY, YY = parts
+    unexplained = 0.0
+    for left in range(_BLOCKS):
+        others = np.arange(_BLOCKS) != left
+        B = _fitted(XX[others].sum(0), XY[others].sum(0))
+        unexplained += float(YY[left] - 2 * (XY[left] * B).sum() + (B * (XX[left] @ B)).sum())
+    return 1.0 - unexplained / max(float(YY.sum()), 1e-12)
+
+
+def _fitted(XX: np.ndarray, XY: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(XX + _RIDGE * np.trace(XX) / len(XX) * np.eye(len(XX)), XY)
+
+
+def _problem(explained: float, curve: list[float], at_end: bool, deviation: float) -> str | None:
+    if explained < _FEWEST_EXPLAINED or explained - float(np.median(curve)) < _FEWEST_GAIN:
+        return "the motion of the arms does not explain what moves in the images. Check columns, signs and units."
+    if at_end:
+        return "the best one is at the end of what was tried. Give a larger range, or check the clocks."
+    if deviation > _MOST_DEVIATION:
+        return f"parts of the recording contradict each other (± {deviation:.2f} s)."
+    return None

@@ -1,0 +1,104 @@
+"""A delay between images and kinematics, found in a video of a synthetic motion."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from swaying import write_log, write_swaying
+
+from carts_core.cli.command_line import main
+from carts_core.errors import SequenceError
+from carts_core.model.robot import Robot
+from carts_core.recording import Sequence, estimate_time_offset
+from carts_core.recording.time_delay import TimeOffsetEstimate
+from carts_core.resources import shipped_robot
+
+SEED, SECONDS = 3, 7.0
+DELAY = 0.12
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_swaying(tmp_path_factory.mktemp("swaying"), Robot.load(shipped_robot()), SEED, SECONDS)
+
+
+@pytest.fixture
+def recording(recorded: Path, tmp_path: Path) -> Path:
+    """The recording in a folder of the test's own."""
+    shutil.copytree(recorded.parent, tmp_path / "own")
+    return tmp_path / "own" / "sequence.toml"
+
+
+@pytest.fixture
+def late(recording: Path, shipped_psm: Robot) -> Path:
+    """With a log whose stamps are late by 120 ms."""
+    write_log(recording.with_name("log.csv"), shipped_psm, SEED, SECONDS, DELAY)
+    return recording
+
+
+def test_a_delay_of_120_ms_is_found_to_10_ms_and_proposed(late: Path) -> None:
+    done: list[tuple[int, int]] = []
+    found = estimate_time_offset(Sequence.open(late), progress=lambda *now: done.append(now))
+    assert abs(found.seconds - DELAY) < 0.010 and found.deviation < 0.010
+    assert found.proposed == round(found.seconds, 4)
+    assert found.explained > found.explained_now + 0.1
+    assert "is proposed" in found.sentence() and done[-1] == (210, 210)
+
+
+def test_without_a_delay_none_is_proposed(recording: Path) -> None:
+    found = estimate_time_offset(Sequence.open(recording))
+    assert abs(found.seconds) < 0.010 and found.proposed is None and found.problem is None
+    assert "fit as they are" in found.sentence()
+
+
+def test_kinematics_of_another_motion_give_no_delay(recording: Path, shipped_psm: Robot) -> None:
+    write_log(recording.with_name("log.csv"), shipped_psm, SEED + 1, SECONDS)
+    found = estimate_time_offset(Sequence.open(recording))
+    assert found.proposed is None and found.problem is not None
+    assert "is not known" in found.sentence()
+
+
+def test_a_delay_beyond_what_is_tried_is_not_proposed(recording: Path, shipped_psm: Robot) -> None:
+    write_log(recording.with_name("log.csv"), shipped_psm, SEED, SECONDS, 0.3)
+    assert estimate_time_offset(Sequence.open(recording), largest=0.1).proposed is None
+
+
+def test_an_arm_that_stands_still_gives_no_delay(recording: Path) -> None:
+    log = recording.with_name("log.csv")
+    header, first, *rest = log.read_text().splitlines()
+    still = [f"{row.split(',')[0]},{first.split(',', 1)[1]}" for row in [first, *rest]]
+    log.write_text("\n".join([header, *still]) + "\n")
+    assert estimate_time_offset(Sequence.open(recording)).problem == "nothing moves in the table."
+
+
+def test_few_frames_give_no_delay(recording: Path) -> None:
+    (recording.parent / "times.csv").write_text("frame,timestamp\n" + "".join(f"{n},{n / 30:.4f}\n" for n in range(20)))
+    recording.write_text(recording.read_text().replace('[frames]\nvideo = "left.mp4"', '[frames]\ntable = "times.csv"'))
+    found = estimate_time_offset(Sequence.open(recording))
+    assert found.problem == "19 steps between frames are few; at least 60 are needed."
+
+
+def test_rows_that_are_frames_have_no_delay(sample_sequence_path: Path) -> None:
+    with pytest.raises(SequenceError, match="there is no time to offset"):
+        estimate_time_offset(Sequence.open(sample_sequence_path))
+
+
+def test_a_small_difference_is_not_worth_a_change() -> None:
+    near = TimeOffsetEstimate(0.0, 0.007, 0.001, 0.9, 0.9, None)
+    uncertain = TimeOffsetEstimate(0.0, 0.02, 0.01, 0.9, 0.9, None)
+    assert near.proposed is None and uncertain.proposed is None
+
+
+def test_the_command_proposes_and_writes_where_it_is_asked_to(
+    late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = late.read_text()
+    main(["time-offset", str(late), "-o", str(tmp_path / "shifted")])
+    assert "is proposed" in capsys.readouterr().out
+    assert late.read_text() == before
+    shifted = Sequence.open(tmp_path / "shifted" / "sequence.toml")
+    assert shifted.matching is not None and abs(shifted.matching.time_offset - DELAY) < 0.010
+    main(["time-offset", str(tmp_path / "shifted" / "sequence.toml"), "-o", str(tmp_path / "again")])
+    assert "fit as they are" in capsys.readouterr().out and not (tmp_path / "again").exists()
+    assert np.isfinite(shifted.measured["PSM1"]).all()
