@@ -3,6 +3,8 @@
   "use strict";
 
   let box = null;
+  let held = false;
+  let waiting = null;
 
   function element() {
     if (!box?.isConnected) {
@@ -21,17 +23,31 @@
       for (const kind of ["keydown", "keyup", "pointerdown", "wheel", "dblclick"]) {
         box.addEventListener(kind, (event) => event.stopPropagation());
       }
+      // A button that is replaced between press and release gets no click: new content waits for the release.
+      box.addEventListener("pointerdown", () => { held = true; });
+      for (const kind of ["pointerup", "pointercancel"]) {
+        window.addEventListener(kind, () => setTimeout(release), { capture: true });
+      }
     }
     return box;
   }
 
   const say = (name, value) => window.carts.report("chosen", JSON.stringify([name, value]));
 
-  /** Put new content in place of the old one; focus and scrolling stay where they are. */
+  function release() {
+    held = false;
+    if (waiting) showDocument(...waiting);
+  }
+
+  /** Put new content in place of the old one; focus, text being typed and scrolling stay where they are. */
   function showDocument(content, place) {
     const target = element();
+    waiting = held ? [content, place] : null;
+    if (held) return;
     const focused = target.contains(document.activeElement) ? document.activeElement : null;
     const key = focused?.dataset?.do && [focused.dataset.do, focused.dataset.value ?? ""];
+    const typed = focused?.type === "text" && focused.value !== focused.defaultValue
+      ? [focused.value, focused.selectionStart, focused.selectionEnd] : null;
     const scrolled = [...target.querySelectorAll("[data-scroll]")].map((part) => [part.dataset.scroll, part.scrollTop]);
     target.className = content ? `carts-document carts-document-${place}` : "";
     target.hidden = !content;
@@ -43,8 +59,13 @@
       if (part) part.scrollTop = position;
     }
     if (key) {
-      [...target.querySelectorAll("[data-do]")]
-        .find((other) => other.dataset.do === key[0] && (other.dataset.value ?? "") === key[1])?.focus();
+      const again = [...target.querySelectorAll("[data-do]")]
+        .find((other) => other.dataset.do === key[0] && (other.dataset.value ?? "") === key[1]);
+      again?.focus();
+      if (typed && again?.type === "text") {
+        again.value = typed[0];
+        again.setSelectionRange(typed[1], typed[2]);
+      }
     }
     document.documentElement.classList.toggle("carts-documented", Boolean(content));
     document.documentElement.classList.toggle("carts-covered", Boolean(content) && place === "page");

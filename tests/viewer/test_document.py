@@ -1,0 +1,57 @@
+"""The document over the page in a browser: what people do there survives that the server writes it anew."""
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser
+from playwright.sync_api import Page as Tab
+from viewer_canvas import eventually
+
+from carts_viewer.transport.document import Document, button, text_field
+from carts_viewer.transport.page import Page
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[tuple[Document, Tab]]:
+    page = Page(host="127.0.0.1", port=0, title="Document")
+    context = browser.new_context()
+    try:
+        document, tab = Document(page), context.new_page()
+        show(document, 1)
+        tab.goto(page.url)
+        tab.get_by_text("step 1").wait_for(timeout=60_000)
+        yield document, tab
+    finally:
+        context.close()
+        page.close()
+
+
+def show(document: Document, step: int) -> None:
+    document.show(f"<p>step {step}</p>{text_field('name', 'old')}{button('stop', 'Stop')}")
+
+
+def test_a_button_that_is_written_anew_while_it_is_pressed_is_pressed(opened: tuple[Document, Tab]) -> None:
+    document, tab = opened
+    chosen: list[tuple[str, str]] = []
+    document.on_chosen(lambda name, value: chosen.append((name, value)))
+    tab.locator("main button").hover()
+    tab.mouse.down()
+    show(document, 2)
+    tab.wait_for_timeout(500)
+    tab.mouse.up()
+    eventually(lambda: chosen, lambda said: said == [("stop", "")])
+    tab.get_by_text("step 2").wait_for()
+
+
+def test_text_being_typed_survives_what_the_server_writes(opened: tuple[Document, Tab]) -> None:
+    document, tab = opened
+    field = tab.locator("main input[data-do=name]")
+    field.focus()
+    field.press("End")
+    tab.keyboard.type(" na")
+    show(document, 2)
+    tab.get_by_text("step 2").wait_for()
+    tab.keyboard.type("me")
+    assert field.input_value() == "old name"
