@@ -414,10 +414,13 @@
     const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
     if (!used || event.detail === 0 || used.closest("[role=dialog]")) return;
     const list = used.matches("[role=option]"); // its field has the focus then, and is no longer about typing
-    setTimeout(() => {
+    const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it has closed, which may be late
+    const leave = () => {
       const focused = document.activeElement;
-      if (list || focused?.matches("button, input[type=checkbox]")) focused?.blur();
-    }, 60);
+      if (focused?.matches(list ? "input[aria-haspopup=listbox]" : "button, input[type=checkbox]")) focused.blur();
+      if (performance.now() < end) setTimeout(leave, 60);
+    };
+    setTimeout(leave, 60);
   }, { capture: true });
 
   // ---- Say when nobody listens any more ------------------------------------------------------------------------------

@@ -1,24 +1,16 @@
 """Names in a recording that try to lead elsewhere, through every command: nothing is written outside the output."""
 
-import json
 import os
-import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hostile_recording import WHERE, hostile_names, with_name
 from planted import contents, treasure
 
 from carts_core.cli.command_line import BAD_INPUT, main
 
-PARTS = [
-    *("..", ".", "/", "//", "\\", "~", "home", "out", "tmp", "\0", "\n", "\t", "\x1b[2J", "\x7f", "\u2028", "\u202e"),
-    *("=1+1", "-rf", "--output", "*", "?", "[red]", "%s", "{frame}", "$HOME", "`id`", ";", "|", "&", "<b>", "'", '"'),
-    *(" ", "ü", "手術", "e\u0301", "\ufeff", "\U0001f600", "CON", "a" * 120, "ü" * 130, ":", "#", "@", "+", ","),
-    *("001", "left"),
-]
-WHERE = ("sequence", "camera", "domain", "arm", "frame")
 COMMANDS: dict[str, list[str]] = {
     "render": ["render", "--frames", "0"],
     "optimize": ["optimize", "--frames", "0", "--solver", "none"],
@@ -29,30 +21,6 @@ COMMANDS: dict[str, list[str]] = {
 }
 OUTPUTS = ("runs", "out")
 """Where commands write: the default, and what the command lines above name."""
-
-
-def hostile_names(count: int, sandbox: Path) -> Iterator[str]:
-    """Names from a seed: paths into the sandbox first, then mixtures of all that paths, consoles and tables know."""
-    dice = random.Random(21)
-    for number in range(count):
-        if number % 4 == 0:
-            up = "../" * dice.randint(1, 8)
-            yield dice.choice([f"{sandbox}/evil{number}", f"{up}evil{number}", f"a/{up}home/evil", f"{up}home/bashrc"])
-        else:
-            yield "".join(dice.choice(PARTS) for _ in range(dice.randint(1, 4)))
-
-
-def _with_name(text: str, where: str, name: str) -> str:
-    """The sequence file with a hostile name in it; images are found by a glob, so that they are there."""
-    before, after = {
-        "sequence": ('name = "tiny"', f"name = {json.dumps(name, ensure_ascii=False)}"),
-        "camera": ('name = "left"', f"name = {json.dumps(name, ensure_ascii=False)}"),
-        "domain": ("['regular']", f"[{json.dumps(name, ensure_ascii=False)}]"),
-        "arm": ('name = "PSM1"', f"name = {json.dumps(name, ensure_ascii=False)}"),
-        "frame": ('frame_id = "{frame:03d}"\n', ""),
-    }[where]
-    assert before in text
-    return text.replace(before, after).replace('"{domain}/{camera}/{frame}.png"', '"regular/left/*.png"')
 
 
 def _outside(sandbox: Path) -> dict[str, str]:
@@ -68,7 +36,7 @@ def _run_all(recording: Path, sandbox: Path, name: str, where: str, commands: li
         shutil.rmtree(work / output, ignore_errors=True)
     file, table = work / "recording" / "sequence.toml", work / "recording" / "kinematics.csv"
     text = (recording / "sequence.toml").read_text()
-    file.write_text(_with_name(text, where, name), encoding="utf-8", errors="surrogatepass")
+    file.write_text(with_name(text, where, name), encoding="utf-8", errors="surrogatepass")
     if where == "frame":
         header, row = (recording / "kinematics.csv").read_text().splitlines()
         quoted = '"' + name.replace('"', '""') + '"'

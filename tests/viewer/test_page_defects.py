@@ -102,6 +102,7 @@ def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab
     # Keys go on working after a list was used.
     tab.choose("Domain", "Smoke")
     eventually(lambda: app.state.domain, lambda domain: domain == "smoke")
+    tab.page.wait_for_function("document.activeElement === document.body")
     tab.page.wait_for_timeout(150)
     tab.page.keyboard.press("b")
     eventually(lambda: app.state.index, lambda index: index == 10)

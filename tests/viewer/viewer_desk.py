@@ -21,12 +21,13 @@ class Desk:
         self.session, self.renderer = Session(sequence, project), OverlayRenderer(sequence)
         self.delivered: list[tuple[int, str, bytes]] = []
         self._factory = factory
-        frame = self.session.frame(0, "regular", "left")
+        domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
+        frame = self.session.frame(0, domain, camera)
         state = ViewState(
             index=0,
             frame=frame,
-            domain="regular",
-            camera="left",
+            domain=domain,
+            camera=camera,
             pose=self.session.pose(frame),
             layer=Layer.MASK,
             opacity=0.5,
