@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import RobotError
+from ..wording import listed, shown
 
 NO_LIMIT = 1e3
 """A larger joint limit [rad], [m] means none."""
@@ -102,7 +103,7 @@ class Kinematics:
         """Ts_base_link of the named links; computed in double precision, returned in the input's.
 
         Raises:
-            RobotError: the last dimension is not the number of degrees of freedom.
+            RobotError: the last dimension is not the number of degrees of freedom, or there is no such link.
         """
         dofs = len(self.joint_names)
         if joint_positions.shape[-1] != dofs:
@@ -110,6 +111,9 @@ class Kinematics:
                 f"got {joint_positions.shape[-1]} joint positions for a robot with {dofs} degrees of freedom: "
                 f"{', '.join(self.joint_names)}."
             )
+        for name in link_names:
+            if name not in self._frame_index:
+                raise RobotError(f"the robot has no link {shown(name)}. Its links are: {listed(self._frame_index)}.")
         batch = joint_positions.shape[:-1]
         Ts_root = self._Ts_root(joint_positions.reshape(-1, dofs).double())
         index = torch.tensor([self._frame_index[name] for name in link_names], device=joint_positions.device)

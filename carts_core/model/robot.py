@@ -127,7 +127,7 @@ class Robot:
         """T_base_link [m] of any link of the URDF, with or without a mesh.
 
         Raises:
-            RobotError: wrong number of joint positions.
+            RobotError: wrong number of joint positions, or no such link.
         """
         return self._kinematics(joint_positions, (link_name,))[..., 0, :, :]
 

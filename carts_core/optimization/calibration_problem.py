@@ -237,7 +237,6 @@ class CalibrationProblem:
                 "value": float(weights @ values) + prior.cost,
                 "loss": float(weights @ losses / weights.sum()),
                 "stage_loss": float(weights @ losses / weights.sum()),
-                "prior": prior.cost,
                 "gradient": slope,
                 "hessian": hessian,
                 "frame_losses": losses,

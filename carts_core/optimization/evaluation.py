@@ -19,8 +19,6 @@ class Evaluation:
     the problem is live under one blur."""
     stage_loss: float
     """The same under the blur that is descended in."""
-    prior: float
-    """Cost of the prior, and of further factors [1]."""
     gradient: Float[Tensor, " n"]
     """Of `value`; zero if it was not asked for."""
     hessian: Float[Tensor, "n n"] | None

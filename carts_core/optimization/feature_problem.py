@@ -108,7 +108,6 @@ class FeatureProblem:
             value=float((value + prior).detach()),
             loss=float(loss.detach()),
             stage_loss=float(value.detach()),
-            prior=float(prior.detach()),
             gradient=torch.nan_to_num(slope),
             hessian=None,
             uncertainty=None,

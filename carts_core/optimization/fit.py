@@ -12,6 +12,7 @@ from .evaluation import Evaluation
 from .factors import Linearization
 from .solvers import FirstOrderDescent, LevenbergMarquardt
 from .variables import Variables
+from .verdict import Assessment
 
 
 class StopReason(StrEnum):
@@ -75,6 +76,8 @@ class Fit:
     offsets: Float[Tensor, " n"]
     budget: int
     stop_reason: StopReason = StopReason.NOT_OPTIMIZED
+    best: Point | None = None
+    """The best point so far."""
     reached: Point | None = None
     """The best point of the last descent."""
     edges: Linearization | None = None
@@ -87,6 +90,8 @@ class Fit:
     """Its state goes on from one `FirstOrder` to the next."""
     losses: list[float] = field(default_factory=list)
     """Of all points of `FirstOrder` stages."""
+    assessment: Assessment | None = None
+    """How far the result can be relied on, after `RejectFailed`."""
 
     def __post_init__(self) -> None:
         self.solver = LevenbergMarquardt(self.problem.variables.lower, self.problem.variables.upper)
@@ -107,30 +112,30 @@ class Fit:
         evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)
         return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
 
-    def restart(self, offsets: Float[Tensor, " n"]) -> None:
-        """Go on from elsewhere, with more care than before."""
+    def jump_to(self, offsets: Float[Tensor, " n"]) -> None:
+        """Go on from elsewhere; later descents then stop at the smaller tolerance."""
         self.offsets, self.restarts = offsets, self.restarts + 1
         self.solver.reset()
 
-    def begin_again(self, start: Float[Tensor, " n"]) -> None:
-        """Forget what was found."""
+    def start_over(self, start: Float[Tensor, " n"]) -> None:
+        """Forget the estimate; the budget is whole again."""
         self.offsets, self.restarts, self.used = start, 0, 0
         self.reached, self.edges = None, None
         self.solver.reset()
 
-    def found(self) -> "Found":
-        """What was found so far."""
-        return Found(self.offsets, self.reached, self.edges, self.stop_reason)
+    def snapshot(self) -> "Snapshot":
+        """The estimate as it is now."""
+        return Snapshot(self.offsets, self.reached, self.edges, self.stop_reason)
 
-    def recall(self, found: "Found") -> None:
-        """Go back to what was found before."""
-        self.offsets, self.reached, self.edges = found.offsets, found.reached, found.edges
-        self.stop_reason = found.stop_reason
+    def restore(self, snapshot: "Snapshot") -> None:
+        """Go back to an estimate."""
+        self.offsets, self.reached, self.edges = snapshot.offsets, snapshot.reached, snapshot.edges
+        self.stop_reason = snapshot.stop_reason
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a run has come to."""
+class Snapshot:
+    """The estimate at some moment of a run."""
 
     offsets: Float[Tensor, " n"]
     reached: Point | None

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
-from ..settings.stages import FINEST, Evaluate
+from ..settings.stages import FINEST
 from .base_frame_gain import base_frame_gain
 from .counterfactual import Backgrounds
 from .evaluation import Evaluation
@@ -26,7 +26,7 @@ from .observability import Uncertainty
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
 from .variables import Variables
-from .verdict import Assessment, Verdict, assess
+from .verdict import Assessment
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,6 @@ class Iterate:
     state: SceneState
     loss: float
     """Without the prior. Comparable within one observation, and if not `live` under one blur."""
-    terms: dict[str, float]
-    """Parts of the objective that was descended."""
     gradient_norms: dict[str, float]
     """Per unknown, in radian-like units."""
     seconds: float
@@ -156,16 +154,17 @@ class FrameOptimizer:
         self._visited: list[tuple[torch.Tensor, object]] = []
         self.best: Iterate | None = None
         self.stop_reason: StopReason | None = None
-        self._best_point: Point | None = None
         if isinstance(self._problem, FrameProblem):
             self._problem.reset()
         # A descent evaluates where its last step leads.
         budget = self.settings.iterations + int(isinstance(self._problem, FeatureProblem))
         self._fit = Fit(self._problem, torch.zeros_like(self._variables.lower), budget)
-        self._points = self._judged(run_stages(self.settings.stages, self._fit))
-        self.assessment: Assessment | None = None
-        """At the end, how far the result can be relied on; None before, and for solvers other than `SurfaceSolver`.
-        What failed keeps its start, unless the image contradicts that even more."""
+        self._points = run_stages(self.settings.stages, self._fit)
+
+    @property
+    def assessment(self) -> Assessment | None:
+        """At the end, how far the result can be relied on; None before, and for a solver without `RejectFailed`."""
+        return self._fit.assessment
 
     @property
     def proposed(self) -> dict[str, Bool[np.ndarray, "h w"]]:
@@ -189,31 +188,9 @@ class FrameOptimizer:
         stage = self.history[-1].stage + (point.objective_key != self._visited[-1][1]) if self.history else 0
         self._visited.append((point.offsets, point.objective_key))
         self.history.append(Progress(iterate.index, iterate.loss, iterate.seconds, stage))
-        if point.improves_on(self._best_point):
-            self.best, self._best_point = iterate, point
+        if point is self._fit.best:
+            self.best = iterate
         return iterate
-
-    def _judged(self, points: Iterator[Point]) -> Iterator[Point]:
-        """The points of the stages, and the start where the image contradicts what they end with."""
-        yield from points
-        last, problem, fit = self._best_point, self._problem, self._fit
-        evaluated = any(isinstance(stage, Evaluate) for stage in self.settings.stages)
-        if last is None or not evaluated or not isinstance(problem, FrameProblem):
-            return
-        self.assessment = self._assess(problem, last)
-        if self.assessment.verdict is not Verdict.FAILED or not bool(last.offsets.any()):
-            return
-        ended, fit.offsets = fit.offsets, torch.zeros_like(fit.offsets)
-        start = replace(fit.evaluate(FINEST), objective_key=(*last.objective_key, "start"))
-        if self.assessment.nothing_there or self._assess(problem, start).probability <= self.assessment.probability:
-            fit.stop_reason = StopReason.FAILED
-            yield start
-        else:
-            fit.offsets = ended
-
-    def _assess(self, problem: FrameProblem, point: Point) -> Assessment:
-        """The verdict on a point."""
-        return assess(problem.evidence(point.offsets, point.evaluation.loss))
 
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""
@@ -242,8 +219,8 @@ class FrameOptimizer:
         ended = self.stop_reason not in (None, StopReason.CANCELLED, StopReason.NOT_OPTIMIZED)
         if not ended or self._free.base_frames or not isinstance(self._problem, FrameProblem):
             return None
-        assert self._best_point is not None
-        return base_frame_gain(self._problem, self._best_point.offsets, self._free)
+        assert self._fit.best is not None
+        return base_frame_gain(self._problem, self._fit.best.offsets, self._free)
 
     def _iterate(self, point: Point, seconds: float) -> Iterate:
         evaluation: Evaluation = point.evaluation
@@ -252,7 +229,6 @@ class FrameOptimizer:
             index=len(self.history),
             state=self._variables.state(point.offsets).detached(),
             loss=evaluation.loss,
-            terms={"similarity": evaluation.value - evaluation.prior, "prior": evaluation.prior},
             gradient_norms=dict(zip(self._variables.names, evaluation.gradient.abs().tolist(), strict=True)),
             seconds=seconds,
             arm_names=self._arm_names,

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -72,10 +74,11 @@ class FrameProblem:
         live: bool = True,
     ) -> None:
         self.scene, self.variables, self.settings = scene, variables, settings
-        self.prior, self._further = prior or variables.prior(settings), tuple(factors)
+        self.prior = prior or variables.prior(settings)
+        self._other_factors: tuple[Factor, ...] = (self.prior, *factors)
         self.predictor, self._backgrounds, self._live = predictor, backgrounds, live
-        self._given: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]] = images, ignore or {}
-        self._ignore = ignore or {}
+        self._observed, self._given_ignore = images, ignore or {}
+        self._ignore = self._given_ignore
         self._images: dict[float, FrameImages] = {}
         self._replaced: bool | None = None
         self._evidence: tuple[Tensor, Evidence] | None = None
@@ -107,7 +110,8 @@ class FrameProblem:
         if scale not in self._images:
             self._images[scale] = FrameImages.of(
                 self.scene,
-                *self._given,
+                self._observed,
+                self._ignore,
                 scale=scale,
                 working_width=self.settings.working_width,
                 dehaze=self.settings.dehaze,
@@ -125,14 +129,13 @@ class FrameProblem:
     def reset(self) -> None:
         """Drop the observation, the proposed ignore mask and the other treatment of the background."""
         if self.proposed or self._replaced is not None:
-            self._given, self._images, self._edges = (self._given[0], self._ignore), {}, None
+            self._ignore, self._images, self._edges = self._given_ignore, {}, None
         self._replaced = self._evidence = None
         self._observation, self._factors, self.observations, self.proposed = None, {}, 0, {}
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"], *, whole: bool = False) -> None:
         """Have surface maps of the images predicted, conditioned on the start or on an estimate."""
-        given = self.start if stage.given is Given.START else offsets
-        state = self.variables.state(given)
+        state = self.variables.state(self.start if stage.given is Given.START else offsets)
         self.observation = observe(self.images(stage.scale), self.predictor, state, stage, whole=whole)
 
     def ignore_occluders(self, evaluation: Evaluation) -> bool:
@@ -140,9 +143,8 @@ class FrameProblem:
         silhouette, similarity = evaluation.silhouette.cpu().numpy(), evaluation.similarity.cpu().numpy()
         self.proposed = propose_ignore(self.scene, silhouette, similarity)
         if self.proposed:
-            images, given = self._given
-            masks = {name: mask | given.get(name, False) for name, mask in self.proposed.items()}
-            self._given, self._images, self._edges = (images, {**given, **masks}), {}, None
+            masks = {name: mask | self._ignore.get(name, False) for name, mask in self.proposed.items()}
+            self._ignore, self._images, self._edges = {**self._ignore, **masks}, {}, None
             self._evidence = None
         return bool(self.proposed)
 
@@ -162,28 +164,27 @@ class FrameProblem:
     @torch.no_grad()
     def costs(self, offsets: Float[Tensor, "batch n"], stage: Descend) -> Float[Tensor, " batch"]:
         """The objective at each of a batch of points, as a stage compares it."""
-        costs = self.factor(stage).costs(offsets) + self.prior.costs(offsets)
-        for factor in self._further:
-            costs = costs + factor.costs(offsets)
-        return costs
+        return self.factor(stage).costs(offsets) + self.other_costs(offsets)
+
+    def other_costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
+        """The cost of all factors but the surface factor at each of a batch of points."""
+        return torch.stack([factor.costs(offsets) for factor in self._other_factors]).sum(0)
 
     @torch.no_grad()
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:
         """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
         factor = self.factor(stage)
-        given = self.prior.linearize(offsets)
-        for further in self._further:
-            given = given + further.linearize(offsets)
+        others = reduce(add, (other.linearize(offsets) for other in self._other_factors))
         slope, hessian, known = torch.zeros_like(offsets), None, None
         if gradient:
             surface = factor.linearize(offsets)
-            compared, total = surface.comparison, given + surface
+            compared, total = surface.comparison, others + surface
             slope, hessian = total.gradient, total.hessian
             if self.prior.informs_all:
                 known = uncertainty(
                     self.variables.names,
                     total.hessian,
-                    self.prior.marginal,
+                    self.prior.marginal_precision,
                     self.variables.scales,
                     self.settings.outline_error * surface.outline,
                 )
@@ -197,10 +198,9 @@ class FrameProblem:
         empty = coverage.new_zeros(len(coverage), shown.size[1], shown.size[0])
         paste = shown.window.paste
         return Evaluation(
-            value=compared.pixels / factor.noise**2 + given.cost,
+            value=compared.pixels / factor.noise**2 + others.cost,
             loss=self._loss(shown, final),
             stage_loss=self._loss(factor, compared),
-            prior=given.cost,
             gradient=slope,
             hessian=hessian,
             uncertainty=known,
@@ -265,9 +265,9 @@ class FrameProblem:
         if self._edges is None:
             self._edges = EdgeFactor(
                 self.scene,
-                self._given[0],
+                self._observed,
                 self.variables,
-                self._given[1],
+                self._ignore,
                 working_width=self.settings.working_width,
                 dehaze=self.settings.dehaze,
                 device=self.predictor.device,

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Verdict = Literal["determined", "weak", "not visible"]
+Observability = Literal["determined", "weak", "not visible"]
 
 _DETERMINED, _VISIBLE = 1 / 3, 0.9
 
@@ -29,7 +29,7 @@ class Uncertainty:
     expected: tuple[float, ...]
     """The same before the image was used."""
 
-    def verdict(self, name: str) -> Verdict:
+    def observability(self, name: str) -> Observability:
         """Whether the image determined an unknown: it has become three times as certain, a little, or not at all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index]

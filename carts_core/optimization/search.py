@@ -43,7 +43,7 @@ def best_random_start(
         seed: of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
-    deviation = stage.deviation * problem.prior.marginal.rsqrt().cpu()
+    deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()
     problem.observe(Observe(scale=stage.scale, given=Given.START, haze=False), offsets, whole=True)
     best = offsets
     for group in problem.variables.groups:
@@ -72,8 +72,10 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
         return False
     problem.observe(Observe(given=Given.START), offsets)
     points = torch.stack([start, offsets])
-    at_start, at_estimate = problem.factor(FINEST).costs(points).tolist()
-    gain = at_start - at_estimate + float(problem.prior.costs(start) - problem.prior.costs(offsets))
+    image_costs = problem.factor(FINEST).costs(points)
+    at_start, at_estimate = image_costs.tolist()
+    start_objective, estimate_objective = (image_costs + problem.other_costs(points)).tolist()
+    gain = start_objective - estimate_objective
     as_well = gain < stage.improvement and at_start < stage.ratio * at_estimate
     if not as_well:
         problem.observation = before

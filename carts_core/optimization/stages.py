@@ -18,6 +18,7 @@ from ..settings.stages import (
     OtherBackground,
     PreferStart,
     RandomRestart,
+    RejectFailed,
     SilhouetteSearch,
     Stage,
 )
@@ -34,9 +35,12 @@ from .verdict import Verdict, assess
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
     """Run stages one after another; yields every point that is evaluated on the way."""
     for stage in stages:
-        if fit.exhausted:
-            return
-        yield from run_stage(stage, fit)
+        if fit.exhausted and not isinstance(stage, RejectFailed):
+            continue
+        for point in run_stage(stage, fit):
+            if point.improves_on(fit.best):
+                fit.best = point
+            yield point
 
 
 @singledispatch
@@ -46,13 +50,15 @@ def run_stage(stage: object, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
-def _(stage: Observe, fit: Fit) -> Iterator[Point]:
+def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
+    """Have the surface maps predicted, conditioned on the start or on the estimate."""
     fit.problem.observe(stage, fit.offsets)
     yield from ()
 
 
 @run_stage.register
-def _(stage: Descend, fit: Fit) -> Iterator[Point]:
+def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
+    """Levenberg-Marquardt on the objective under one blur, until the predicted reduction is small."""
     # After a restart nothing is left to later stages.
     tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
     best, rejections = None, 0
@@ -79,26 +85,30 @@ def _(stage: Descend, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
-def _(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
+def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
+    """Where the loss is high or an arm is lost: go on from the best of random points."""
     problem = _one_frame(fit)
     if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
-        fit.restart(best_random_start(problem, fit.offsets, stage))
+        fit.jump_to(best_random_start(problem, fit.offsets, stage))
         yield from run_stages(stage.then, fit)
 
 
 @run_stage.register
-def _(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
+def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
+    """Where given masks are far off: go on from where silhouettes are nearest to them."""
     problem = fit.problem
     assert isinstance(problem, FrameProblem | CalibrationProblem), "a stage of the surface solver"
     if problem.masked and problem.silhouette_overlap(fit.offsets, stage.scale) < stage.if_overlap:
-        fit.restart(problem.search_silhouettes(stage))
+        fit.jump_to(problem.search_silhouettes(stage))
     yield from ()
 
 
 @run_stage.register
-def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
+def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
+    """Draw outlines to the image's edges, from the best point of the descent before."""
     assert fit.reached is not None, "AlignEdges follows a Descend"
     if _one_frame(fit).predictor.masked:
+        # The descent has led one step beyond the best point, which nothing would evaluate before the end.
         fit.offsets = fit.reached.offsets
         return
     fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
@@ -106,14 +116,16 @@ def _(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
-def _(stage: PreferStart, fit: Fit) -> Iterator[Point]:
+def run_prefer_start(stage: PreferStart, fit: Fit) -> Iterator[Point]:
+    """Go back to the start where it explains the image as well."""
     if start_explains_as_well(_one_frame(fit), fit.offsets, stage):
         fit.offsets, fit.stop_reason = torch.zeros_like(fit.offsets), StopReason.START_KEPT
     yield from ()
 
 
 @run_stage.register
-def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
+def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
+    """Evaluate the estimate for the record."""
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
@@ -126,15 +138,16 @@ def _(stage: Evaluate, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
-def _(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
+def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
+    """Where the fit failed: run again with the background treated the other way, and keep the better one."""
     problem = _one_frame(fit)
     before = problem.evidence_at(fit.offsets)
     known = assess(before)
     if before.overlap_with_change is None or known.verdict is not Verdict.FAILED or known.nothing_there:
         return
-    kept, observation = fit.found(), problem.observation
+    first_run, observation = fit.snapshot(), problem.observation
     problem.treat_background_otherwise()
-    fit.begin_again(problem.start)
+    fit.start_over(problem.start)
     yield from run_stages(stage.then, fit)
     after = problem.evidence_at(fit.offsets)
     assert after.overlap_with_change is not None
@@ -142,19 +155,40 @@ def _(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
     if not better:
         problem.treat_background_otherwise()
         problem.observation = observation
-        fit.recall(kept)
+        fit.restore(first_run)
 
 
 @run_stage.register
-def _(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
+def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
+    """Judge the best point; where it failed, go back to the start if that fits better, or nothing is there."""
+    problem, found = _one_frame(fit), fit.best
+    if found is None:
+        return
+    fit.assessment = assess(problem.evidence(found.offsets, found.evaluation.loss))
+    if fit.assessment.verdict is not Verdict.FAILED or not bool(found.offsets.any()):
+        return
+    estimate, fit.offsets = fit.offsets, problem.start
+    start = replace(fit.evaluate(FINEST), objective_key=(*found.objective_key, "start"))
+    at_start = assess(problem.evidence(start.offsets, start.evaluation.loss))
+    if fit.assessment.nothing_there or at_start.probability <= fit.assessment.probability:
+        fit.stop_reason = StopReason.FAILED
+        yield start
+    else:
+        fit.offsets = estimate
+
+
+@run_stage.register
+def run_ignore_occluders(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
+    """Leave out pixels that contradict the fit, and run again."""
     problem = _one_frame(fit)
     if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
-        fit.begin_again(problem.start)
+        fit.start_over(problem.start)
         yield from run_stages(stage.then, fit)
 
 
 @run_stage.register
-def _(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
+def run_first_order(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
+    """Steps of a first-order method on a loss of image features."""
     problem = fit.problem
     assert isinstance(problem, FeatureProblem)
     settings, planned = problem.settings, problem.settings.iterations

@@ -31,6 +31,7 @@ from .stages import IgnoreOccluders as IgnoreOccluders
 from .stages import Observe as Observe
 from .stages import PreferStart as PreferStart
 from .stages import RandomRestart as RandomRestart
+from .stages import RejectFailed as RejectFailed
 from .stages import Stage as Stage
 from .synthesis import DOMAINS as DOMAINS
 from .synthesis import DomainConfig as DomainConfig

@@ -54,7 +54,7 @@ class SurfaceSolver:
     stages: tuple[Stage, ...] = presets.FRAME
     """What runs, in this order."""
     iterations: int = 60
-    """Largest number of steps of all stages [1]."""
+    """Largest number of evaluations [1]; where stages run again from the start, they have as many again."""
     working_width: int = 320
     """Width of the working image [px]; stages say how many times larger their images are."""
     noise: float = 1.33

@@ -14,6 +14,7 @@ from .stages import (
     OtherBackground,
     PreferStart,
     RandomRestart,
+    RejectFailed,
     SilhouetteSearch,
     Stage,
 )
@@ -43,13 +44,15 @@ SEARCH: tuple[Stage, ...] = (
 _FITTED: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST)
 _ALONE: tuple[Stage, ...] = (*_FITTED, AlignEdges(), PreferStart())
 
-FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate())
+FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate(), RejectFailed())
 """One frame alone: the default."""
 
-OCCLUDED: tuple[Stage, ...] = (*_FITTED, IgnoreOccluders(then=_FITTED), AlignEdges(), PreferStart(), Evaluate())
+OCCLUDED: tuple[Stage, ...] = (
+    *(*_FITTED, IgnoreOccluders(then=_FITTED), AlignEdges(), PreferStart(), Evaluate(), RejectFailed()),
+)
 """One frame alone, run again without pixels that probably show an occluder."""
 
-NONE: tuple[Stage, ...] = (Observe(), Evaluate())
+NONE: tuple[Stage, ...] = (Observe(), Evaluate(), RejectFailed())
 """Nothing moves: the start is compared ("CaRTS without optimization")."""
 
 COLD: tuple[Stage, ...] = (*SEARCH, Observe(), FINEST)

@@ -176,6 +176,12 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class RejectFailed:
+    """Judge the best point: good, doubtful or failed. Where it failed, go back to the start, unless the image
+    contradicts that even more."""
+
+
+@dataclass(frozen=True)
 class FirstOrder:
     """Gradient descent on a loss of image features, as in the paper."""
 
@@ -202,6 +208,7 @@ Stage = (
     | OtherBackground
     | IgnoreOccluders
     | Evaluate
+    | RejectFailed
     | FirstOrder
 )
 

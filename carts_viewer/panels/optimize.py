@@ -90,8 +90,9 @@ def undetermined_lines(state: ViewState, session: Session) -> str:
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
     lines = []
-    for verdict, meaning in (("weak", "Weakly determined by this image"), ("not visible", UNDETERMINED)):
-        names = [_spoken(name) + _moved(name, state, session) for name in known.names if known.verdict(name) == verdict]
+    for how, meaning in (("weak", "Weakly determined by this image"), ("not visible", UNDETERMINED)):
+        these = [name for name in known.names if known.observability(name) == how]
+        names = [_spoken(name) + _moved(name, state, session) for name in these]
         if names:
             lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
     return "".join(lines)

@@ -202,3 +202,8 @@ def test_a_urdf_that_xacro_made_is_no_xacro_though_it_declares_the_namespace(tmp
     expanded = shipped_robot().read_text().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     (tmp_path / "arm.urdf").write_text(expanded.replace("meshes/", f"{shipped_robot().parent}/meshes/"))
     assert len(Robot.load(tmp_path / "arm.urdf").meshes) == len(Robot.load(shipped_robot()).meshes)
+
+
+def test_a_link_that_is_not_there_is_said_with_those_that_are(shipped_psm: Robot) -> None:
+    with pytest.raises(RobotError, match=r"no link 'tip'\. Its links are: .*tool_tip_link"):
+        shipped_psm.link_transform(torch.zeros(len(shipped_psm.joint_names)), "tip")

@@ -39,7 +39,7 @@ class Bowl:
         slope = offsets - self.minimum
         value = self.floor + 0.5 * float(slope @ slope)
         empty = torch.zeros(1, 1, 1)
-        return Evaluation(value, value, value, 0.0, slope, torch.eye(len(offsets)), None, *(empty,) * 4)
+        return Evaluation(value, value, value, slope, torch.eye(len(offsets)), None, *(empty,) * 4)
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_descent_ends_when_no_more_than_its_tolerance_is_to_be_gained(variable
 
 def test_after_a_restart_coarse_stages_end_as_late_as_fine_ones(variables: Variables) -> None:
     fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
-    fit.restart(torch.zeros_like(variables.lower))
+    fit.jump_to(torch.zeros_like(variables.lower))
     assert len(list(run_stage(Descend(1.0, tolerance=0.06), fit))) > 1
 
 

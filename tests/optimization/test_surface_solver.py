@@ -333,7 +333,7 @@ def test_what_is_not_in_the_image_stays_and_is_unknown(sequence: Sequence, predi
     list(optimizer)
     best = optimizer.best
     assert best is not None and best.uncertainty is not None
-    assert best.uncertainty.verdict("PSM1/yaw") == "determined"
+    assert best.uncertainty.observability("PSM1/yaw") == "determined"
     std = best.joint_std()["PSM1"]
     assert std.shape == truth.shape and (std > 0).all()
     assert std[2] < 0.15 * np.deg2rad(3.0), "an insertion is in metres"
@@ -342,7 +342,7 @@ def test_what_is_not_in_the_image_stays_and_is_unknown(sequence: Sequence, predi
     blind = FrameOptimizer(sequence.scene, frame, {}, predictor, start=away, settings=SurfaceSolver())
     list(blind)
     assert blind.best is not None and blind.best.uncertainty is not None
-    assert blind.best.uncertainty.verdict("PSM1/wrist_yaw") == "not visible"
+    assert blind.best.uncertainty.observability("PSM1/wrist_yaw") == "not visible"
     assert np.allclose(blind.best.joint_positions()["PSM1"], away["PSM1"], atol=1e-4)
 
 

@@ -108,7 +108,7 @@ def visible_joints(
         arm: tuple(
             joint
             for joint in joints
-            if f"{arm}/{joint}" in known.names and known.verdict(f"{arm}/{joint}") == "determined"
+            if f"{arm}/{joint}" in known.names and known.observability(f"{arm}/{joint}") == "determined"
         )
         for arm, joints in measured_joints.items()
     }

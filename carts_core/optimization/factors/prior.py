@@ -37,7 +37,7 @@ class Prior:
         return Linearization(float(self.costs(offsets)), self.gradient(offsets), self.precision)
 
     @property
-    def marginal(self) -> Float[Tensor, " n"]:
+    def marginal_precision(self) -> Float[Tensor, " n"]:
         """Inverse variance of each unknown [1/rad^2]."""
         return 1.0 / torch.linalg.inv(self.precision.double()).diagonal().to(self.precision)
 

@@ -66,25 +66,25 @@ class SurfaceFactor:
     ) -> None:
         images = observation.images
         blur *= images.scale
-        factor = max(f for f in _REDUCTIONS if f == 1 or blur / f >= _SMALLEST_BLUR)
-        self._variables, self._blur, self._robust = variables, blur / factor, robust
-        self.area = (factor / images.scale) ** 2
+        reduction = max(r for r in _REDUCTIONS if r == 1 or blur / r >= _SMALLEST_BLUR)
+        self._variables, self._blur, self._robust = variables, blur / reduction, robust
+        self.area = (reduction / images.scale) ** 2
         self.noise = settings.mask_noise if observation.masked else settings.noise
         self._precision = self.area / self.noise**2
-        self.size = images.size[0] // factor, images.size[1] // factor
-        self.window = observation.window.reduced(factor)
+        self.size = images.size[0] // reduction, images.size[1] // reduction
+        self.window = observation.window.reduced(reduction)
         device = observation.maps.device
         self.renderer = Renderer(
             scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=device
         )
-        self._weight = functional.avg_pool2d(observation.weight, factor)
-        self.certainty = functional.avg_pool2d(observation.certainty, factor)
+        self._weight = functional.avg_pool2d(observation.weight, reduction)
+        self.certainty = functional.avg_pool2d(observation.certainty, reduction)
         self._total_only = not observation.knows_parts
-        self._observed = self._blurred(functional.avg_pool2d(observation.maps * observation.weight, factor))
+        self._observed = self._blurred(functional.avg_pool2d(observation.maps * observation.weight, reduction))
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=device)
         self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
-        # Parts and normals are the network's, whoever knows the whole.
+        # Parts and normals are predicted by the network even where a given mask says what the arm covers.
         self._channels[1:] *= (self.noise / settings.noise) ** 2
         if self._total_only:
             self._channels = self._channels[: COVERAGE.start + 1]
@@ -187,7 +187,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class SurfaceLinearization(Linearization):
-    """The quadratic model, and what it was made from."""
+    """The quadratic model, and the comparison that gave it."""
 
     comparison: Comparison
     outline: Float[Tensor, " n"]
