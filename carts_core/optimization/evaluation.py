@@ -1,11 +1,13 @@
 """A problem evaluated at one point: the objective, its quadratic model, and the rendered images."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from jaxtyping import Float
 from torch import Tensor
 
-from .observability import Uncertainty
+from .factors import Prior
+from .observability import Uncertainty, expected_scale, uncertainty
+from .variables import Variables
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Evaluation:
     hessian: Float[Tensor, "n n"] | None
     """Gauss-Newton's approximation of the second derivative of `value`; None where there is none."""
     uncertainty: Uncertainty | None
-    """Standard deviations that follow from the hessian."""
+    """Standard deviations that follow from the hessian, for errors as large as expected."""
     image: Float[Tensor, "cameras 3 h w"]
     """Rendered arms, RGB, black elsewhere."""
     silhouette: Float[Tensor, "cameras h w"]
@@ -32,3 +34,19 @@ class Evaluation:
     """At most 1; 1 where nothing was compared."""
     attention: Float[Tensor, "cameras h w"]
     """Weight of each pixel, in [0, 1]."""
+    common: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
+    """What the gradient is off by for one standard deviation of an error that all pixels share; None as the hessian."""
+
+    def final_uncertainty(self, offsets: Float[Tensor, " n"], variables: Variables, prior: Prior) -> Uncertainty | None:
+        """Deviations where a fit has ended, for errors of the start as large as what it has corrected makes likely.
+
+        Args:
+            offsets: where it has ended, near this point.
+            variables: the unknowns.
+            prior: of their offsets.
+        """
+        if self.hessian is None or self.common is None or self.uncertainty is None:
+            return None
+        scale = expected_scale(offsets - prior.mean, self.hessian - prior.precision, prior.precision)
+        later = uncertainty(variables, prior, self.hessian, self.common, scale)
+        return later and self.uncertainty.scaled(later)

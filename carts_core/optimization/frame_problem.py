@@ -175,19 +175,13 @@ class FrameProblem:
         """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
         factor = self.factor(stage)
         others = reduce(add, (other.linearize(offsets) for other in self._other_factors))
-        slope, hessian, known = torch.zeros_like(offsets), None, None
+        slope, hessian, common, known = torch.zeros_like(offsets), None, None, None
         if gradient:
             surface = factor.linearize(offsets)
             compared, total = surface.comparison, others + surface
             slope, hessian = total.gradient, total.hessian
-            if self.prior.informs_all:
-                known = uncertainty(
-                    self.variables.names,
-                    total.hessian,
-                    self.prior.marginal_precision,
-                    self.variables.scales,
-                    self.settings.outline_error * surface.outline,
-                )
+            common = self.settings.outline_error * surface.outline
+            known = uncertainty(self.variables, self.prior, hessian, common)
         else:
             compared = factor.compare(offsets)
         shown, final = factor, compared
@@ -203,6 +197,7 @@ class FrameProblem:
             stage_loss=self._loss(factor, compared),
             gradient=slope,
             hessian=hessian,
+            common=common,
             uncertainty=known,
             image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
             silhouette=paste(coverage, empty.clone()),
@@ -262,6 +257,14 @@ class FrameProblem:
     ) -> tuple[Float[Tensor, " n"], Linearization]:
         """Outlines drawn to edges from a point whose evaluation is known; see `align_edges`."""
         assert known.hessian is not None
+        model = Linearization(known.value, known.gradient, known.hessian)
+        return align_edges(self._edge_factor(), stage, offsets, model, self.observation.whole_coverage())
+
+    def edge_distance(self, offsets: Float[Tensor, " n"]) -> float:
+        """How far outlines are from edges at a point; see `EdgeFactor.cost`."""
+        return self._edge_factor().near(offsets, self.observation.whole_coverage(), AlignEdges.weight).cost()
+
+    def _edge_factor(self) -> EdgeFactor:
         if self._edges is None:
             self._edges = EdgeFactor(
                 self.scene,
@@ -272,5 +275,4 @@ class FrameProblem:
                 dehaze=self.settings.dehaze,
                 device=self.predictor.device,
             )
-        model = Linearization(known.value, known.gradient, known.hessian)
-        return align_edges(self._edges, stage, offsets, model, self.observation.whole_coverage())
+        return self._edges

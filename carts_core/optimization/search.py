@@ -59,7 +59,7 @@ def best_random_start(
 
 @torch.no_grad()
 def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
-    """Whether the start explains an observation that is conditioned on it as well as the estimate does.
+    """Whether the start explains an observation that is conditioned on it as well as the estimate does, and edges, too.
 
     Where silhouettes differ much it does not, and nothing is observed. Where it does, that observation becomes the
     problem's. A start is never preferred where a calibration is free: that is thought to be wrong.
@@ -77,6 +77,8 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
     start_objective, estimate_objective = (image_costs + problem.other_costs(points)).tolist()
     gain = start_objective - estimate_objective
     as_well = gain < stage.improvement and at_start < stage.ratio * at_estimate
+    if as_well and not problem.masked:
+        as_well = problem.edge_distance(start) < stage.edges * problem.edge_distance(offsets)
     if not as_well:
         problem.observation = before
     return as_well

@@ -29,7 +29,7 @@ from .frame_problem import FrameProblem
 from .search import arm_is_lost, best_random_start, start_explains_as_well
 from .solvers import FirstOrderDescent
 from .solvers.levenberg_marquardt import REJECTIONS
-from .verdict import Verdict, assess
+from .verdict import Assessment, Verdict, assess
 
 
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
@@ -131,7 +131,10 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     if known is not None and not kept:
         # Edges have no deviation of their own: that of the descent before stands.
         before = known.evaluation
-        evaluation = replace(point.evaluation, gradient=before.gradient, uncertainty=before.uncertainty)
+        evaluation = replace(point.evaluation, gradient=before.gradient)
+        if isinstance(fit.problem, FrameProblem):
+            deviations = before.final_uncertainty(fit.offsets, fit.problem.variables, fit.problem.prior)
+            evaluation = replace(evaluation, uncertainty=deviations)
         point = replace(point, evaluation=evaluation)
     # It is what counts in the end, whatever its loss, in which edges have no part.
     yield replace(point, objective_key=(*point.objective_key, "end"))
@@ -164,17 +167,26 @@ def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
     problem, found = _one_frame(fit), fit.best
     if found is None:
         return
-    fit.assessment = assess(problem.evidence(found.offsets, found.evaluation.loss))
-    if fit.assessment.verdict is not Verdict.FAILED or not bool(found.offsets.any()):
+    verdict = fit.assessment = assess(problem.evidence(found.offsets, found.evaluation.loss))
+    if verdict.verdict is Verdict.GOOD or fit.stop_reason is StopReason.NOT_OPTIMIZED:
         return
-    estimate, fit.offsets = fit.offsets, problem.start
-    start = replace(fit.evaluate(FINEST), objective_key=(*found.objective_key, "start"))
-    at_start = assess(problem.evidence(start.offsets, start.evaluation.loss))
-    if fit.assessment.nothing_there or at_start.probability <= fit.assessment.probability:
-        fit.stop_reason = StopReason.FAILED
-        yield start
-    else:
+    if verdict.verdict is Verdict.FAILED and bool(found.offsets.any()):
+        estimate, fit.offsets = fit.offsets, problem.start
+        start = fit.evaluate(FINEST)
+        at_start = assess(problem.evidence(start.offsets, start.evaluation.loss))
+        if verdict.nothing_there or at_start.probability <= verdict.probability:
+            fit.stop_reason = StopReason.FAILED
+            yield _judged(replace(start, objective_key=(*found.objective_key, "start")), verdict)
+            return
         fit.offsets = estimate
+    yield _judged(replace(found, objective_key=(*found.objective_key, "judged")), verdict)
+
+
+def _judged(point: Point, verdict: Assessment) -> Point:
+    """A point with deviations that allow for a wrong fit."""
+    if (known := point.evaluation.uncertainty) is None:
+        return point
+    return replace(point, evaluation=replace(point.evaluation, uncertainty=verdict.of(known)))
 
 
 @run_stage.register

@@ -14,6 +14,7 @@ from ..model.scene import SceneState
 from ..model.surface import COVERAGE
 from .frame_images import FrameImages
 from .losses import attention
+from .observability import Uncertainty
 from .predictor import FramePredictor
 
 _MARGIN, _NEAR = 16, 8
@@ -132,6 +133,15 @@ class Assessment:
     evidence: Evidence
     nothing_there: bool = False
     """Whether no arm is in view or seen at all, so that nothing could be fitted."""
+
+    def of(self, known: Uncertainty) -> Uncertainty:
+        """What is known after the verdict, from what the curvature of the objective says.
+
+        A good fit is taken at its word, of a failed one nothing is known beyond what was expected before.
+        """
+        if self.verdict is Verdict.GOOD:
+            return known
+        return known.doubted(self.probability if self.verdict is Verdict.DOUBTFUL else 1.0)
 
 
 def assess(found: Evidence) -> Assessment:

@@ -67,7 +67,7 @@ class SurfaceSolver:
     """Weight of normals beside that [1]."""
     dehaze: float = 0.8
     """Share of smoke and haze that is taken off images [1]; 0 leaves images as they are."""
-    outline_error: float = 0.5
+    outline_error: float = 0.3
     """Expected error that all outlines in an image have in common, outwards or inwards [px of the working image].
     It widens the reported deviations of what moves an arm along the line of sight."""
     prior_deg: float = 2.5

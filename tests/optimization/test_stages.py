@@ -14,6 +14,7 @@ from carts_core.optimization import FreeParameters
 from carts_core.optimization.evaluation import Evaluation
 from carts_core.optimization.fit import Fit, StopReason
 from carts_core.optimization.frame_problem import FrameProblem
+from carts_core.optimization.search import start_explains_as_well
 from carts_core.optimization.stages import run_stage, run_stages
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
@@ -146,6 +147,23 @@ def test_a_random_restart_happens_only_where_the_fit_is_bad(tiny_sequence: Calla
     again = frame_fit(tiny_sequence, Free(), np.zeros(7))
     list(run_stages((Observe(), Descend(3.0), replace(restart, if_loss=0.0)), again))
     assert again.restarts == 1
+
+
+def test_a_start_that_edges_contradict_is_not_preferred_however_little_the_network_says(
+    tiny_sequence: Callable[..., Path],
+) -> None:
+    def kept(off: np.ndarray, edges: float) -> bool:
+        fit = frame_fit(tiny_sequence, Free(), off)
+        assert isinstance(fit.problem, FrameProblem)
+        fit.problem.observe(Observe(), fit.offsets)
+        right = -torch.from_numpy(off).to(fit.offsets)
+        # Neither the gain nor the ratio of what the network says counts here.
+        says_nothing = PreferStart(improvement=1e6, ratio=100.0, overlap=0.5, edges=edges)
+        return start_explains_as_well(fit.problem, right, says_nothing)
+
+    off = np.deg2rad([0.7, -0.7, 0, 0, 0, 0, 0])
+    assert kept(off, edges=100.0) and not kept(off, edges=PreferStart.edges)
+    assert kept(np.zeros(7), edges=PreferStart.edges), "it is where the estimate is"
 
 
 def test_the_start_is_never_preferred_where_a_calibration_is_free(tiny_sequence: Callable[..., Path]) -> None:

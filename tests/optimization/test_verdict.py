@@ -12,6 +12,7 @@ from carts_core.cli.hints import verdict_hints
 from carts_core.evaluation import evaluate
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, SurfaceSolver, Verdict
+from carts_core.optimization.observability import Uncertainty
 from carts_core.optimization.verdict import assess
 from carts_core.recording import Sequence
 
@@ -69,6 +70,14 @@ def test_a_verdict_grows_worse_with_the_evidence() -> None:
     assert levels == sorted(levels) and set(levels) == {0, 1, 2}
 
 
+def test_a_doubtful_fit_widens_the_deviations_and_of_a_failed_one_the_expected_ones_are_left() -> None:
+    known = Uncertainty(("PSM1/yaw", "PSM1/jaw"), (0.01, 0.04), (0.05, 0.05))
+    half = replace(assess(CONVINCING), verdict=Verdict.DOUBTFUL, probability=0.36)
+    assert assess(CONVINCING).of(known) == known
+    np.testing.assert_allclose(half.of(known).std, np.sqrt([0.64 * 0.01**2 + 0.36 * 0.05**2, 0.64 * 0.04**2 + 9e-4]))
+    assert assess(CONTRADICTED).of(known).std == pytest.approx(known.expected)
+
+
 @pytest.mark.parametrize("shown", ["black", "background"])
 def test_where_no_arm_is_seen_the_measured_joints_are_kept_and_the_frame_is_marked(
     shipped: Sequence, extractor: FeatureExtractor, shown: str
@@ -80,7 +89,8 @@ def test_where_no_arm_is_seen_the_measured_joints_are_kept_and_the_frame_is_mark
     list(optimizer)
     found = optimizer.assessment
     assert found is not None and found.verdict is Verdict.FAILED and found.reason and found.remedy
-    assert optimizer.best is not None
+    assert optimizer.best is not None and optimizer.best.uncertainty is not None
+    assert optimizer.best.uncertainty.std == pytest.approx(optimizer.best.uncertainty.expected)
     for arm, joints in optimizer.best.joint_positions().items():
         assert np.allclose(joints, frame.measured[arm], atol=1e-6)
 

@@ -17,6 +17,7 @@ from torch.nn import functional
 from ...imaging.haze import certainty, dehazed, transmission
 from ...model.scene import Scene
 from ...rendering import Outline, Renderer
+from ...threads import total
 from ..inputs import pixel_weights, smoothed, stacked_images, working_size
 from ..losses import attention
 from ..variables import APART, Variables
@@ -113,6 +114,17 @@ class EdgeFactor:
         cost = 0.5 * edge_weight * float((weight * distance.square()).sum())
         return Linearization(cost, -weighted @ distance, weighted @ outline.motion.T)
 
+    def cost(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> float:
+        """How far outlines are from edges: robust squared distances, summed [px^2].
+
+        A pixel without an edge costs as much as one far away, so that poses compare.
+        """
+        distance, found = self._nearest(outline)
+        column, row = outline.position.round().long()
+        weight = counts[outline.camera, 0, row, column] * self._share[outline.parts]
+        squared = distance.square() / (1.0 + (distance / _ROBUST).square())
+        return total(weight * (found * squared + (1.0 - found) * _ROBUST**2))
+
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Distance to the edge along the outward normal [px], and 1 where there is one, 0 elsewhere."""
         strength = self._strength(outline) * self._expected[:, None]
@@ -157,6 +169,10 @@ class LocalEdgeFactor:
         if self._outline.moved_by(offsets - self._rendered_at) > _RENDERED_ANEW:
             self._render(offsets)
         return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
+
+    def cost(self) -> float:
+        """How far the outlines that were rendered last are from edges; see `EdgeFactor.cost`."""
+        return self._factor.cost(self._outline, self._counts)
 
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
         """How far outlines move with a step [px]."""
