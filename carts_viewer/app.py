@@ -62,6 +62,7 @@ class ViewerApp:
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
         page: Page | None = None,
+        folders: tuple[Path, ...] = (),
     ) -> None:
         """Start serving an open sequence with its project, which is closed with the viewer; the rest as in `open`."""
         self._report = report
@@ -71,7 +72,7 @@ class ViewerApp:
         self.scene = sequence.scene
         self.project = storage.project
         self._storage = storage
-        self._session = Session(sequence, storage.project)
+        self._session = Session(sequence, storage.project, folders)
         self._renderer = OverlayRenderer(sequence, device)
         state = self._first_state()
         self.queue = IntentQueue()
@@ -110,6 +111,7 @@ class ViewerApp:
         weights: tuple[Path, ...] = (),
         report: Report = lambda line: None,
         page: Page | None = None,
+        folders: tuple[Path, ...] = (),
     ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
 
@@ -123,6 +125,7 @@ class ViewerApp:
             weights: Weights files; a network that none is given of is the shipped one.
             report: Called with a line about what takes long.
             page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
+            folders: From where masks may be imported, besides the sequence's own folder.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.

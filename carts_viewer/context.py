@@ -6,8 +6,9 @@ from typing import Any, Protocol
 
 from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
-from carts_core.project import Edits, Figures, Provenance, Source
+from carts_core.project import Edits, Figures, Kind, Provenance, Source
 from carts_core.project.keys import WHOLE_PROJECT
+from carts_viewer.imported import with_imported
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState
@@ -137,17 +138,26 @@ class Context:
             self.change(pose=pose, scores=None, maps=None)
             self._measure_pins()
         self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
-        if self.state.mask_correction != before.mask_correction:
+        if self._truths(self.state) != self._truths(before):
             self.change(scores=None)
         if self.state.ignore_region != before.ignore_region:
             self.change(maps=None)
+
+    @staticmethod
+    def _truths(state: ViewState) -> tuple[object, ...]:
+        """What scores depend on besides the pose: the corrected mask, and masks of others."""
+        record = state.project.records.get(state.index)
+        entries = {} if record is None else record.entries
+        others = [entry.value for key, entry in entries.items() if key.kind is Kind.IMPORTED_MASK]
+        return state.mask_correction, *others
 
     def score(self) -> None:
         """Compare the pose with the truth, if that was not done yet; the project keeps the first figures it gets."""
         state = self.state
         if state.scores is not None:
             return
-        scores = self.renderer.scores(state.pose.scene, state.frame, state.camera, state.mask_correction)
+        frame = with_imported(state.frame, self.session.scene, self._editor.view)
+        scores = self.renderer.scores(state.pose.scene, frame, state.camera, state.mask_correction)
         self.change(scores=scores)
         project = self._editor.project
         known = scores.dice is None or state.unsaved or project.state.figures(state.index) is not None

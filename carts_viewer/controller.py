@@ -16,6 +16,7 @@ from carts_viewer.handlers.annotating import AnnotatingHandler
 from carts_viewer.handlers.browsing import BrowsingHandler
 from carts_viewer.handlers.exporting import Deliver, ExportingHandler
 from carts_viewer.handlers.finding import FindingHandler
+from carts_viewer.handlers.importing import ImportingHandler
 from carts_viewer.handlers.jobs import JobsHandler
 from carts_viewer.handlers.optimizing import OptimizingHandler
 from carts_viewer.handlers.painting import PaintingHandler
@@ -71,6 +72,7 @@ class Controller:
             intents.Propagating: self._propagating.handle,
             intents.Exporting: self._exporting.handle,
             intents.Painting: PaintingHandler(context, run).handle,
+            intents.ImportMasks: ImportingHandler(context, run).handle,
             intents.Finding: FindingHandler(context, run, self._browsing.show).handle,
             intents.Refresh: lambda _: context.change(),
             # Nothing to do: it has woken the worker, which now may send the next overlay.

@@ -6,7 +6,8 @@ from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
 from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer.compare import composed, other_pose
-from carts_viewer.layers import Layer, Rgba, paint_over
+from carts_viewer.imported import with_imported
+from carts_viewer.layers import Layer, Rgba, imported, paint_over
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.rate_limit import RateLimit
@@ -72,9 +73,13 @@ class PageDisplay:
 
     def _overlay(self, state: ViewState, camera: str) -> Rgba:
         correction = state.project.get(Key.mask_correction(state.index, camera))
+        truth = state.layer is Layer.TRUTH
+        frame = with_imported(state.frame, self._scene, state.project) if truth else state.frame
 
         def at(scene: SceneState, maps: Maps | None) -> Rgba:
-            return self._renderer.overlay(scene, state.frame, camera, state.layer, state.opacity, maps, correction)
+            if state.layer is Layer.IMPORTED:
+                return self._imported(state, camera)
+            return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
 
         overlay, share = at(state.pose.scene, state.maps), state.compare.share
         if share > 0.0:
@@ -82,6 +87,14 @@ class PageDisplay:
             overlay = composed(overlay, at(other, None), share)
         _draw_paint(overlay, state, correction, state.project.get(Key.ignore_region(state.index, camera)))
         return overlay
+
+    def _imported(self, state: ViewState, camera: str) -> Rgba:
+        """Masks and keypoints of others."""
+        own = self._scene.camera(camera)
+        layer = state.project.get(Key.imported_mask(state.index, camera))
+        points = state.project.get(Key.imported_keypoints(state.index, camera))
+        labels = None if layer is None else layer.labels()
+        return imported(labels, () if points is None else points.points, (own.height, own.width), state.opacity)
 
     def _show_others(self, state: ViewState, old: ViewState | None, overlays: Mapping[str, Rgba]) -> None:
         """The images of the other cameras, as far as they are to be seen."""
@@ -109,7 +122,7 @@ class PageDisplay:
 
 def _picture(state: ViewState) -> tuple:
     brush = state.brush
-    keys = Kind.MASK_CORRECTION, Kind.IGNORE_REGION
+    keys = Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
     entries = state.project.records.get(state.index)
     layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
     painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted

@@ -1,5 +1,7 @@
 """What can be drawn over the frame: pure functions from arm ids, masks and maps to RGBA pictures."""
 
+import colorsys
+from collections.abc import Iterable
 from enum import StrEnum
 from functools import lru_cache
 
@@ -20,6 +22,7 @@ class Layer(StrEnum):
     ATTENTION = "Attention map"
     SIMILARITY = "Feature similarity"
     NONE = "None"
+    IMPORTED = "Imported masks"
 
 
 ARM_COLORS = ((45, 212, 167), (96, 165, 250), (250, 204, 21), (232, 121, 249))
@@ -82,6 +85,35 @@ def against_truth(
         [(*color, _byte(opacity)) for color in (negative, false_negative, false_positive, positive)], np.uint8
     )
     return np.take(table, 2 * predicted.astype(np.uint8) + truth, axis=0)
+
+
+def imported(
+    labels: UInt8[np.ndarray, "height width"] | None,
+    points: Iterable[tuple[str, float, float]],
+    size: tuple[int, int],
+    opacity: float,
+) -> Rgba:
+    """Labels of others in the arms' colours, in turn, and their keypoints as crosses; `size` is height and width."""
+    picture = nothing(*size)
+    if labels is not None:
+        colors = np.array([(*label_color(max(number, 1)), _byte(opacity)) for number in range(256)], np.uint8)
+        colors[0, 3] = 0
+        picture = np.take(colors, labels, axis=0)
+    length = max(5, round(max(size) / 60))
+    for number, (_, u, v) in enumerate(points, start=1):
+        at = round(u - 0.5), round(v - 0.5)
+        if 0 <= at[0] < size[1] and 0 <= at[1] < size[0]:
+            for color, thickness in (((0, 0, 0), 3), (label_color(number), 1)):
+                cv2.drawMarker(picture, at, (*color, 255), cv2.MARKER_CROSS, length, thickness)
+    return picture
+
+
+def label_color(number: int) -> tuple[int, int, int]:
+    """Of label 1 and so on; after the arms' colours, others spread over the hues."""
+    if number <= len(ARM_COLORS):
+        return ARM_COLORS[number - 1]
+    red, green, blue = colorsys.hsv_to_rgb(0.618 * number % 1.0, 0.65, 0.95)
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[int, int], opacity: float) -> Rgba:

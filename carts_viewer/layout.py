@@ -10,6 +10,7 @@ from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.find import FindPanel
 from carts_viewer.panels.fit import FitPanel
 from carts_viewer.panels.help import HelpPanel
+from carts_viewer.panels.importing import ImportPanel
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel
@@ -87,6 +88,7 @@ class Layout:
                 ReviewPanel(page, emit, waits),
                 KeyframesPanel(page, session, emit),
                 KeypointsPanel(page, session, emit),
+                ImportPanel(page, session, emit),
                 FindPanel(page, session, emit, waits),
                 HistoryPanel(page, emit),
             ]

@@ -1,8 +1,8 @@
 """The recording that is open, and the poses that its project gives to its frames. No widgets, no optimizer."""
 
-import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from carts_core.errors import CartsError, SequenceError
 from carts_core.model.perturbation import perturb
-from carts_core.model.scene import Arm, Scene, SceneState
+from carts_core.model.scene import Scene, SceneState
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -26,19 +26,9 @@ from carts_core.project import (
 )
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.editing import Editor
+from carts_viewer.joint_range import JointRange, joint_range
+from carts_viewer.start.roots import Roots
 from carts_viewer.state import Pose
-
-
-@dataclass(frozen=True)
-class JointRange:
-    """What a joint may be set to."""
-
-    arm: str
-    joint: str
-    revolute: bool
-    lower: float
-    """[rad] or [m]; a joint without limits may turn once round either way."""
-    upper: float
 
 
 class Session:
@@ -50,17 +40,19 @@ class Session:
         scene: its arms and cameras.
         editor: its project, and what is on the way there.
         ranges: what each joint may be set to, arm by arm.
+        roots: folders that files may be brought in from: that of the sequence, and others that somebody allowed.
     """
 
-    def __init__(self, sequence: Sequence, project: Project) -> None:
+    def __init__(self, sequence: Sequence, project: Project, folders: Iterable[Path] = ()) -> None:
         self._sequence = sequence
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
         self.editor = Editor(project)
         self.ranges = tuple(
-            _range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
+            joint_range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
         )
         self._reader = FrameReader(sequence)
+        self.roots = Roots([sequence.path.parent, *folders])
 
     @property
     def time_offset(self) -> float | None:
@@ -278,17 +270,3 @@ def _calibrated(scene: Scene, state: SceneState, project: ProjectState) -> Scene
 
 def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> CorrectedTransform:
     return CorrectedTransform(tuple(tuple(row) for row in matrix.tolist()), provenance)
-
-
-def _range(arm: Arm, joint: int) -> JointRange:
-    lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
-    revolute = arm.robot.joint_types[joint] == "revolute"
-    # A joint without limits gets a slider with ends all the same: once round, or a metre, either way.
-    room = math.pi if revolute else 1.0
-    return JointRange(
-        arm.name,
-        arm.robot.joint_names[joint],
-        revolute,
-        lower if math.isfinite(lower) else -room,
-        upper if math.isfinite(upper) else room,
-    )

@@ -209,6 +209,8 @@ class ViewState:
     """What the worker is preparing, for people."""
     export: ExportState | None = None
     error: str | None = None
+    imported: str = ""
+    """What masks of others were imported last, for people."""
 
     @property
     def run_outdated(self) -> bool:

@@ -19,6 +19,7 @@ from .evaluate import Evaluate
 from .export import Export
 from .hand_eye import HandEye
 from .import_ import Import
+from .import_masks import ImportMasks
 from .live import Live
 from .optimize import Optimize
 from .render import Render
@@ -41,6 +42,7 @@ BAD_INPUT = 2
 Command = (
     Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[ImportMasks, tyro.conf.subcommand("import-masks")]
     | Annotated[HandEye, tyro.conf.subcommand("hand-eye")]
     | Annotated[TimeOffset, tyro.conf.subcommand("time-offset")]
     | Annotated[Optimize, tyro.conf.subcommand("optimize")]

@@ -4,10 +4,15 @@ from .changes import Change as Change
 from .database import DamagedProject as DamagedProject
 from .fit_verdict import FitVerdict as FitVerdict
 from .identity import SequenceIdentity as SequenceIdentity
+from .imported import ImportReport as ImportReport
+from .imported import import_annotations as import_annotations
+from .imported_values import ImportedKeypoints as ImportedKeypoints
+from .imported_values import ImportedLabels as ImportedLabels
 from .keys import Edits as Edits
 from .keys import Key as Key
 from .keys import Kind as Kind
 from .layers import IgnoreRegion as IgnoreRegion
+from .layers import ImportedMask as ImportedMask
 from .layers import MaskCorrection as MaskCorrection
 from .place import default_path as default_path
 from .place import rescued_copies as rescued_copies

@@ -77,7 +77,11 @@ VERSION_4 = """
 -- The same tables. Changes may be of the kind verdict, which version 3 would take for damage.
 """
 
-MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4)
+VERSION_5 = """
+-- The same tables. Changes may be of the kinds imported_mask, imported_keypoints and imported_labels.
+"""
+
+MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5)
 """Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
 SEALED = 3
 """The first schema with digests."""

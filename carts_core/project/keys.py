@@ -10,7 +10,8 @@ from typing import Any, Generic, TypeVar
 from ..errors import ProjectError
 from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
-from .layers import IgnoreRegion, Layer, MaskCorrection
+from .imported_values import ImportedKeypoints, ImportedLabels
+from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection
 from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review, TimeOffset
 
 V_co = TypeVar("V_co", covariant=True)
@@ -32,6 +33,9 @@ class Kind(StrEnum):
     KEYFRAME = "keyframe"
     REVIEW = "review"
     VERDICT = "verdict"
+    IMPORTED_MASK = "imported_mask"
+    IMPORTED_KEYPOINTS = "imported_keypoints"
+    IMPORTED_LABELS = "imported_labels"
 
 
 VALUE_TYPES: dict[Kind, type] = {
@@ -45,11 +49,15 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.KEYFRAME: Keyframe,
     Kind.REVIEW: Review,
     Kind.VERDICT: FitVerdict,
+    Kind.IMPORTED_MASK: ImportedMask,
+    Kind.IMPORTED_KEYPOINTS: ImportedKeypoints,
+    Kind.IMPORTED_LABELS: ImportedLabels,
 }
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
-_OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, *_MARKS}
-_OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET}
+_IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}
+_OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, *_IMPORTED, *_MARKS}
+_OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET, Kind.IMPORTED_LABELS}
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,21 @@ class Key(Generic[V_co]):
     def ignore_region(frame: int, camera: str) -> "Key[IgnoreRegion]":
         """Pixels where something hides the arms."""
         return Key(Kind.IGNORE_REGION, operator.index(frame), camera)
+
+    @staticmethod
+    def imported_mask(frame: int, camera: str) -> "Key[ImportedMask]":
+        """Labels that others gave to pixels."""
+        return Key(Kind.IMPORTED_MASK, operator.index(frame), camera)
+
+    @staticmethod
+    def imported_keypoints(frame: int, camera: str) -> "Key[ImportedKeypoints]":
+        """Points that others marked."""
+        return Key(Kind.IMPORTED_KEYPOINTS, operator.index(frame), camera)
+
+    @staticmethod
+    def imported_labels() -> "Key[ImportedLabels]":
+        """What the numbers in imported masks mean."""
+        return Key(Kind.IMPORTED_LABELS, WHOLE_PROJECT, "")
 
     @staticmethod
     def keyframe(frame: int) -> "Key[Keyframe]":

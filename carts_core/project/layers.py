@@ -108,6 +108,30 @@ class IgnoreRegion(Layer):
         return self.pixels() == _IGNORED
 
 
+class ImportedMask(Layer):
+    """What others marked in a frame: the number of a label (`ImportedLabels`) per pixel, 0 where nothing is marked."""
+
+    @classmethod
+    def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
+        """The layer of these labels.
+
+        Raises:
+            ProjectError: they are no picture of 8 bits.
+        """
+        labels = np.asarray(labels)
+        if labels.ndim != 2 or labels.dtype != np.uint8:
+            raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
+        return cls(_png(labels))
+
+    def labels(self) -> UInt8[np.ndarray, "height width"]:
+        """Label of every pixel, not to be written to."""
+        return self.pixels()
+
+    def mask(self) -> Bool[np.ndarray, "height width"]:
+        """Where anything is marked."""
+        return self.pixels() > 0
+
+
 @lru_cache(maxsize=8)
 def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
     """A layer is read several times for each stroke, by the overlay, the scores and the panels."""

@@ -82,8 +82,8 @@ class Record:
 
 
 _EMPTY = Record({}, {})
-_MARKS = (Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT)
-"""Kinds that say something about a frame and do not change how its arms fit."""
+_MARKS = (Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT, Kind.IMPORTED_KEYPOINTS, Kind.IMPORTED_LABELS)
+"""Kinds that say something about frames and do not change how arms fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,8 @@ class ProjectState:
 
     @cached_property
     def _calibration_revision(self) -> int:
-        return max((entry.step for entry in self._record(WHOLE_PROJECT).entries.values()), default=0)
+        entries = self._record(WHOLE_PROJECT).entries.items()
+        return max((entry.step for key, entry in entries if key.kind not in _MARKS), default=0)
 
     def _record(self, frame: int) -> Record:
         return self.records.get(frame, _EMPTY)

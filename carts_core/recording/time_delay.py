@@ -195,7 +195,7 @@ class _Delays:
         curve = {offset: _predicted(parts) for offset, parts in tried.items()}
         best = max(curve, key=lambda offset: curve[offset])
         seconds = self._refined(best, np.ones(_BLOCKS, bool))
-        without = [self._refined(seconds, np.arange(_BLOCKS) != left) for left in range(_BLOCKS)]
+        without = np.array([self._refined(seconds, np.arange(_BLOCKS) != left) for left in range(_BLOCKS)])
         deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(without - np.mean(without)).sum()))
         return TimeOffsetEstimate(
             present,

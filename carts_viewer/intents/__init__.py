@@ -48,6 +48,7 @@ from .finding import Finding as Finding
 from .finding import ReviewFound as ReviewFound
 from .finding import SetFilter as SetFilter
 from .finding import ShowFound as ShowFound
+from .importing import ImportMasks as ImportMasks
 from .jobs import Calibrate as Calibrate
 from .jobs import CancelJob as CancelJob
 from .jobs import ForgetJobs as ForgetJobs

@@ -8,8 +8,9 @@ import viser
 
 from carts_viewer import intents
 from carts_viewer.handlers.posing import LARGEST_PERTURBATION
+from carts_viewer.joint_range import JointRange
 from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
-from carts_viewer.session import JointRange, Session
+from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import Page
 

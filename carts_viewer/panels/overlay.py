@@ -1,14 +1,23 @@
 """What is drawn over the frame, and what its colours mean."""
 
+import numpy as np
+
+from carts_core.project import Key
+from carts_core.wording import counted
 from carts_viewer import intents
 from carts_viewer.compare import Against
-from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer
+from carts_viewer.imported import with_imported
+from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
 from carts_viewer.panels.inputs import Emit, Waits, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import Page
 
 _NOTHING = "Nothing"
+_RAMPS = {
+    Layer.ATTENTION: '<span class="carts-ramp"></span> 0 (left out) to 1 (counts fully)',
+    Layer.SIMILARITY: '<span class="carts-ramp"></span> 0 (unlike) to 1 (alike)',
+}
 
 
 class OverlayPanel:
@@ -17,7 +26,7 @@ class OverlayPanel:
     def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.server.gui
         sequence = session.sequence
-        self._waits = waits
+        self._waits, self._session = waits, session
         self._arms = [arm.name for arm in sequence.scene.arms]
         options = offered_layers(session)
         with gui.add_folder("Overlay"):
@@ -35,6 +44,9 @@ class OverlayPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
+        options = tuple(str(layer) for layer in offered_layers(self._session))
+        if options != self._layer.options:
+            self._layer.options = options
         write(self._layer, str(state.layer))
         if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))
@@ -50,19 +62,31 @@ class OverlayPanel:
                 swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
             )
         if state.layer is Layer.TRUTH:
-            if state.frame.masks is None or state.camera not in state.frame.masks:
-                return "This frame has no true mask to compare with."
+            if state.camera not in (with_imported(state.frame, self._session.scene, state.project).masks or {}):
+                return "This frame has no mask to compare with."
             return " ".join(swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
-        if state.layer is Layer.ATTENTION:
-            return '<span class="carts-ramp"></span> 0 (left out) to 1 (counts fully)'
-        if state.layer is Layer.SIMILARITY:
-            return '<span class="carts-ramp"></span> 0 (unlike) to 1 (alike)'
-        return ""
+        if state.layer is Layer.IMPORTED:
+            return self._explain_imported(state)
+        return _RAMPS.get(state.layer, "")
+
+    def _explain_imported(self, state: ViewState) -> str:
+        """The labels of others; those of the shown frame."""
+        layer = state.project.get(Key.imported_mask(state.index, state.camera))
+        points = state.project.get(Key.imported_keypoints(state.index, state.camera))
+        known = state.project.get(Key.imported_labels())
+        names = () if known is None else known.names
+        if layer is None and points is None:
+            return "Nothing was imported for this frame and camera."
+        there = set() if layer is None else set(np.unique(layer.labels()).tolist())
+        swatches = [swatch(label_color(n), name) for n, name in enumerate(names, start=1) if n in there]
+        count = 0 if points is None else len(points.points)
+        return " ".join([*swatches, *([counted(count, "keypoint")] if count else [])]) or "This mask is empty."
 
 
 def offered_layers(session: Session) -> list[Layer]:
-    """The layers that make sense for a sequence: without true masks there is nothing to compare with."""
+    """The layers that make sense for a sequence: without masks there is nothing to compare with."""
     sequence = session.sequence
     cameras = [camera.name for camera in sequence.scene.cameras]
-    truth = any(sequence.has_masks(camera, domain) for camera in cameras for domain in sequence.domains)
+    imported = session.editor.view.get(Key.imported_labels()) is not None
+    truth = imported or any(sequence.has_masks(camera, domain) for camera in cameras for domain in sequence.domains)
     return [layer for layer in Layer if truth or layer is not Layer.TRUTH]

@@ -2,9 +2,10 @@
 
 import viser
 
+from carts_viewer.joint_range import JointRange
 from carts_viewer.panels.inputs import escaped, humanized
 from carts_viewer.panels.joints import to_shown
-from carts_viewer.session import JointRange, Session
+from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
 

@@ -141,6 +141,7 @@ class Site:
                 weights=self.weights,
                 report=self._report,
                 page=self.page,
+                folders=self.roots.folders,
             )
         except CartsError as error:
             self._report(str(error))

@@ -15,6 +15,7 @@ COMMANDS = (
     "batch",
     "live",
     "time-offset",
+    "import-masks",
 )
 
 

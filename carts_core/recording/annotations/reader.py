@@ -1,0 +1,177 @@
+"""Foreign annotations as frames of a sequence."""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ...errors import SequenceError
+from ...model.camera import HALF_PIXEL, Camera
+from ..importing.cameras import side_of
+from ..sequence import Sequence
+from .coco import is_coco, read_coco
+from .cvat import is_cvat, read_cvat
+from .folders import is_mask_folder, read_mask_folder
+from .found import Annotations, ForeignImage, FrameAnnotation, Labels
+from .surgpose import is_surgpose, read_surgpose
+
+_INSIDE = {"annotations/instances_default.json", "annotations.xml"}
+"""Of a folder that is an export: the file that matters."""
+_OWN_EXPORT = "export.json"
+
+
+@dataclass(frozen=True)
+class _Format:
+    kind: str
+    fits: Callable[[Path], bool]
+    read: Callable[[Path], Iterator[ForeignImage]]
+
+
+_FORMATS = (
+    _Format("COCO", is_coco, read_coco),
+    _Format("CVAT for images", is_cvat, read_cvat),
+    _Format("keypoints of SurgPose", is_surgpose, read_surgpose),
+    _Format("a folder of masks", is_mask_folder, read_mask_folder),
+)
+
+
+def read_annotations(
+    source: Path, sequence: Sequence, camera: str | None = None, *, confined: bool = False
+) -> Annotations:
+    """Masks and keypoints of others, for the frames of a sequence that they belong to.
+
+    Frames are found by their ids, or the numbers in the names of images; cameras by their names, or by left and right.
+    What was marked in images with distortion is undistorted, unless carts exported it.
+
+    Args:
+        source: a COCO file, a CVAT file, keypoints of SurgPose, a folder of masks, or the folder of an export.
+        sequence: whose frames they are.
+        camera: whose images they are, where their names do not say it.
+        confined: whether nothing outside of the source is read, neither beside it nor by links in it.
+
+    Raises:
+        SequenceError: it is none of these, or cannot be read; also later, while frames are gone through.
+    """
+    if camera is not None:
+        sequence.recorded_camera(camera)
+    place = next((source / name for name in sorted(_INSIDE) if (source / name).is_file()), source)
+    chosen = next((format for format in _FORMATS if format.fits(place)), None)
+    if chosen is None or not place.exists():
+        raise SequenceError(
+            f"{source} holds no masks or keypoints that are known. Give a COCO file (.json), a CVAT file (.xml), "
+            "keypoints of SurgPose (.yaml), or a folder of PNG masks."
+        )
+    own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
+    labels, unknown = Labels(), []
+    reader = _FrameReader(sequence, camera, source.name, labels, unknown, undistorted=own)
+    images = read_mask_folder(place, confined=confined) if place.is_dir() else chosen.read(place)
+    return Annotations(chosen.kind, reader.frames(images), labels.names, unknown)
+
+
+class _FrameReader:
+    """Turns images of a source into frames of a sequence.
+
+    Args:
+        sequence, camera: see `read_annotations`.
+        source: name of the source, which may say the camera.
+        labels: that are numbered meanwhile.
+        unknown: where names of images without a frame are put.
+        undistorted: whether annotations are of undistorted images already.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        camera: str | None,
+        source: str,
+        labels: Labels,
+        unknown: list[str],
+        *,
+        undistorted: bool,
+    ) -> None:
+        self._sequence, self._camera, self._source = sequence, camera, source
+        self._labels, self._unknown, self._undistorted = labels, unknown, undistorted
+        self._cameras = [own.name for own in sequence.scene.cameras]
+        self._ids = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+        self._numbers = {int(name): index for name, index in self._ids.items() if name.isdecimal()}
+
+    def frames(self, images: Iterator[ForeignImage]) -> Iterator[FrameAnnotation]:
+        """One annotation per frame and camera; images that follow each other are joined."""
+        at: tuple[int, str] | None = None
+        joined: list[ForeignImage] = []
+        done: set[tuple[int, str]] = set()
+        for image in images:
+            found = self._place(image)
+            if found is None:
+                self._unknown.append(image.name)
+                continue
+            if found != at and at is not None:
+                yield self._joined(at, joined)
+                done.add(at)
+                joined = []
+            if found in done:
+                raise SequenceError(f"{image.name} is of a frame that came before. Name the images by their frames.")
+            at, joined = found, [*joined, image]
+        if at is not None:
+            yield self._joined(at, joined)
+
+    def _place(self, image: ForeignImage) -> tuple[int, str] | None:
+        camera = self._camera_of(image)
+        if camera is None:
+            return None
+        stem = PurePosixPath(image.name.replace("\\", "/")).stem
+        for text in (image.frame, stem, stem.removeprefix(f"{camera}_"), stem.removesuffix(f"_{camera}")):
+            if text in self._ids:
+                return self._ids[text], camera
+        digits = re.findall(r"\d+", image.frame or stem)
+        index = self._numbers.get(int(digits[-1])) if digits and len(digits[-1]) < 18 else None
+        return None if index is None else (index, camera)
+
+    def _camera_of(self, image: ForeignImage) -> str | None:
+        if self._camera is not None or image.camera in self._cameras:
+            return self._camera or image.camera
+        path = PurePosixPath(image.name.replace("\\", "/"))
+        for part in (path.stem, *path.parts[-2::-1], self._source):
+            named = [name for name in self._cameras if part == name or part.startswith(f"{name}_")]
+            named += [name for name in self._cameras if part.endswith(f"_{name}")]
+            if named:
+                return named[0]
+        side = side_of(image.name) or side_of(self._source)
+        if len(self._cameras) == 1:
+            return self._cameras[0]
+        return side if side in self._cameras else None
+
+    def _joined(self, at: tuple[int, str], images: list[ForeignImage]) -> FrameAnnotation:
+        index, name = at
+        camera = self._sequence.recorded_camera(name)
+        labels: UInt8[np.ndarray, "height width"] | None = None
+        points: dict[str, tuple[float, float]] = {}
+        for image in images:
+            points |= image.keypoints
+            for label, mask in image.parts():
+                if mask.shape != (camera.height, camera.width):
+                    raise SequenceError(
+                        f"{image.name} is {mask.shape[1]} x {mask.shape[0]} pixels, but images of camera {name!r} are "
+                        f"{camera.width} x {camera.height}. Give masks of the images' own size."
+                    )
+                labels = np.zeros(mask.shape, np.uint8) if labels is None else labels
+                if label:
+                    labels[mask] = self._labels.number(label)
+        if not self._undistorted:
+            labels = None if labels is None else camera.undistort(labels, cv2.INTER_NEAREST)
+            points = _undistorted(points, camera)
+        return FrameAnnotation(index, name, labels, points)
+
+
+def _undistorted(points: dict[str, tuple[float, float]], camera: Camera) -> dict[str, tuple[float, float]]:
+    if not points or not any(camera.distortion):
+        return points
+    K = camera.K
+    K[:2, 2] -= HALF_PIXEL
+    recorded = np.array(list(points.values()), np.float64) - HALF_PIXEL
+    straight = cv2.undistortPoints(recorded[:, None], K, np.array(camera.distortion), P=K)[:, 0] + HALF_PIXEL
+    return {name: (float(u), float(v)) for name, (u, v) in zip(points, straight, strict=True)}
