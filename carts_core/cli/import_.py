@@ -31,10 +31,11 @@ class Import:
 
     def run(self) -> None:
         """Say what was found, and write the sequence file."""
+        from ..recording.importing.found import recording_name
         from ..recording.importing.importer import import_recording
 
         console = Console()
-        folder = self.output or Path(f"{self.source.absolute().stem}_sequence")
+        folder = self.output or Path(f"{recording_name(self.source)}_sequence")
         path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
         print_report(console, recording)
         console.print(f"wrote {path}. Look at it: carts view {path}", markup=False, soft_wrap=True)

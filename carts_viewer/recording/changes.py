@@ -8,6 +8,7 @@ from typing import Any
 
 from carts_core.errors import SettingsError
 from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.recording.importing.found import recording_name
 from carts_viewer.recording.draft import Draft, Step
 
 _CHOICES = {
@@ -62,7 +63,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
     options = draft.options
     match kind:
         case "source":
-            return replace(Draft(), source=str(path), name=path.stem, step=Step.CHECK)
+            return replace(Draft(), source=str(path), name=recording_name(path), step=Step.CHECK)
         case "images":
             images = options.images or {name: str(place) for name, place in found.items()}
             return _new_import(draft.with_options(images={**images, which or _new_name(images, path): str(path)}))

@@ -11,6 +11,12 @@ from jaxtyping import Float, Int
 NoteKind = Literal["found", "guessed", "missing", "warning"]
 
 
+def recording_name(path: Path) -> str:
+    """What a recording is called by default: its folder's name, or its file's without the suffix."""
+    path = path.absolute()
+    return path.name if path.is_dir() else path.stem
+
+
 @dataclass(frozen=True)
 class Note:
     """A line of the report."""

@@ -13,7 +13,7 @@ from ...settings.importing import ImportOptions
 from ..image_sources import BAG_SUFFIXES, decode_message, open_bag
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, camera_from_info, side_of
-from ..importing.found import FoundCamera, FoundRecording, Note
+from ..importing.found import FoundCamera, FoundRecording, Note, recording_name
 from ..importing.logs import ArmLog, arm_from_log, track
 from .protocol import Source
 
@@ -280,7 +280,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         reader.close()
     ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
     offset = options.time_offset or 0.0
-    return FoundRecording("a ROS bag", path.stem, cameras, arms, ids, frame_times, tuple(notes), offset)
+    return FoundRecording("a ROS bag", recording_name(path), cameras, arms, ids, frame_times, tuple(notes), offset)
 
 
 SOURCE = Source(

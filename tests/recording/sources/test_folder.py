@@ -276,3 +276,11 @@ def test_a_sign_can_be_turned_round(folder):
     assert np.array_equal(after, before * [-1, 1, 1, -1, 1, 1])
     with pytest.raises(CartsError, match=r"--flip knee is no joint. Joints are: yaw"):
         find(folder, ImportOptions(flip=("knee",)))
+
+
+def test_the_default_output_has_the_whole_name_of_a_folder_with_a_dot(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("case.3", "case.4"):
+        folder = folder.rename(tmp_path / name)
+        main(["import", str(folder)])
+        assert Sequence.open(tmp_path / f"{name}_sequence/sequence.toml").name == name
