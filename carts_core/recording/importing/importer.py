@@ -4,6 +4,7 @@ from pathlib import Path
 
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
+from ...wording import shown
 from ..sources import SOURCES, Source
 from .found import FoundRecording
 from .placing import completed
@@ -41,7 +42,13 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
         CartsError: it is of no known kind, damaged, or contradicts itself.
     """
     options = options or ImportOptions()
-    return completed(detect(path, options.source).read(path.absolute(), options))
+    try:
+        return completed(detect(path, options.source).read(path.absolute(), options))
+    except OSError as error:
+        named = "" if error.filename is None else f" {shown(str(error.filename))}"
+        raise SequenceError(
+            f"{path} cannot be read:{named} {error.strerror or error}. Check that it was copied whole, and its rights."
+        ) from error
 
 
 def import_recording(

@@ -37,7 +37,7 @@ def image_files(folder: Path) -> list[Path]:
     """Images directly in a folder, in no order."""
     try:
         return [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-    except OSError:
+    except (OSError, ValueError):  # a name that no file can have
         return []
 
 
