@@ -104,7 +104,7 @@ def receive(connection: socket.socket) -> FrameMessage | None:
         raise StreamError("the connection ended within a message.")
     try:
         return _decoder.decode(content)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # a ValueError: no UTF-8
         raise StreamError(f"a message cannot be read: {error}. docs/reference/live.md describes them.") from error
 
 

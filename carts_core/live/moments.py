@@ -1,5 +1,6 @@
 """What sources of a stream hand on, and the desk where the newest waits."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -59,8 +60,10 @@ class Assembler:
         """The frame that a message completes; None for one without images, or before every arm's joints are known.
 
         Raises:
-            StreamError: it has an unknown arm, joint or camera, lacks an image, or one is not usable.
+            StreamError: it has an unknown arm, joint or camera, lacks an image, or one or the time is not usable.
         """
+        if not math.isfinite(message.time):
+            raise StreamError(f"a message has the time {message.time}; give seconds.")
         with self._changing:
             self._take_joints(message)
             self._take_poses(message)
@@ -95,11 +98,9 @@ class Assembler:
     def _take_poses(self, message: FrameMessage) -> None:
         known = [camera.name for camera in self._sequence.scene.cameras]
         for name, rows in message.camera_poses.items():
-            pose = (
-                np.array(rows, np.float64) if {len(row) for row in rows} == {4} and len(rows) == 4 else np.zeros((4, 4))
-            )
-            rigid = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) and np.all(np.isfinite(pose))
-            if name not in known or not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):
+            square = len(rows) == 4 and {len(row) for row in rows} == {4}
+            pose = np.array(rows, np.float64) if square else np.zeros((4, 4))
+            if name not in known or not _is_rigid(pose):
                 raise StreamError(f"camera_poses of {name!r}: give a rigid 4 x 4 matrix for one of {', '.join(known)}.")
             self._poses[name] = pose
 

@@ -1,8 +1,11 @@
 """The kinds of files that CaRTS reads: a right one of each, and reading it as the commands do."""
 
 import random
+import socket
+import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import av
@@ -11,11 +14,16 @@ import numpy as np
 import torch
 import trimesh
 
+from carts_core.batch.manifest import read_manifest
+from carts_core.cli.solver_options import SolverOptions
 from carts_core.export.kinematics import KinematicsRow, kinematics_csv, read_kinematics_csv
 from carts_core.lab.training.checkpoint import History, load_checkpoint, save_checkpoint
+from carts_core.live.messages import FrameMessage, ImageMessage, packed, receive
+from carts_core.live.moments import Assembler
 from carts_core.model.robot import Robot
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.weights import read_weights, save_weights
+from carts_core.optimization.hand_eye.files import read_points
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image, read_mask
 from carts_core.recording.video import Video
@@ -65,6 +73,11 @@ masks = "masks/{frame}.png"
 _CALIBRATION = """{"left": {"K": [[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]],
  "T": [[1.0, 0.0, 0.0, 0.01], [0.0, 1.0, 0.0, 0.02], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]}}
 """
+_MANIFEST = """format = "carts-batch/1"
+[[jobs]]
+recordings = ["sequence.toml"]
+steps = ["optimize", "export"]
+"""
 _KINEMATICS = "frame,time,yaw\n1,0.0,5.0\n2,0.1,6.25\n"
 
 
@@ -112,6 +125,12 @@ def make_folder(folder: Path) -> None:
     save_checkpoint(folder / "run", {"network": network}, optimizer, 3, "{}", History([{"step": 1.0}], [], 2.0))
     sequence = Sequence.open(folder / "sequence.toml")
     (folder / "corrected.csv").write_text(_corrected(sequence))
+    (folder / "settings.toml").write_text(SolverOptions().printed())
+    (folder / "manifest.toml").write_text(_MANIFEST)
+    (folder / "points.csv").write_text("frame,camera,arm,landmark,u,v\n001,left,PSM1,tip,12.5,30\n")
+    picture = (folder / "image.jpg").read_bytes()
+    sent = FrameMessage(0.5, {"PSM1": {"yaw": 0.1}}, {"left": ImageMessage(picture)}, {"left": np.eye(4).tolist()})
+    (folder / "message.bin").write_bytes(packed(sent))
 
 
 def _write_video(path: Path, image: np.ndarray) -> None:
@@ -182,6 +201,35 @@ def _open_weights(path: Path) -> None:
     _check_finite(*(value.float().numpy() for value in weights.network.state_dict().values()))
 
 
+def _open_settings(path: Path) -> None:
+    options = SolverOptions(settings=(str(path),))
+    options.printed()
+    _check_finite(*(value for value in asdict(options.chosen).values() if isinstance(value, float)))
+
+
+def _open_points(path: Path) -> None:
+    for point in read_points(path, Sequence.open(path.parent / "sequence.toml")):
+        _check_finite(point.pixel)
+
+
+def _open_message(path: Path) -> None:
+    """As the server of `carts live` takes it from a socket."""
+    here, there = socket.socketpair()
+    with here, there:
+        content = path.read_bytes()
+        threading.Thread(target=_send, args=(there, content), daemon=True).start()
+        message = receive(here)
+    moment = message and Assembler(Sequence.open(path.parent / "sequence.toml"), ("left",)).moment(message)
+    if moment:
+        _check_finite(moment.frame.timestamp, *moment.frame.measured.values(), *moment.camera_poses.values())
+
+
+def _send(connection: socket.socket, content: bytes) -> None:
+    with suppress(OSError):
+        connection.sendall(content)
+        connection.shutdown(socket.SHUT_WR)
+
+
 def _of_folder(name: str, read: Callable[[Path], object]) -> Callable[[Path], object]:
     return lambda path: read(path.parent / name)
 
@@ -201,5 +249,9 @@ KINDS = {
     "stl": Kind("ball.stl", mutated_bytes, _of_folder("stl.urdf", _open_robot)),
     "ply": Kind("ball.ply", mutated_bytes, _of_folder("ply.urdf", _open_robot)),
     "weights": Kind("weights.safetensors", mutated_safetensors, _open_weights),
+    "settings": Kind("settings.toml", mutated_text, _open_settings),
+    "manifest": Kind("manifest.toml", mutated_text, read_manifest),
+    "points": Kind("points.csv", mutated_text, _open_points),
+    "message": Kind("message.bin", mutated_bytes, _open_message),
     "checkpoint": Kind("run/checkpoint.safetensors", mutated_safetensors, lambda path: load_checkpoint(path.parent)),
 }

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Sequence as Rows
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
             pixel = (float(row["u"]), float(row["v"]))
         except (TypeError, ValueError) as error:
             raise SettingsError(f"{path}, line {number}: u and v must be numbers of pixels ({error}).") from error
+        if not all(map(math.isfinite, pixel)):
+            raise SettingsError(f"{path}, line {number}: u and v are {pixel[0]} and {pixel[1]}. Give finite numbers.")
         points.append(ImagePoint(position[row["frame"]], row["camera"], row["arm"], row["landmark"], pixel))
     return points
 
