@@ -24,7 +24,7 @@ class Bench:
     real: Path | None = None
     """Sequence file with real frames and masks, to be measured too, also with their instruments in other rooms."""
     rooms: Path | None = None
-    """Folder of photographs to put the real instruments before, besides made rooms."""
+    """Folder of photographs to put instruments before, besides made rooms."""
     report_only: bool = False
     """Measure nothing; write the report of what is there."""
     frames: int | None = None
@@ -39,7 +39,13 @@ class Bench:
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
         from ..lab.benchmark.fingerprints import code_fingerprint
-        from ..lab.benchmark.sources import real_source, room_sources, synthetic_source
+        from ..lab.benchmark.sources import (
+            family_sources,
+            real_source,
+            room_sources,
+            synthetic_room_source,
+            synthetic_source,
+        )
         from ..lab.benchmark.stages import known_stages, measure_stages
         from ..networks.extractor import FeatureExtractor
 
@@ -48,14 +54,13 @@ class Bench:
         if self.frames is not None:
             scope = scope.with_frames(self.frames)
         name = "quick" if self.quick else "full"
-        if self.rooms is not None and self.real is None:
-            raise CartsError("--rooms was given without --real. Say which real frames are to be put into these rooms.")
         folder = output_folder(self.output, "bench", name)
         seed = TEST_SEED if self.seed is None else self.seed
         extractor = FeatureExtractor.load(
             *self.network.weights, device=self.network.device, inference=self.network.inference
         )
-        sources = [synthetic_source(scope, seed)]
+        made = synthetic_source(scope, seed)
+        sources = [made, synthetic_room_source(made, self.rooms, scope, seed), *family_sources(scope, seed)]
         if self.real is not None:
             sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
         runs = plan(scope, sources)

@@ -12,8 +12,10 @@ from .scope import Run as Run
 from .scope import Scope as Scope
 from .sources import TEST_SEED as TEST_SEED
 from .sources import Source as Source
+from .sources import family_sources as family_sources
 from .sources import real_source as real_source
 from .sources import room_sources as room_sources
+from .sources import synthetic_room_source as synthetic_room_source
 from .sources import synthetic_source as synthetic_source
 from .store import ResultsFile as ResultsFile
 from .target import Target as Target

@@ -149,7 +149,7 @@ def _rooms(data: Measurements, camera: str) -> list[Target]:
     percent = lambda value: f"{100 * value:.1f} %"  # noqa: E731
     return [
         make_target(
-            f"real instruments in other rooms, {camera}: mean Dice",
+            f"instruments in other rooms, {camera}: mean Dice",
             0.95,
             mean(m.final.dice for m in alone) if alone else None,
             basis,
@@ -158,7 +158,7 @@ def _rooms(data: Measurements, camera: str) -> list[Target]:
             reference=f"ACS, our schedule: {mean(beside.values()):.3f}" if beside else "",
         ),
         make_target(
-            f"real instruments in other rooms, {camera}: more than 0.01 below ACS from the same start",
+            f"instruments in other rooms, {camera}: more than 0.01 below ACS from the same start",
             0.0,
             mean(behind) if behind else None,
             f"{sum(behind)} of {basis}",
@@ -166,7 +166,7 @@ def _rooms(data: Measurements, camera: str) -> list[Target]:
             text=percent,
         ),
         make_target(
-            f"real instruments in other rooms, {camera}: made worse than their start",
+            f"instruments in other rooms, {camera}: made worse than their start",
             0.01,
             mean(m.made_worse for m in alone) if alone else None,
             basis,

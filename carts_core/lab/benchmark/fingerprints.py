@@ -27,6 +27,7 @@ _MEASURED = (
     "lab/benchmark/frame.py",
     "lab/benchmark/occlusion.py",
     "lab/benchmark/together.py",
+    "lab/benchmark/wrong_inputs.py",
 )
 
 

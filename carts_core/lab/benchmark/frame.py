@@ -14,7 +14,14 @@ from ...model.keypoints import keypoints
 from ...model.perturbation import perturb
 from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
-from ...optimization import Backgrounds, FrameOptimizer, FreeParameters, SolverSettings, SurfaceSolver
+from ...optimization import (
+    Backgrounds,
+    FrameOptimizer,
+    FreeParameters,
+    SolverSettings,
+    SurfacePredictor,
+    SurfaceSolver,
+)
 from ...optimization.observability import Uncertainty
 from ...recording import Frame
 from ...rendering import Renderer
@@ -88,6 +95,25 @@ class Truth:
             seconds=seconds,
         )
 
+    def within(
+        self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
+    ) -> tuple[int, int, int] | None:
+        """How many measured joints have a truth and a deviation, and err by at most one and two of them; None if none.
+
+        Args:
+            scene: whose arms these are.
+            found: arm -> joint positions [rad, m].
+            std: arm -> their standard deviations, NaN where they are not known.
+        """
+        ratios = []
+        for arm in scene.arms:
+            counts = np.isin(arm.robot.joint_names, self.measured_joints.get(arm.name, ()))
+            if arm.name in self.joint_positions:
+                errors = np.abs(found[arm.name] - self.joint_positions[arm.name]) / std[arm.name]
+                ratios += errors[counts & (std[arm.name] > 0)].tolist()
+        one, two = (sum(ratio <= bound for ratio in ratios) for bound in (1.0, 2.0))
+        return (len(ratios), one, two) if ratios else None
+
     def _overlap(self, mask: np.ndarray) -> tuple[float, float]:
         truth = self.mask
         if self.hidden is not None:
@@ -151,7 +177,7 @@ def optimize(
     scene: Scene,
     frame: Frame,
     backgrounds: Backgrounds,
-    extractor: FeatureExtractor,
+    networks: FeatureExtractor | SurfacePredictor,
     settings: SolverSettings,
     free: FreeParameters,
     truth: Truth,
@@ -165,7 +191,7 @@ def optimize(
         scene: with the cameras that take part.
         frame: its images and kinematics.
         backgrounds: of these cameras.
-        extractor: the feature network.
+        networks: the networks, or what stands in their place.
         settings: of the method.
         free: what is unknown.
         truth: what estimates are compared with.
@@ -175,9 +201,33 @@ def optimize(
     start = start_of(scene, frame, run, truth.measured_joints)
     began = time.perf_counter()
     optimizer = FrameOptimizer(
-        scene, frame, backgrounds, extractor, ignore=ignore, start=start, settings=settings, free=free, live=False
+        scene, frame, backgrounds, networks, ignore=ignore, start=start, settings=settings, free=free, live=False
     )
-    seconds = time.perf_counter() - began
+    trace, best, seconds = _followed(optimizer, truth, renderer, time.perf_counter() - began)
+    assert optimizer.best is not None and optimizer.stop_reason is not None
+    end = optimizer.best
+    final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
+    assessment = optimizer.assessment
+    # Far from a given mask the first iterate is what a search has found.
+    searched = METHODS[run.method].masks_given
+    return Measurement(
+        run,
+        final,
+        tuple(trace),
+        tuple(best),
+        optimizer.stop_reason,
+        machine(networks.device),
+        truth.score(scene.state(start), None, None, renderer, 0.0) if searched else None,
+        verdict=assessment and assessment.verdict.value,
+        probability=assessment and assessment.probability,
+        within=truth.within(scene, end.joint_positions(), end.joint_std()),
+    )
+
+
+def _followed(
+    optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
+) -> tuple[list[Score], list[int], float]:
+    """The scores of all iterates, for each the place of the best one then, and the seconds with those until then."""
     trace: list[Score] = []
     best: list[int] = []
     while True:
@@ -185,15 +235,11 @@ def optimize(
         iterate = optimizer.step()
         seconds += time.perf_counter() - began
         if iterate is None:
-            break
+            return trace, best, seconds
         best.append(len(trace) if optimizer.best is iterate else best[-1])
         known, first = iterate.uncertainty, not trace
-        loss = None if isinstance(settings, SurfaceSolver) else iterate.loss
+        loss = None if isinstance(optimizer.settings, SurfaceSolver) else iterate.loss
         trace.append(truth.score(iterate.state, known, loss, renderer, seconds, depth=first))
-    assert optimizer.best is not None and optimizer.stop_reason is not None
-    end = optimizer.best
-    final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
-    return Measurement(run, final, tuple(trace), tuple(best), optimizer.stop_reason, machine(extractor.device))
 
 
 def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:

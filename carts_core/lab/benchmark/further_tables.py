@@ -115,7 +115,7 @@ def sequence_table(data: Measurements) -> Table | None:
 
 
 def room_table(data: Measurements) -> Table | None:
-    """Real instruments in other rooms: the default solver, each frame alone and in a sequence, beside ACS."""
+    """Instruments in other rooms: the default solver, each frame alone and in a sequence, beside ACS."""
     rows = []
     for camera, half in product(data.room_cameras(), get_args(Half)):
         alone, acs, together = (data.in_rooms(camera, half, method) for method in ("ours", "acs", "sequence"))
@@ -134,10 +134,11 @@ def room_table(data: Measurements) -> Table | None:
         )
     header = ("camera", "rooms", "number", "Dice before", "ours", "ACS, our schedule", "ours, sequence mode")
     caption = (
-        "Real instruments, cut out by their masks and put before made rooms and photographs, started at the measured "
-        "kinematics. Nothing was chosen on those that are held out. Dice in percent; made worse: by more than 1."
+        "Instruments, cut out by their masks and put before made rooms and photographs, started at the measured "
+        "kinematics; real ones by camera, and those of the synthetic frames. Nothing was chosen on rooms that are held "
+        "out. Dice in percent; made worse: by more than 1."
     )
-    return Table("Real instruments in other rooms", caption, header, tuple(rows)) if rows else None
+    return Table("Instruments in other rooms", caption, header, tuple(rows)) if rows else None
 
 
 def _table(

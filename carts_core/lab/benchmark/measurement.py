@@ -44,12 +44,18 @@ class Measurement:
     machine: str
     """What it ran on, for people."""
     before: Score | None = None
-    """Of the start, where iterates are not followed."""
+    """Of the start, where iterates are not followed, or do not begin with it."""
+    verdict: str | None = None
+    """`good`, `doubtful` or `failed`, where the method says so."""
+    probability: float | None = None
+    """That the mask is wrong, as the verdict has it [1]."""
+    within: tuple[int, int, int] | None = None
+    """Joint positions with a truth and a deviation; those that err by at most one deviation; by at most two."""
 
     @property
     def start(self) -> Score | None:
         """The score before anything is corrected; None where the method has no start."""
-        return self.trace[0] if self.trace else self.before
+        return self.before or (self.trace[0] if self.trace else None)
 
     @property
     def iterations(self) -> int:
@@ -86,6 +92,9 @@ class Measurement:
             "stopped": self.stopped,
             "machine": self.machine,
             "before": self.before and _rounded(asdict(self.before)),
+            "verdict": self.verdict,
+            "probability": _round(self.probability),
+            "within": self.within,
         }
 
     @staticmethod
@@ -108,6 +117,9 @@ class Measurement:
             stopped=line["stopped"],
             machine=line["machine"],
             before=line["before"] and Score(**line["before"]),
+            verdict=line["verdict"],
+            probability=line["probability"],
+            within=line["within"] and tuple(line["within"]),
         )
 
 

@@ -25,6 +25,8 @@ class Method:
     """Base frames are those of one calibration of the whole recording."""
     together: bool = False
     """Frames are corrected together, as a sequence."""
+    masks_given: bool = False
+    """The given masks are what is fitted, and no network is used."""
 
 
 def _ours(_: int) -> SolverSettings:
@@ -49,6 +51,7 @@ METHODS = {
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
     "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
     "sequence": Method("ours, sequence mode", _ours, together=True),
+    "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
 MAIN = ("unet", "start", "l1", "paper", "ours")
 """Methods of the main table: each frame alone, in one camera."""

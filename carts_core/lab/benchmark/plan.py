@@ -5,8 +5,9 @@ from collections.abc import Sequence as Items
 from ...settings import DOMAINS
 from .methods import MAIN, METHODS
 from .occlusion import OCCLUSION
-from .scope import REAL, ROOMS, SYNTHETIC, Run, Scope
+from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Run, Scope
 from .sources import Source
+from .wrong_inputs import wrong_inputs
 
 _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
@@ -14,11 +15,11 @@ _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
     """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
 
-    Frames on which not all methods are evaluated come after that, then frames that are corrected together, and other
-    rooms last.
+    Frames on which not all methods are evaluated come after that, then frames that are corrected together, other rooms,
+    and instruments that no training has last.
     """
-    rooms = [source for source in sources if source.name.startswith(ROOMS)]
-    sources = [source for source in sources if source not in rooms]
+    rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
+    sources = [source for source in sources if source not in (*rooms, *families)]
     runs: list[Run] = []
     for turn in range(max((len(source.frames) for source in sources), default=0)):
         for source in sources:
@@ -36,7 +37,14 @@ def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
         for method in together
         for frame in source.consecutive
     ]
-    return runs + [run for source in rooms for run in _runs_in_rooms(source)]
+    runs += [run for source in rooms for run in _runs_in_rooms(source)]
+    return runs + [
+        Run(source.name, domain, frame, "ours", error)
+        for source in families
+        for frame in source.frames
+        for domain in source.domains
+        for error in scope.hard_errors_deg
+    ]
 
 
 def _runs_in_rooms(source: Source) -> list[Run]:
@@ -61,7 +69,9 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
         domains, ours, papers, hard = ("regular",), scope.real_errors_deg, scope.real_errors_deg, ()
     runs += [Run(source.name, domain, frame, "ours", error) for error in ours for domain in domains]
     runs += [Run(source.name, "regular", frame, "paper", error) for error in papers]
+    runs += [Run(source.name, wrong, frame, "ours") for wrong in wrong_inputs(source.length, len(source.cameras))]
     for error in (None, *hard):
+        runs += [Run(source.name, "regular", frame, "masks", error)]
         runs += [Run(source.name, OCCLUSION, frame, method, error) for method in _UNDER_OCCLUDERS]
         if len(source.cameras) > 1:
             runs += [Run(source.name, "regular", frame, method, error) for method in ("stereo", "stereo_posed")]

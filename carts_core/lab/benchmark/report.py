@@ -21,6 +21,7 @@ from .speed_tables import pair_table, speed_table, stage_table, worse_table
 from .statistics import Measurements
 from .target import Target
 from .targets import targets
+from .verdicts import deviation_table, family_table, verdict_table
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ def write_report(folder: OutputPath, measurements: list[Measurement], facts: Fac
         ("Calibration", _known(calibration_table(data))),
         ("Sequence mode", _known(sequence_table(data))),
         ("Other rooms", _known(room_table(data))),
+        ("Other instruments", _known(family_table(data))),
+        ("Verdicts and deviations", _known(verdict_table(data), deviation_table(data))),
         ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
     ]
@@ -119,6 +122,8 @@ def _row(measurement: Measurement) -> dict[str, object]:
         "iterations": measurement.iterations,
         "seconds": final.seconds,
         "made_worse": measurement.made_worse,
+        "verdict": measurement.verdict,
+        "probability_of_failure": measurement.probability,
         "stopped": measurement.stopped,
     }
 

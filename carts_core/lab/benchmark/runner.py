@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, Time
 from ...console import Bar, PlainColumn
 from ...model.scene import Scene
 from ...networks.extractor import FeatureExtractor
-from ...optimization import Backgrounds, FreeParameters
+from ...optimization import Backgrounds, FreeParameters, MaskPredictor
 from ...recording import Frame
 from ...rendering import Renderer
 from ...wording import counted
@@ -23,6 +23,7 @@ from .scope import Run, Scope
 from .sources import Recording, Source
 from .store import ResultsFile
 from .together import calibrated_scene, correct_together
+from .wrong_inputs import WRONG, misled
 
 _OCCLUDERS_SEED = 20
 
@@ -121,21 +122,29 @@ class _Bench:
         recording, renderer = self._open()
         method, camera = METHODS[run.method], self._source.camera
         cameras = self._source.cameras if method.every_camera else (camera,)
-        covered = run.domain == OCCLUSION
-        frame = recording.frame(run.frame, None if covered else run.domain, cameras)
+        covered, wrong = run.domain == OCCLUSION, run.domain in WRONG
+        frame = (
+            misled(recording, run.domain, run.frame, camera)
+            if wrong
+            else recording.frame(run.frame, None if covered else run.domain, cameras)
+        )
         truth = self._truth(frame)
         if covered:
             frame, truth = self._covered(frame, truth)
         if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
         settings = method.settings(scope.steps(run))
-        domain = "regular" if covered else run.domain
-        backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
+        domain = "regular" if covered or wrong else run.domain
+        if method.masks_given:
+            networks, backgrounds = MaskPredictor(), Backgrounds({})
+        else:
+            networks = extractor
+            backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
         ignore = {camera: truth.hidden} if method.occluders_given and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
         scene = known.with_cameras(cameras)
         free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))
-        return optimize(run, scene, frame, backgrounds, extractor, settings, free, truth, renderer, ignore)
+        return optimize(run, scene, frame, backgrounds, networks, settings, free, truth, renderer, ignore)
 
     def _truth(self, frame: Frame) -> Truth:
         recording, _ = self._open()

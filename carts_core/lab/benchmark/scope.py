@@ -8,7 +8,9 @@ from ...settings import DOMAINS
 SYNTHETIC = "synthetic"
 REAL = "real"
 ROOMS = "rooms"
-"""Real instruments in other rooms; a source of that name and the camera's."""
+"""Instruments in other rooms; a source of that name and the camera's, or `synthetic`."""
+FAMILY = "family"
+"""Instruments of a family that no training has; a source of that name and the instrument's."""
 PAPERS_STEPS = 50
 """The paper's number of steps."""
 
@@ -18,9 +20,9 @@ class Run:
     """One method on one frame from one start."""
 
     source: str
-    """`synthetic`, `real`, or `rooms` and a camera."""
+    """`synthetic`, `real`, `rooms` and a camera, or `family` and an instrument."""
     domain: str
-    """One of the synthetic domains, `occlusion`, or a room."""
+    """One of the synthetic domains, `occlusion`, a room, or one of `wrong_inputs.WRONG`."""
     frame: int
     """Position in the sequence."""
     method: str
@@ -70,6 +72,8 @@ class Scope:
     """Frames, likewise, that are corrected together there."""
     room_share: int
     """Only every so many rooms are measured."""
+    family_frames: int
+    """Frames of each instrument that no training has; 0 leaves them out."""
 
     def steps(self, run: Run) -> int:
         """Steps in the paper's setting for a run."""
@@ -107,6 +111,7 @@ QUICK = Scope(
     room_frames=1,
     room_consecutive=0,
     room_share=8,
+    family_frames=1,
 )
 FULL = Scope(
     frames=8,
@@ -126,4 +131,5 @@ FULL = Scope(
     room_frames=2,
     room_consecutive=8,
     room_share=1,
+    family_frames=6,
 )

@@ -16,7 +16,7 @@ from ...model.mesh_cache import cache_dir
 from ...model.scene import Scene
 from ...recording import Frame, MeanBackground, Sequence
 from ...recording.background import spread
-from ...settings import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
+from ...settings import DOMAINS, EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ...wording import counted
 from ..synthesis.layout import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
@@ -25,10 +25,13 @@ from .backdrop import backdrop
 from .counterfactual import Counterfactual
 from .fingerprints import code_fingerprint
 from .rooms import made_rooms, photographs
-from .scope import REAL, ROOMS, SYNTHETIC, Scope
+from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
 """Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
+HELD_OUT = ("curved_scissors", "clip_applier")
+"""Built-in instruments of the families that no training has."""
+_FAMILY_DOMAINS = ("regular", "smoke")
 _MOTION_SECONDS = 6.0
 _SYNTHESIS = ("lab/synthesis/*.py", "settings/synthesis.py")
 _ROOMS_CODE = ("lab/benchmark/another_room.py", "lab/benchmark/rooms.py")
@@ -84,6 +87,10 @@ class Source:
     """Positions of frames that are corrected together."""
     rooms: list[str] = field(default_factory=list)
     """The rooms that these frames are put into, where that is what the source does."""
+    domains: tuple[str, ...] = DOMAINS
+    """The synthetic domains that it has."""
+    length: int = 1
+    """Frames of the whole recording."""
 
     @property
     def further(self) -> list[int]:
@@ -110,16 +117,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
         render=RenderConfig(samples=scope.samples),
     )
-    code = code_fingerprint(_SYNTHESIS)
-    fingerprint = hashlib.sha256(repr((config, code)).encode()).hexdigest()[:32]
-    folder = output_path(cache_dir(), "benchmark", f"sequence_{seed}_{fingerprint[:8]}")
-
-    def open_(progress: Progress) -> Sequence:
-        file = folder / "sequence.toml"
-        if not holds_file(file):
-            synthesize(config, folder, progress)
-        return Sequence.open(file.path)
-
+    fingerprint, open_ = _made_once(config)
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
     taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
@@ -132,7 +130,51 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         open_,
         cameras=tuple(camera.name for camera in place_cameras(config.endoscope)),
         consecutive=list(range(min(frames, scope.consecutive))),
+        length=frames,
     )
+
+
+def family_sources(scope: Scope, seed: int = TEST_SEED) -> list[Source]:
+    """A synthetic sequence for each instrument of the families that no training has."""
+    frames, sources = scope.family_frames, []
+    for robot in HELD_OUT if frames else ():
+        config = SynthesisConfig(
+            seed=seed,
+            name=f"{robot} {seed}",
+            robot=Path(f"builtin:{robot}"),
+            domains=_FAMILY_DOMAINS,
+            motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
+            render=RenderConfig(samples=scope.samples),
+        )
+        fingerprint, open_ = _made_once(config)
+        sources.append(
+            Source(
+                f"{FAMILY} {robot}",
+                f"seed {seed}: two arms, {counted(frames, 'frame')}, each in {counted(len(config.domains), 'domain')}",
+                "left",
+                list(range(frames)),
+                fingerprint,
+                open_,
+                cameras=("left",),
+                domains=config.domains,
+                length=frames,
+            )
+        )
+    return sources
+
+
+def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Sequence]]:
+    """The fingerprint of a synthetic sequence, and what makes it in the cache, or finds it there."""
+    fingerprint = hashlib.sha256(repr((config, code_fingerprint(_SYNTHESIS))).encode()).hexdigest()[:32]
+    folder = output_path(cache_dir(), "benchmark", f"sequence_{config.seed}_{fingerprint[:8]}")
+
+    def open_(progress: Progress) -> Sequence:
+        file = folder / "sequence.toml"
+        if not holds_file(file):
+            synthesize(config, folder, progress)
+        return Sequence.open(file.path)
+
+    return fingerprint, open_
 
 
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
@@ -171,7 +213,44 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         open_,
         cameras=tuple(camera.name for camera in sequence.scene.cameras),
         consecutive=consecutive,
+        length=len(sequence),
     )
+
+
+def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> Source:
+    """The instruments of the synthetic sequence, put into other rooms.
+
+    Args:
+        sequence: the synthetic one.
+        folder, scope, seed: as for `room_sources`.
+    """
+    rooms, fingerprint = _rooms(folder, scope, sequence.fingerprint, seed)
+    frames = [sequence.frames[place] for place in spread(len(sequence.frames), scope.room_frames)]
+
+    def open_(progress: Progress) -> AnotherRoom:
+        recording = sequence.open(progress)
+        assert isinstance(recording, Sequence), "what is made is a sequence on disk"
+        return AnotherRoom(recording, rooms, seed)
+
+    return Source(
+        f"{ROOMS} {SYNTHETIC}",
+        f"{counted(len(frames), 'frame')} in {counted(len(rooms), 'room')}",
+        sequence.camera,
+        frames,
+        fingerprint.hexdigest()[:32],
+        open_,
+        consecutive=[sequence.consecutive[i] for i in spread(len(sequence.consecutive), scope.room_consecutive)],
+        rooms=[room.domain for room in rooms],
+    )
+
+
+def _rooms(folder: Path | None, scope: Scope, *parts: object):
+    """The rooms, and a hash over them and what else is given."""
+    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
+    fingerprint = hashlib.sha256(repr((*parts, code_fingerprint(_ROOMS_CODE))).encode())
+    for photograph in sorted(folder.glob("*")) if folder else []:
+        fingerprint.update(photograph.name.encode() + read_bytes(photograph, IMAGE))
+    return rooms, fingerprint
 
 
 def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
@@ -188,10 +267,7 @@ def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST
         SettingsError: the folder holds no photograph.
     """
     sequence = Sequence.open(path)
-    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
-    fingerprint = hashlib.sha256(repr((read_bytes(path, SEQUENCE), seed, code_fingerprint(_ROOMS_CODE))).encode())
-    for photograph in sorted(folder.glob("*")) if folder else []:
-        fingerprint.update(photograph.name.encode() + read_bytes(photograph, IMAGE))
+    rooms, fingerprint = _rooms(folder, scope, read_bytes(path, SEQUENCE), seed)
     sources = []
     for camera in (known.name for known in sequence.scene.cameras):
         masked = [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]

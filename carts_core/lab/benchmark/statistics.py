@@ -10,7 +10,7 @@ from .measurement import Measurement, Score
 from .methods import MAIN
 from .occlusion import OCCLUSION
 from .rooms import Half
-from .scope import ROOMS
+from .scope import FAMILY, ROOMS
 
 ANY = object()
 """Matches every error at the start."""
@@ -47,12 +47,13 @@ class Measurements:
     ) -> list[Measurement]:
         """The measurements that match; what is not named matches everything, `error_deg=None` the measured start.
 
-        Pictures with occluders are none of the usual conditions: they match only where their domain is named.
+        Pictures with occluders, other rooms and instruments that no training has are none of the usual conditions: they
+        match only where their domain or source is named.
         """
         return [
             measurement
             for measurement in self.all
-            if source in (None, measurement.run.source)
+            if (measurement.run.source == source if source else _usual(measurement.run.source))
             and measurement.run.domain in ((domain,) if domain else DOMAINS)
             and method in (None, measurement.run.method)
             and (error_deg is ANY or measurement.run.error_deg == error_deg)
@@ -72,9 +73,14 @@ class Measurements:
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self) -> list[str]:
-        """The sources that occur, without other rooms, whose domains are none of the usual ones."""
+        """The usual sources that occur, without other rooms and other instruments."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
-        return [source for source in found if not source.startswith(ROOMS)]
+        return [source for source in found if _usual(source)]
+
+    def families(self) -> list[str]:
+        """The sources that occur of instruments that no training has."""
+        found = dict.fromkeys(measurement.run.source for measurement in self.all)
+        return [source for source in found if source.startswith(FAMILY)]
 
     def in_rooms(self, camera: str, half: Half, method: str) -> list[Measurement]:
         """Those of a camera's frames in the other rooms of one half."""
@@ -90,6 +96,10 @@ class Measurements:
         """The cameras whose frames were put into other rooms."""
         found = dict.fromkeys(m.run.source for m in self.all if m.run.source.startswith(ROOMS))
         return [source.removeprefix(ROOMS).strip() for source in found]
+
+
+def _usual(source: str) -> bool:
+    return not source.startswith((ROOMS, FAMILY))
 
 
 def scores(measurements: Iterable[Measurement], iterations: int | None = None) -> list[Score]:

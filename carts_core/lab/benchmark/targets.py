@@ -4,8 +4,9 @@ from .accuracy_targets import accuracy_targets
 from .speed_targets import speed_targets
 from .statistics import Measurements
 from .target import Target
+from .verdicts import verdict_targets
 
 
 def targets(data: Measurements) -> list[Target]:
     """All targets, also those that could not be computed from what is there."""
-    return [*speed_targets(data), *accuracy_targets(data)]
+    return [*speed_targets(data), *accuracy_targets(data), *verdict_targets(data)]

@@ -69,5 +69,19 @@ def correct_together(
         truth, state = truths[index], scene.state(frame_at(index).measured, mounts=frame_at(index).mounts)
         before = truth.score(state, None, None, renderer, 0.0)
         after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
-        found.append(Measurement(by_frame[index], after, (), (), estimate.start, machine(extractor.device), before))
+        assessment = estimate.assessment
+        found.append(
+            Measurement(
+                by_frame[index],
+                after,
+                (),
+                (),
+                estimate.start,
+                machine(extractor.device),
+                before,
+                verdict=assessment and assessment.verdict.value,
+                probability=assessment and assessment.probability,
+                within=truth.within(scene, estimate.joint_positions, estimate.joint_std),
+            )
+        )
     return found

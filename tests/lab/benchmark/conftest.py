@@ -31,6 +31,7 @@ TINY = Scope(
     room_frames=1,
     room_consecutive=2,
     room_share=16,
+    family_frames=0,
 )
 
 
@@ -63,6 +64,7 @@ def tiny_benchmark(tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps
             lambda progress: Sequence.open(path),
             cameras=("left", "right"),
             consecutive=[0, 1],
+            length=2,
         )
         results = ResultsFile(output_path(tmp_path, "bench", "measurements.jsonl"))
         return Benchmark(TINY, [source], FeatureExtractor.load(), results, plan(TINY, [source]))

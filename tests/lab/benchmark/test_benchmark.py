@@ -17,10 +17,12 @@ from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import output_path
 from carts_core.lab.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
 from carts_core.lab.benchmark.runner import _Bench
+from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
 
 QUIET = Console(quiet=True)
-RUNS = 46
-"""30 of the main table, 2 with an error at the start, 6 with occluders, 4 with both cameras, 4 in sequence mode."""
+RUNS = 51
+"""30 of the main table, 2 with an error at the start, 3 with something wrong, 6 with occluders, 4 with both cameras, 2
+with masks as the target, 4 in sequence mode."""
 
 
 @pytest.fixture
@@ -51,10 +53,16 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     held, posed = by_method["stereo"], by_method["stereo_posed"]
     assert replace(posed.run, method="stereo") == held.run and posed.final.dice != held.final.dice
     for measurement in measurements:
-        assert 0.0 <= measurement.final.nsd <= 1.0 and 0.3 < measurement.final.dice <= 1.0
+        assert 0.0 <= measurement.final.nsd <= 1.0
+        assert measurement.run.domain in WRONG or 0.3 < measurement.final.dice <= 1.0
         assert measurement.final.seconds > 0
         if measurement.run.error_deg and measurement.start:
             assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
+    judged = [m for m in measurements if m.run.method in ("ours", "masks", "sequence")]
+    assert all(m.verdict in ("good", "doubtful", "failed") and m.probability is not None for m in judged)
+    assert all(m.within and 0 <= m.within[1] <= m.within[2] <= m.within[0] == 7 for m in judged)
+    (nothing,) = [m for m in measurements if m.run.domain == NO_ARM]
+    assert nothing.final.dice == 0.0 and nothing.verdict == "failed"
     tiny_benchmark().run(QUIET)
     assert len(count_runs) == RUNS
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")

@@ -1,0 +1,113 @@
+"""How often verdicts and deviations were right, from measurements made by hand."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from handmade import make_measurement
+
+from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, plan, synthetic_source, targets
+from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
+from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.benchmark.verdicts import deviation_table, family_table, verdict_table
+from carts_core.lab.benchmark.wrong_inputs import NO_ARM, OTHER_CAMERA, OTHER_FRAME, misled, wrong_inputs
+from carts_core.recording import Sequence
+
+
+def _judged(
+    dice: float,
+    verdict: str,
+    probability: float,
+    frame: int = 0,
+    source: str = "synthetic",
+    domain: str = "regular",
+) -> Measurement:
+    found = make_measurement((0.85, dice), frame=frame, source=source, domain=domain)
+    return replace(found, verdict=verdict, probability=probability, within=(10, 7, 9))
+
+
+FRAMES = [
+    _judged(0.97, "good", 0.02),
+    _judged(0.93, "doubtful", 0.3, 1),
+    _judged(0.0, "failed", 0.99, 2, domain=NO_ARM),
+    _judged(0.7, "good", 0.05, 3),
+]
+
+
+def _target(start: str, *measurements: Measurement):
+    (found,) = [target for target in targets(Measurements(measurements)) if target.what.startswith(start)]
+    return found
+
+
+def test_the_area_under_the_roc_is_how_often_a_wrong_mask_is_held_for_less_likely() -> None:
+    # Wrong at 0.99 and 0.05, right at 0.02 and 0.3: three of four pairs are in order.
+    assert _target("verdict against Dice", *FRAMES).reached == "0.750"
+    assert _target("verdict against Dice", *FRAMES[:3]).met is True
+    assert _target("verdict against Dice", FRAMES[0], FRAMES[3]).met is None, "nothing was wrong about any input"
+
+
+def test_a_wrong_mask_that_is_called_good_and_one_that_was_made_worse_are_counted() -> None:
+    for what in ("called good though", "made worse than the start and called good"):
+        assert _target(what, *FRAMES).reached == "50.0 %" and _target(what, *FRAMES).met is False
+        assert _target(what, *FRAMES[:3]).met is True
+
+
+def test_shares_of_errors_are_compared_with_a_gaussians() -> None:
+    found = _target("errors of joints within one", *FRAMES)
+    assert found.reached == "2.0" and found.met is True and found.basis == "70.0 % of 40 joint positions"
+    assert _target("errors of joints within two", *FRAMES).met is False
+
+
+def test_the_verdict_table_has_a_row_per_condition_and_one_of_all() -> None:
+    table = verdict_table(Measurements(FRAMES))
+    assert table is not None
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
+    assert rows["all"] == ["4", "2", "2", "1", "1", "0.750"]
+    assert rows["synthetic: no arm"] == ["1", "1", "0", "0", "0", "–"]
+    deviations = deviation_table(Measurements(FRAMES))
+    assert deviations is not None and [cell.text for cell in deviations.rows[0][2:]] == ["70 %", "90 %"]
+
+
+def test_other_instruments_have_a_table_and_targets_and_count_nowhere_else() -> None:
+    scissors = _judged(0.94, "good", 0.02, source="family curved_scissors")
+    data = Measurements([*FRAMES, scissors])
+    assert data.sources() == ["synthetic"] and scissors not in data.of(method="ours")
+    table = family_table(data)
+    assert table is not None
+    assert [cell.text for cell in table.rows[0]] == ["curved_scissors", "regular", "1", "85.0", "94.0"]
+    assert _target("curved_scissors", *data.all).met is False
+
+
+def test_rooms_and_other_instruments_are_planned_without_real_frames() -> None:
+    made = synthetic_source(QUICK)
+    sources = [made, synthetic_room_source(made, None, QUICK), *family_sources(QUICK)]
+    runs = plan(QUICK, sources)
+    rooms = [run for run in runs if run.source == "rooms synthetic"]
+    assert {run.method for run in rooms} == {"ours", "acs"} and {run.domain for run in rooms} == set(sources[1].rooms)
+    families = [run for run in runs if run.source.startswith("family")]
+    assert {run.source for run in families} == {f"family {name}" for name in HELD_OUT}
+    assert {run.domain for run in families} == {"regular", "smoke"} and {run.error_deg for run in families} == {2.0}
+    assert {run.domain for run in runs} >= {NO_ARM, OTHER_FRAME, OTHER_CAMERA}
+    assert len(set(runs)) == len(runs)
+    assert len(family_sources(FULL)[0].frames) == FULL.family_frames
+
+
+def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> None:
+    path: Path = tiny_sequence(frames=4, cameras=("left", "right"), width=160, height=128)
+    sequence = Sequence.open(path)
+    right = sequence.frame(1, "regular")
+    assert right.masks is not None
+    empty, joints, image = (misled(sequence, kind, 1, "left") for kind in wrong_inputs(4, 2))
+    assert empty.masks is not None and not empty.masks["left"].any()
+    np.testing.assert_array_equal(empty.images["left"], sequence.background("left", "regular"))
+    np.testing.assert_array_equal(joints.measured["PSM1"], sequence.frame(3, "regular").measured["PSM1"])
+    np.testing.assert_array_equal(joints.images["left"], right.images["left"])
+    np.testing.assert_array_equal(image.images["left"], right.images["right"])
+    assert image.masks is not None
+    np.testing.assert_array_equal(image.masks["left"], right.masks["right"])
+
+
+@pytest.mark.parametrize(("frames", "cameras", "kinds"), [(1, 1, 1), (2, 1, 2), (2, 2, 3)])
+def test_what_a_recording_lacks_is_not_planned(frames: int, cameras: int, kinds: int) -> None:
+    assert len(wrong_inputs(frames, cameras)) == kinds
