@@ -77,6 +77,16 @@ class FoundArm:
 
 
 @dataclass(frozen=True, eq=False)
+class FoundMotion:
+    """Where what carries the cameras was over time."""
+
+    times: Float[np.ndarray, " rows"]
+    """In the recording's seconds, increasing."""
+    Ts_world_mount: Float[np.ndarray, "rows 4 4"]
+    """[m]"""
+
+
+@dataclass(frozen=True, eq=False)
 class FoundRecording:
     """All that a source holds."""
 
@@ -91,5 +101,7 @@ class FoundRecording:
     notes: tuple[Note, ...] = ()
     time_offset: float = 0.0
     """Time in the kinematics minus time of the image [s]."""
+    motion: FoundMotion | None = None
+    """Of all cameras; None for cameras that stay."""
     domains: Mapping[str, str] = field(default_factory=dict)
     """Domain -> what stands for {domain} in patterns; empty for one domain."""

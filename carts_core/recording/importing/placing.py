@@ -45,27 +45,26 @@ def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], No
         return recording
     wanted = recording.frame_times + recording.time_offset
     keep = np.ones(len(wanted), bool)
-    for arm in recording.arms:
-        if arm.times is None:
-            continue
-        after = np.searchsorted(arm.times, wanted).clip(0, len(arm.times) - 1)
-        before = np.where(arm.times[after] > wanted, after - 1, after).clip(0)
-        gaps = np.maximum(np.abs(wanted - arm.times[before]), np.abs(arm.times[after] - wanted))
+    logs = [(arm.name, arm.times) for arm in recording.arms if arm.times is not None]
+    if recording.motion is not None and logs:
+        logs.append(("the endoscope", recording.motion.times))
+    for name, times in logs:
+        after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
+        before = np.where(times[after] > wanted, after - 1, after).clip(0)
+        gaps = np.maximum(np.abs(wanted - times[before]), np.abs(times[after] - wanted))
         keep &= gaps <= MAX_GAP
-        spacing = np.diff(arm.times)
+        spacing = np.diff(times)
         if (long := spacing > MAX_GAP).any():
             note(
                 Note(
                     "warning",
-                    f"{arm.name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.",
+                    f"{name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.",
                 )
             )
     if keep.all():
         return recording
     if not keep.any():
-        spans = "; ".join(
-            f"{arm.name} {arm.times[0]:.3f} to {arm.times[-1]:.3f} s" for arm in recording.arms if arm.times is not None
-        )
+        spans = "; ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times in logs)
         raise SequenceError(
             f"{recording.name}: no frame has joint positions within {MAX_GAP} s. Images are from {wanted[0]:.3f} to "
             f"{wanted[-1]:.3f} s, kinematics: {spans}. Clocks or their units differ: give --time-offset or --clock."

@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
@@ -15,10 +16,12 @@ from ...model.instruments import SCHEME, robot_file
 from ...model.psm_kinematics import JOINT_NAMES
 from ...model.urdf_check import parsed_urdf
 from .. import Sequence
+from ..camera_motion import ORIENTATION, POSITION
 from .found import FoundArm, FoundCamera, FoundRecording
 from .placing import MAX_GAP
 
 FRAMES = "frames.csv"
+MOTION = "endoscope.csv"
 _HANDLE = "frame"
 
 
@@ -81,9 +84,26 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
             rows = np.column_stack([arm.times - start, arm.values])
             np.savetxt(stream, rows, "%.9f", ",", header=",".join(["timestamp", *arm.columns]), comments="")
             tables[_table_of(arm)] = stream.getvalue()
+    if _moves(recording):
+        tables[MOTION] = _motion_table(recording, start)
     rows = zip(*frame_columns.values(), strict=True)
     lines = [",".join(frame_columns), *(",".join(cells) for cells in rows)]
     return {FRAMES: ("\n".join(lines) + "\n").encode(), **tables}
+
+
+def _moves(recording: FoundRecording) -> bool:
+    """Whether where the cameras are is written; only logs with times have a place for it."""
+    return recording.motion is not None and any(arm.times is not None for arm in recording.arms)
+
+
+def _motion_table(recording: FoundRecording, start: float) -> bytes:
+    assert recording.motion is not None
+    Ts, stream = recording.motion.Ts_world_mount, io.BytesIO()
+    rows = np.column_stack(
+        [recording.motion.times - start, Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]
+    )
+    np.savetxt(stream, rows, "%.9f", ",", header=",".join(["timestamp", *POSITION, *ORIENTATION]), comments="")
+    return stream.getvalue()
 
 
 def _start(recording: FoundRecording) -> float:
@@ -129,7 +149,7 @@ def _toml(recording: FoundRecording, place: Path) -> str:
     for arm in recording.arms:
         lines += _arm_lines(arm, place, bool(timed))
     for camera in recording.cameras:
-        lines += _camera_lines(camera, place)
+        lines += _camera_lines(camera, place, _moves(recording))
     return "\n".join(lines) + "\n"
 
 
@@ -163,7 +183,7 @@ def _arm_lines(arm: FoundArm, place: Path, timed: bool) -> list[str]:
     return lines
 
 
-def _camera_lines(camera: FoundCamera, place: Path) -> list[str]:
+def _camera_lines(camera: FoundCamera, place: Path, moves: bool) -> list[str]:
     assert camera.intrinsics is not None
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
     images = _relative(camera.images, place)
@@ -186,6 +206,8 @@ def _camera_lines(camera: FoundCamera, place: Path) -> list[str]:
         lines += [f"topic = {_text(camera.topic)}", f"message_time = {_text(_column(camera))}"]
     elif camera.numbers is not None:
         lines.append(f"video_frame = {_text(_column(camera))}")
+    if moves:
+        lines.append(f"motion = {_text(MOTION)}  # where the camera is, in the world that it is at the first image")
     if camera.masks:
         masks = Path(camera.masks)
         parent = _relative(masks.parent, place).replace("{{", "{").replace("}}", "}")

@@ -1,7 +1,6 @@
 """ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that speak CRTK."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,10 @@ from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, camera_from_info, side_of
 from ..importing.found import FoundCamera, FoundRecording, Note, recording_name
 from ..importing.logs import ArmLog, arm_from_log, track
+from .bag_messages import header_time, messages, raw_messages, stamp_of, values_of
+from .ecm import read_endoscope
 from .protocol import Source
+from .separate_images import separate_images
 
 _ARM_TOPIC = re.compile(r"^(?P<prefix>/|.*/)(?P<arm>PSM\d?)/(?P<rest>.+)$", re.IGNORECASE)
 _ROLES = {
@@ -78,13 +80,13 @@ def read_arm_logs(reader: Any, path: Path, options: ImportOptions) -> list[ArmLo
         raise SequenceError(f"{path} has no arm {missing[0]!r}. It has: {', '.join(sorted(seen)) or 'none'}.")
     rows: dict[str, _Rows] = {}
     connections = [connection for connection in reader.connections if connection.id in wanted]
-    for connection, bag_time, message in _messages(reader, connections, path) if connections else ():
+    for connection, bag_time, message in messages(reader, connections, path) if connections else ():
         arm, role = wanted[connection.id]
         entry = rows.setdefault(arm, _Rows())
         if role == "tool":
             entry.tool = str(message.data)
-        elif (values := _values(message, role)) is not None:
-            getattr(entry, role).append((_stamp(message, bag_time), *values))
+        elif (values := values_of(message, role)) is not None:
+            getattr(entry, role).append((stamp_of(message, bag_time), *values))
     return [
         ArmLog(
             arm,
@@ -103,42 +105,6 @@ def _role(match: re.Match[str]) -> str | None:
     if match["prefix"].rstrip("/").endswith("SUJ"):
         return "setup" if match["rest"] == "measured_cp" else None
     return _ROLES.get(match["rest"])
-
-
-def _messages(reader: Any, connections: list[Any], path: Path) -> Iterator[tuple[Any, int, Any]]:
-    """Decoded messages; what rosbags raises becomes a sentence."""
-    messages = reader.messages(connections)
-    while True:
-        try:
-            entry = next(messages, None)
-            if entry is None:
-                return
-            connection, time, raw = entry
-            message = reader.deserialize(raw, connection.msgtype)
-        except Exception as error:  # rosbags raises whatever its storage formats raise
-            raise SequenceError(
-                f"bag {path} is damaged or was cut off ({error}). Copy it again, or reindex it."
-            ) from error
-        yield connection, time, message
-
-
-def _stamp(message: Any, bag_time: int) -> float:
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    nanoseconds = bag_time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
-    return nanoseconds * 1e-9
-
-
-def _values(message: Any, role: str) -> tuple[float, ...] | None:
-    if role in ("joints", "jaw"):
-        positions = np.asarray(message.position, np.float64)
-        count = 6 if role == "joints" else 1
-        return tuple(positions[:count]) if len(positions) >= count else None
-    pose = getattr(message, "pose", None) or getattr(message, "transform", None)
-    if pose is None:
-        return None
-    p = getattr(pose, "position", None) or pose.translation
-    q = getattr(pose, "orientation", None) or pose.rotation
-    return (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
 
 
 def _image_topics(reader: Any, path: Path, options: ImportOptions) -> dict[str, str]:
@@ -179,37 +145,15 @@ def _image_times(reader: Any, path: Path, topic: str) -> tuple[np.ndarray, np.nd
         record = sorted(
             entry.time for index in indexes if index for connection in connections for entry in index[connection.id]
         )
-    for count, (connection, time, raw) in enumerate(_raw_messages(reader, connections, path)):
+    for count, (connection, time, raw) in enumerate(raw_messages(reader, connections, path)):
         if record and count == _SAMPLED:
             break
-        stamps.append(_header_time(raw, connection, reader, time) - time)
+        stamps.append(header_time(raw, connection, reader, time) - time)
         if not record or count >= len(record):
             record.append(time)
     times = np.array(record, np.int64)
     late = np.array(stamps, np.int64) if len(stamps) == len(times) else np.int64(np.median(stamps)) if stamps else 0
     return times, (times + late) * 1e-9
-
-
-def _raw_messages(reader: Any, connections: list[Any], path: Path) -> Iterator[tuple[Any, int, bytes]]:
-    messages = reader.messages(connections)
-    while True:
-        try:
-            entry = next(messages, None)
-        except Exception as error:  # rosbags raises whatever its storage formats raise
-            raise SequenceError(
-                f"bag {path} is damaged or was cut off ({error}). Copy it again, or reindex it."
-            ) from error
-        if entry is None:
-            return
-        yield entry
-
-
-def _header_time(raw: bytes, connection: Any, reader: Any, bag_time: int) -> int:
-    """The stamp of a message that begins with a header, without decoding its pixels."""
-    start = 4  # ROS 1 has the sequence number there, ROS 2 the encapsulation.
-    seconds = int.from_bytes(raw[start : start + 4], "little")
-    nanoseconds = int.from_bytes(raw[start + 4 : start + 8], "little")
-    return seconds * 10**9 + nanoseconds if seconds and nanoseconds < 10**9 else bag_time
 
 
 def _cameras(
@@ -243,7 +187,7 @@ def _cameras(
 
 def _size(reader: Any, path: Path, topic: str) -> tuple[int, int]:
     connections = [connection for connection in reader.connections if connection.topic == topic]
-    for _, _, message in _messages(reader, connections, path):
+    for _, _, message in messages(reader, connections, path):
         image = decode_message(message, f"{path}, {topic}")
         return image.shape[1], image.shape[0]
     raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one with --images.")
@@ -256,7 +200,7 @@ def _camera_info(reader: Any, path: Path, topic: str) -> Any:
     chosen = [info for parent in parents for info in infos if info.topic.rsplit("/", 1)[0] == parent]
     side = side_of(topic)
     chosen += [info for info in infos if side is not None and side_of(info.topic) == side]
-    for _, _, message in _messages(reader, chosen[:1], path) if chosen else ():
+    for _, _, message in messages(reader, chosen[:1], path) if chosen else ():
         return message
     return None
 
@@ -267,7 +211,13 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         if not reader.connections:
             raise SequenceError(f"bag {path} has no messages. Record again, or copy it again.")
         notes: list[Note] = []
-        cameras, frame_times = _cameras(reader, path, options, notes)
+        topics = [connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES]
+        beside = separate_images(path, topics, options, notes)
+        if beside is None:
+            cameras, frame_times = _cameras(reader, path, options, notes)
+            ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
+        else:
+            cameras, frame_times, ids = beside.cameras, beside.times, beside.ids
         logs = read_arm_logs(reader, path, options)
         if not logs:
             known = ", ".join(sorted(connection.topic for connection in reader.connections))
@@ -276,11 +226,15 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
                 f"names of dVRK 1.x). Its topics are: {known}."
             )
         arms = tuple(arm_from_log(log, options, notes.append) for log in logs)
+        offset = options.time_offset
+        if offset is None:
+            offset = 0.0 if beside is None else beside.offset(arms, notes)
+        first = float(frame_times[0]) + offset if len(frame_times) else 0.0
+        motion = read_endoscope(reader, path, first, notes.append) if len(frame_times) else None
     finally:
         reader.close()
-    ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
-    offset = options.time_offset or 0.0
-    return FoundRecording("a ROS bag", recording_name(path), cameras, arms, ids, frame_times, tuple(notes), offset)
+    name = recording_name(path)
+    return FoundRecording("a ROS bag", name, cameras, arms, ids, frame_times, tuple(notes), offset, motion)
 
 
 SOURCE = Source(

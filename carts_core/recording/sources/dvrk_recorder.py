@@ -18,11 +18,12 @@ from ..image_sources import open_bag
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, side_of
 from ..importing.foreign_tables import ForeignTable, read_foreign_table
-from ..importing.found import FoundCamera, FoundRecording, Note
+from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Note
 from ..importing.logs import ArmLog, Track, arm_from_log, track
 from ..importing.media import find_images
 from ..video import SUFFIXES
 from .bag import read_arm_logs
+from .ecm import read_endoscope
 from .protocol import Source
 
 _SIDES = {"LR": ("left", "right"), "RL": ("right", "left")}
@@ -198,16 +199,19 @@ def _cameras(
     return tuple(cameras), leader.times
 
 
-def _logs(path: Path, options: ImportOptions) -> list[ArmLog]:
+def _logs(
+    path: Path, options: ImportOptions, start: float, notes: list[Note]
+) -> tuple[list[ArmLog], FoundMotion | None]:
     bags = [each for each in sorted(path.iterdir()) if (each / "metadata.yaml").is_file()]
     bags += sorted(path.glob("*.mcap"))
     if bags:
         reader = open_bag(bags[0])
         try:
-            return read_arm_logs(reader, bags[0], options)
+            motion = read_endoscope(reader, bags[0], start, notes.append)
+            return read_arm_logs(reader, bags[0], options), motion
         finally:
             reader.close()
-    return _extracted(path, options)
+    return _extracted(path, options), None
 
 
 def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
@@ -245,7 +249,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     if not streams:
         raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the session again, whole.")
     cameras, times = _cameras(streams, options, notes)
-    logs = _logs(path, options)
+    logs, motion = _logs(path, options, float(times[0]), notes)
     if not logs:
         raise SequenceError(
             f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
@@ -260,7 +264,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         )
     ids = tuple(f"{number:06d}" for number in range(len(times)))
     return FoundRecording(
-        "a session of the dVRK's recorder", path.name, cameras, arms, ids, times, tuple(notes), offset
+        "a session of the dVRK's recorder", path.name, cameras, arms, ids, times, tuple(notes), offset, motion
     )
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from carts_core.errors import CartsError
 from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.ecm_kinematics import forward as ecm
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording.importing.importer import import_recording
 
@@ -38,6 +39,12 @@ def joints_at(time: np.ndarray | float) -> np.ndarray:
 
 def jaw_at(time: np.ndarray | float) -> np.ndarray:
     return 0.3 + 0.2 * np.sin(np.asarray(time, np.float64))
+
+
+def endoscope_at(time: np.ndarray | float) -> np.ndarray:
+    """Four joints of the ECM [rad, m] at times [s]."""
+    phase = np.asarray(time, np.float64)[..., None] * [1.0, 1.3, 0.8, 1.1]
+    return np.array([0.1, -0.2, 0.11, 0.3]) + np.array([0.05, 0.04, 0.01, 0.1]) * np.sin(phase)
 
 
 def image(number: int, camera: str = "left") -> np.ndarray:
@@ -72,6 +79,8 @@ class BagKind:
     cameras: tuple[str, ...] = ("left", "right")
     arms: tuple[str, ...] = ("PSM1",)
     frames: int = 6
+    endoscope: str = ""
+    """Topic below /ECM that says where the endoscope is; none by default."""
     info: Callable[[dict[str, Any]], None] | None = None
     """Changes the values of every camera_info."""
 
@@ -134,10 +143,22 @@ def _messages(store: Any, kind: BagKind):
                 yield time + 950_000, f"{prefix}/{topic}", _pose(make, header(time + 300_000, "ECM"), pose, kind)
         if kind.generation == "2.2":
             yield START, f"{prefix}/tool_type", make("std_msgs/msg/String", data="LARGE_NEEDLE_DRIVER:400006[1]")
+    yield from _endoscope_messages(make, header, kind)
     for camera in kind.cameras:
         for frame in range(kind.frames):
             time = START + frame * 80_000_000 + (1_000_000 if camera == "right" else 0)
             yield from _image_messages(make, header(time, camera), time + 5_000_000, frame, camera, kind)
+
+
+def _endoscope_messages(make: Any, header: Any, kind: BagKind):
+    for row in range(-5, 8 * kind.frames + 5) if kind.endoscope else ():
+        time, q = START + row * 10_000_000, endoscope_at(row / 100)
+        if kind.endoscope.endswith("_js"):
+            values = {"name": ["yaw"] * 4, "position": q, "velocity": np.empty(0), "effort": np.empty(0)}
+            message = make("sensor_msgs/msg/JointState", header=header(time, ""), **values)
+        else:
+            message = _pose(make, header(time, "world"), ecm(q), kind)
+        yield time + 800_000, f"/ECM/{kind.endoscope}", message
 
 
 def _pose(make: Any, header: Any, T: np.ndarray, kind: BagKind) -> Any:

@@ -5,10 +5,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import SIZE, T_CAMERA_BASE, BagKind, K, image, jaw_at, joints_at, write_bag
+from recordings import (
+    SIZE,
+    START,
+    T_CAMERA_BASE,
+    BagKind,
+    K,
+    endoscope_at,
+    image,
+    jaw_at,
+    joints_at,
+    write_bag,
+    write_images,
+    write_video,
+)
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
+from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.ecm_kinematics import forward as ecm
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.rendering import Renderer
@@ -73,6 +88,59 @@ def test_base_frames_come_from_what_the_bag_knows_of_itself(tmp_path):
     (path, found) = import_recording(bag, tmp_path / "out", ImportOptions())
     assert rendered_pixels(Sequence.open(path), 0, "left") > 50
     assert found.arms[0].base_from == "measured_cp and local/measured_cp"
+
+
+@pytest.mark.parametrize("topic", ["measured_cp", "local/measured_cp", "measured_js"])
+def test_an_endoscope_that_moves_gives_the_cameras_a_motion(tmp_path: Path, topic: str) -> None:
+    path = write_bag(tmp_path / "bag", BagKind(endoscope=topic, frames=10))
+    file, found = import_recording(path, tmp_path / "out", ImportOptions())
+    sequence = Sequence.open(file)
+    assert sequence.moving_cameras == ("left", "right")
+    first = ecm(endoscope_at(0.0))
+    for index in (0, 4, 9):
+        moved = T_DVRK_OPENCV @ np.linalg.inv(ecm(endoscope_at(0.08 * index))) @ first @ T_DVRK_OPENCV
+        assert np.allclose(sequence.mounts(index)["left"], moved, atol=2e-4)
+    assert any("the endoscope (ECM) moves by up to" in note.text for note in found.notes)
+
+
+def test_an_endoscope_that_stands_still_is_a_camera_as_any_other(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("recordings.endoscope_at", lambda time: np.array([0.1, -0.2, 0.11, 0.3]))
+    path = write_bag(tmp_path / "bag", BagKind(endoscope="measured_js"))
+    file, found = import_recording(path, tmp_path / "out", ImportOptions())
+    assert not Sequence.open(file).moving_cameras and not (tmp_path / "out" / "endoscope.csv").exists()
+    assert any(note.text == "the endoscope (ECM) stands still." for note in found.notes)
+
+
+def test_a_bag_without_images_gets_those_of_a_video_beside_it(tmp_path: Path, capsys) -> None:
+    path = write_bag(tmp_path / "bag", BagKind(cameras=(), frames=10))
+    write_video(tmp_path / "left.mp4", [image(number) for number in range(10)], rate=20)
+    main(["import", str(path), "--images", "left", "left.mp4", "-o", str(tmp_path / "out")])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the clocks do not overlap: images and kinematics are taken to begin together" in said
+    assert "carts time-offset" in said
+    sequence = Sequence.open(tmp_path / "out" / "sequence.toml")
+    assert len(sequence) == 10 and sequence.timestamps is not None
+    assert np.allclose(np.diff(sequence.timestamps), 0.05)
+    # The log begins 50 ms before the images of a bag would.
+    assert np.abs(sequence.frame(4).measured["PSM1"][:6] - joints_at(0.2 - 0.05)).max() < 2e-3
+    assert np.abs(sequence.frame(4).images["left"].astype(int) - image(4)).mean() < 12
+    assert rendered_pixels(sequence, 4, "left") > 50
+    clock = ["--time-offset", f"{START * 1e-9}"]
+    main(["import", str(path), "--images", "left", "left.mp4", *clock, "-o", str(tmp_path / "own")])
+    timed = Sequence.open(tmp_path / "own" / "sequence.toml")
+    assert np.abs(timed.frame(4).measured["PSM1"][:6] - joints_at(0.2)).max() < 2e-3
+
+
+def test_images_beside_a_bag_without_times_are_asked_for_their_rate(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", BagKind(cameras=("right",)))
+    write_images(tmp_path / "pictures", 5)
+    with pytest.raises(CartsError, match=r"have no times\. Say how many there are a second: --frame-rate"):
+        import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}))
+    file, _ = import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}, frame_rate=20))
+    assert np.array_equal(Sequence.open(file).frame(3).images["left"], image(3))
+    both = {"left": "pictures", "right": "/stereo/right/image_raw/compressed"}
+    with pytest.raises(CartsError, match="either all topics of the bag or all files beside it"):
+        import_recording(path, tmp_path / "both", ImportOptions(images=both, frame_rate=20))
 
 
 def test_the_user_chooses_topics_arms_and_the_time_offset(tmp_path):
