@@ -20,7 +20,7 @@ view: setup ## Open the start page in the browser (or SEQUENCE=path/to/sequence.
 
 test: lint docs ## Check style and types, build the documentation, and run the tests, browser included
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
-	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not gpu" $(ARGS)
+	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not gpu" $(ARGS)
 
 lint: setup-dev ## Check style, formatting and types
 	$(BIN)/ruff check

@@ -124,7 +124,7 @@ def test_a_missing_extra_is_said_with_the_command_that_installs_it(monkeypatch):
         extras.needs_extra("xacrodoc", "import")
 
 
-@pytest.mark.parametrize("number", ["400006", "420093"])
+@pytest.mark.parametrize("number", [pytest.param("400006", marks=pytest.mark.slow), "420093"])
 def test_the_real_trees_instruments_have_the_controllers_kinematics(shared_dir, tmp_path, number):
     path = tmp_path / "psm.urdf"
     path.write_text(dvrk_urdf(shared_dir / "robots/dvrk_model", number, tmp_path))

@@ -139,19 +139,22 @@ def test_a_portrait_shows_the_tip_whole_before_its_backdrop() -> None:
     assert backdrop[-4:].all()
 
 
+SLOW = pytest.mark.slow  # Real meshes are large, and are decimated first.
+
+
 @pytest.mark.skipif(not DVRK_MODEL.is_dir(), reason="dvrk_model is not beside this checkout")
 @pytest.mark.parametrize(
-    ("name", "number", "least"),
+    ("name", "number"),
     [
-        ("mega_needle_driver", "400194", 0.85),
-        ("maryland_bipolar_forceps", "400172", 0.85),
-        ("prograsp_forceps", "400093", 0.85),
-        ("cautery_hook", "400183", 0.85),
-        ("cautery_spatula", "400184", 0.85),
-        ("clip_applier_si", "420327", 0.85),
+        ("maryland_bipolar_forceps", "400172"),
+        pytest.param("mega_needle_driver", "400194", marks=SLOW),
+        pytest.param("prograsp_forceps", "400093", marks=SLOW),
+        pytest.param("cautery_hook", "400183", marks=SLOW),
+        pytest.param("cautery_spatula", "400184", marks=SLOW),
+        pytest.param("clip_applier_si", "420327", marks=SLOW),
     ],
 )
-def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, least: float, tmp_path: Path) -> None:
+def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, tmp_path: Path) -> None:
     urdf = tmp_path / "real.urdf"
     urdf.write_text(dvrk_urdf(DVRK_MODEL, number, tmp_path))
     ours, real = Robot.load(f"builtin:{name}"), Robot.load(urdf)
@@ -161,7 +164,7 @@ def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, l
         joints = np.r_[0.0, 0.0, 0.1, rng.uniform(-2, 2), rng.uniform(-0.7, 0.7, 2), rng.uniform(0, 0.6)]
         masks = [_tip_mask(robot, joints[: len(robot.joint_names)]) for robot in (ours, real)]
         overlaps.append((masks[0] & masks[1]).sum() / (masks[0] | masks[1]).sum())
-    assert np.mean(overlaps) > least
+    assert np.mean(overlaps) > 0.85
 
 
 def _tip_mask(robot: Robot, joints: np.ndarray) -> np.ndarray:
