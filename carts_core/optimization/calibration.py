@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float
 
@@ -261,6 +260,8 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
     before, after = getattr(start, name)[index], getattr(state, name)[index]
     if torch.equal(before, after):
         return given
+    import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second
+
     result = after.cpu().double()
     result[:3, :3] = roma.special_procrustes(result[:3, :3])
     return result.numpy()

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -242,6 +241,8 @@ class Variables:
         return self.state(torch.cat([offsets[None], offsets - step, offsets + step]))
 
     def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+        import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second; joints do without
+
         rotation = roma.rotvec_to_rotmat(step[..., :3])
         translation = step[..., 3:] * self._length_scale
         top = torch.cat([rotation, translation[..., None]], -1)
