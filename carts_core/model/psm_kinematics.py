@@ -126,7 +126,7 @@ def forward(joints: Float[np.ndarray, "*batch 6"], geometry: PsmGeometry = CLASS
 
 
 def modified_dh(alpha: float, a: float, theta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Rx(alpha) Tx(a) Rz(theta) Tz(d), [*batch, 4, 4]."""
+    """Rx(alpha) Tx(a) Rz(theta) Tz(d) of the modified convention, [batch ..., 4, 4]."""
     c, s = np.cos(theta), np.sin(theta)
     ca, sa = np.cos(alpha), np.sin(alpha)
     T = np.zeros((*theta.shape, 4, 4))
