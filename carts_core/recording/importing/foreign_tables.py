@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -174,7 +175,10 @@ def _array(content: bytes) -> np.ndarray:
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, kind = header(stream)
+    try:
+        shape, _, kind = header(stream)
+    except (SyntaxError, tokenize.TokenError) as error:  # NumPy reads headers as Python's literals.
+        raise ValueError(f"its header is damaged ({error})") from error
     if kind.itemsize * math.prod(shape) > len(content):
         raise ValueError(f"its header says {shape}, and it has {len(content)} bytes")
     stream.seek(0)

@@ -37,8 +37,12 @@ def write_csv(path: Path, header: list[str], rows: np.ndarray, delimiter: str = 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Of `lab`, under an awkward name."""
+    return lab(tmp_path / "Recording {1}")
+
+
+def lab(source: Path) -> Path:
     """Two cameras, joints in degrees and millimetres under names of their own, and a ROS calibration."""
-    source = tmp_path / "Recording {1}"
     write_images(source / "imgs_left", FRAMES, "img_{:04d}.png")
     write_images(source / "imgs_right", FRAMES, "img_{:04d}.png", "right")
     q = joints_at(np.arange(FRAMES) / 10)
