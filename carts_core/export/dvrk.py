@@ -17,13 +17,10 @@ from jaxtyping import Float
 
 from ..errors import CartsError
 from ..files import OutputPath, write_text
-from ..model.camera import Camera
+from ..model.camera import T_DVRK_OPENCV, Camera
 from ..model.scene import Arm
 from .dataset import Dataset
 from .monitor import Monitor
-
-T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From OpenCV's camera frame to the dVRK's; its own inverse."""
 
 
 def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:

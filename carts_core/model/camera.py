@@ -24,6 +24,9 @@ EXACT = 1e-9
 LAST_ROW_TOLERANCE = 1e-6
 """How far the last row may be from 0, 0, 0, 1, as matrices in single precision are."""
 
+T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""From OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
+
 FARTHEST = 1e6
 """Largest coordinate of a transform [m], of a focal length and of a principal point [px]."""
 

@@ -10,7 +10,6 @@ from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
 from ..model.scene import Scene, SceneState
-from ..rendering import Renderer
 
 FRAMES = 30
 """How many frames, spread evenly over the recording, the estimate looks at."""
@@ -70,6 +69,9 @@ def background_of_recording(
     Raises:
         SequenceError: the whole image is covered in every view.
     """
+    # What only reads or imports recordings does without the renderer, and without its compiler in memory.
+    from ..rendering import Renderer  # noqa: PLC0415
+
     renderer = Renderer(scene, cameras=[camera])
     arms = [renderer.segment(state)[0] >= 0 for state in states]
     covers = [widen(silhouette) for silhouette in arms]

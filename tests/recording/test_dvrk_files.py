@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from carts_core.errors import SequenceError
-from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.recording.importing import read_base_frames
 
 T_CAMERA_BASE = np.eye(4)

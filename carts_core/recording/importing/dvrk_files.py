@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SequenceError, SettingsError
-from ...export.dvrk import T_DVRK_OPENCV
 from ...files.reading import VALUES, parse_json, read_text
-from ...model.camera import rigid_transform
+from ...model.camera import T_DVRK_OPENCV, rigid_transform
 from ...settings.importing import Axes
 
 _KINDS = (

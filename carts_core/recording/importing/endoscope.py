@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ...export.dvrk import T_DVRK_OPENCV
+from ...model.camera import T_DVRK_OPENCV
 from ...model.ecm_kinematics import forward
 from .found import FoundMotion, Note
 from .logs import Track, transforms

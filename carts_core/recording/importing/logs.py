@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
-from ...export.dvrk import T_DVRK_OPENCV
+from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, inverse
 from ...settings.importing import ImportOptions
 from ...wording import counted

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from carts_core.errors import CartsError
-from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.ecm_kinematics import forward as ecm
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording.importing.importer import import_recording

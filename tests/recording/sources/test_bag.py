@@ -22,7 +22,7 @@ from recordings import (
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
-from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.ecm_kinematics import forward as ecm
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording

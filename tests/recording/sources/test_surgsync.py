@@ -21,7 +21,7 @@ from recordings import (
     write_video,
 )
 
-from carts_core.export.dvrk import T_DVRK_OPENCV
+from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
