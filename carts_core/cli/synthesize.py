@@ -13,7 +13,8 @@ from ..stopping import when_stopped
 
 @dataclass(frozen=True)
 class Synthesize:
-    """Make a sequence of two arms over tissue, path-traced, with true and measured kinematics, in all domains."""
+    """Make a sequence of two instruments, or of one arm of any other robot, over tissue, path-traced, with true and
+    measured kinematics, in all domains."""
 
     output: Annotated[Path, tyro.conf.Positional]
     """Folder to make; it must not exist."""

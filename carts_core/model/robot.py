@@ -107,6 +107,8 @@ class Robot:
             raise
         except Exception as error:  # the URDF parser raises many kinds
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
+        if not kinematics.joint_names:
+            raise RobotError(f"robot {model.robot.name} ({urdf}) has no joint that moves. Name a robot that has one.")
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
         meshes, decimation = _load_meshes(model, kinematics, urdf, link_names, (max_faces, tolerance), report)
         if not meshes:

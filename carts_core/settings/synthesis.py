@@ -30,7 +30,7 @@ class EndoscopeConfig:
     focal_length: float = 560.0
     """Focal length for an image 640 px wide [px]; other widths scale it."""
     distance: float = 0.100
-    """From the camera to the middle of the scene [m]."""
+    """From the camera to the middle of the scene [m]; at most 0.3 for instruments."""
     elevation: float = 1.05
     """Angle between the viewing direction and the tissue's plane [rad]."""
     stereo: bool = False
@@ -42,9 +42,9 @@ class EndoscopeConfig:
         _require(self, "width", 32, 4096)
         _require(self, "height", 32, 4096)
         _require(self, "focal_length", 100, 5000)
-        _require(self, "distance", 0.05, 0.3)
+        _require(self, "distance", 0.05, 10.0)
         _require(self, "elevation", 0.5, 1.57)
-        _require(self, "baseline", 0.0, 0.05)
+        _require(self, "baseline", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -194,9 +194,9 @@ class SynthesisConfig:
     name: str = "synthetic"
     """Name of the sequence."""
     robot: Path = field(default_factory=shipped_robot)
-    """URDF of both arms, with the joints of a PSM; or `builtin:NAME`."""
+    """URDF, or `builtin:NAME`. One with the joints of a PSM makes both arms, any other one a single arm."""
     tip_link: str = "tool_tip_link"
-    """Link of the URDF whose origin is the point between the jaws' tips."""
+    """Link of the URDF whose origin is the point between the jaws' tips; of another robot the last link with a mesh."""
     domains: tuple[str, ...] = DOMAINS
     """The conditions to render."""
     endoscope: EndoscopeConfig = EndoscopeConfig()

@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ...errors import RobotError
 from ...model.camera import Camera
 from ...model.robot import Robot
 from ...model.scene import Arm
@@ -42,18 +41,17 @@ def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
 
 
 def load_robot(config: SynthesisConfig) -> Robot:
-    """The robot of both arms, with finer meshes than the optimizer uses.
+    """The robot, with finer meshes than the optimizer uses.
 
     Raises:
-        RobotError: the URDF is unusable, or it is not a PSM.
+        RobotError: the URDF is unusable.
     """
-    robot = Robot.load(config.robot, max_faces=config.render.robot_faces)
-    if robot.joint_types not in (JOINT_TYPES, JOINT_TYPES[:-1]):
-        raise RobotError(
-            f"robot {config.robot} has the joints {', '.join(robot.joint_names)} ({', '.join(robot.joint_types)}). "
-            f"Synthetic sequences need a PSM's seven, or all but the last: {', '.join(JOINT_TYPES)}."
-        )
-    return robot
+    return Robot.load(config.robot, max_faces=config.render.robot_faces)
+
+
+def is_instrument(robot: Robot) -> bool:
+    """Whether the joints are those of a PSM: its seven, or all but the last."""
+    return robot.joint_types in (JOINT_TYPES, JOINT_TYPES[:-1])
 
 
 def place_arms(robot: Robot, tip_link: str, camera: Camera) -> tuple[Arm, ...]:
@@ -63,7 +61,7 @@ def place_arms(robot: Robot, tip_link: str, camera: Camera) -> tuple[Arm, ...]:
     for name, centre, work in zip(ARM_NAMES, _REMOTE_CENTRES_CAMERA, WORK_POINTS, strict=True):
         centre_world = (T_world_camera @ np.append(centre, 1.0))[:3]
         T_world_base = np.eye(4)
-        T_world_base[:3, :3] = _rotation_between(_shaft_direction(robot, tip_link), np.asarray(work) - centre_world)
+        T_world_base[:3, :3] = rotation_between(_shaft_direction(robot, tip_link), np.asarray(work) - centre_world)
         T_world_base[:3, 3] = centre_world
         arms.append(Arm(name, robot, T_world_base))
     return tuple(arms)
@@ -77,7 +75,7 @@ def _shaft_direction(robot: Robot, tip_link: str) -> Float[np.ndarray, "3"]:
     return tips[1] - tips[0]
 
 
-def _rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
+def rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """A rotation that takes direction a to direction b and keeps their common 'up' as far as it can."""
     return _frame(b) @ _frame(a).T
 

@@ -1,6 +1,7 @@
 """Smooth motion of two instruments that stay in view, apart from each other and above the tissue."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -34,7 +35,10 @@ _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
 """Where the jaws point in the middle of their range, in the world: to the other arm and down."""
 
 
-class _Rejected(Exception):
+Motion = TypeVar("Motion")
+
+
+class Rejected(Exception):
     """Why a random motion cannot be used."""
 
 
@@ -48,16 +52,32 @@ def plan_motion(
     Raises:
         SettingsError: no motion within the settings was found.
     """
-    bodies = tuple(_surface_points(arm.robot, config.rng("surface points")) for arm in arms)
+    bodies = tuple(surface_points(arm.robot, config.rng("surface points")) for arm in arms)
+
+    def draw(rng: np.random.Generator) -> tuple[Float[np.ndarray, "frames dofs"], ...]:
+        joints = tuple(_draw(arm, number, camera, config, rng) for number, arm in enumerate(arms))
+        seen = [clouds(arm, positions, body) for arm, positions, body in zip(arms, joints, bodies, strict=True)]
+        check_clearance(seen, tissues, camera, config.motion.clearance)
+        return joints
+
+    return random_motion(draw, config)
+
+
+def random_motion(draw: Callable[[np.random.Generator], Motion], config: SynthesisConfig) -> Motion:
+    """The first of many random motions that is not rejected.
+
+    Args:
+        draw: makes one, or raises `Rejected`.
+        config: with the seed.
+
+    Raises:
+        SettingsError: all are.
+    """
     reasons: dict[str, int] = {}
     for attempt in range(_ATTEMPTS):
-        rng = config.rng("motion", attempt)
         try:
-            joints = tuple(_draw(arm, number, camera, config, rng) for number, arm in enumerate(arms))
-            clouds = [_clouds(arm, positions, body) for arm, positions, body in zip(arms, joints, bodies, strict=True)]
-            _check_clearance(clouds, tissues, camera, config.motion.clearance)
-            return joints
-        except _Rejected as rejected:
+            return draw(config.rng("motion", attempt))
+        except Rejected as rejected:
             reasons[str(rejected)] = reasons.get(str(rejected), 0) + 1
     why = ", ".join(f"{reason} ({count})" for reason, count in sorted(reasons.items(), key=lambda item: -item[1]))
     raise SettingsError(
@@ -110,8 +130,8 @@ def _draw(
         return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
 
     targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
-    if not _in_view(targets, camera):
-        raise _Rejected("a tip leaves the picture")
+    if not in_view(targets, camera):
+        raise Rejected("a tip leaves the picture")
     joints = np.zeros((len(times), len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
@@ -121,7 +141,7 @@ def _draw(
     lowest, highest = arm.robot.joint_limits.numpy()[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
     if (joints[:, :6] < lowest + margin).any() or (joints[:, :6] > highest - margin).any():
-        raise _Rejected("a joint comes too near to its limit")
+        raise Rejected("a joint comes too near to its limit")
     return joints
 
 
@@ -142,7 +162,7 @@ def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random
     return joints[np.argmax(jaws @ wanted), 3:6]
 
 
-def _check_clearance(
+def check_clearance(
     clouds: Sequence[list[np.ndarray]], tissues: Sequence[Tissue], camera: Camera, clearance: float
 ) -> None:
     """Raise when, in some frame and in view, the instruments come too near to each other or to the tissue."""
@@ -151,12 +171,13 @@ def _check_clearance(
         for points in seen:
             for tissue in tissues:
                 if (points[:, 2] - tissue.height(points[:, 0], points[:, 1])).min() < clearance:
-                    raise _Rejected("an instrument touches the tissue")
-        if KDTree(seen[0]).query(seen[1])[0].min() < clearance:
-            raise _Rejected("the instruments touch")
+                    raise Rejected("an instrument touches the tissue")
+        if len(seen) > 1 and KDTree(seen[0]).query(seen[1])[0].min() < clearance:
+            raise Rejected("the instruments touch")
 
 
-def _in_view(tips_world: np.ndarray, camera: Camera) -> bool:
+def in_view(tips_world: np.ndarray, camera: Camera) -> bool:
+    """Whether tips stay in the picture, away from its border, and at a working distance."""
     depth = tips_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     return bool((_seen(tips_world, camera, -_BORDER) & (depth > 0.055) & (depth < 0.135)).all())
 
@@ -170,7 +191,7 @@ def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float)
     return (np.abs(u - 0.5) < 0.5 + margin) & (np.abs(v - 0.5) < 0.5 + margin) & (z > NEAR)
 
 
-def _surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0018) -> list[np.ndarray]:
+def surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0018) -> list[np.ndarray]:
     """Points spread over the surface of each link, in its frame [m]."""
     points: list[list[np.ndarray]] = [[] for _ in robot.link_names]
     for mesh in robot.meshes:
@@ -183,7 +204,7 @@ def _surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0
     return [np.concatenate(part) if part else np.zeros((0, 3)) for part in points]
 
 
-def _clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.ndarray]:
+def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.ndarray]:
     """Surface points of an arm in the world, per frame."""
     Ts = arm.T_world_base @ arm.robot.forward_kinematics(torch.from_numpy(positions)).numpy()
     return [np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p, T in zip(body, frame, strict=True)]) for frame in Ts]

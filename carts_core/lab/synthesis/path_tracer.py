@@ -53,6 +53,8 @@ class Part:
     faces: Int[np.ndarray, "f 3"]
     metal: bool
     """Steel, or else the dark plastic of the shaft."""
+    paint: tuple[float, ...] | None = None
+    """RGB in [0, 1] of a painted part, which is neither."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class PathTracer:
             seed: of the sampler.
         """
         T_world_light = np.linalg.inv(T_light_world)
-        scene = self._instruments(parts, lambda part: _METAL if part.metal else _PLASTIC)
+        scene = self._instruments(parts, _material)
         scene |= self._tissue
         integrator = {"type": "path", "max_depth": self._config.bounces, "rr_depth": 16}
         samples = -(-self._config.samples // len(LIGHTS_CAMERA))
@@ -231,7 +233,14 @@ _PLASTIC: dict[str, Any] = {
     "diffuse_reflectance": {"type": "rgb", "value": [0.022, 0.022, 0.024]},
     "alpha": 0.22,
 }
+_PAINT: dict[str, Any] = {"type": "roughplastic", "alpha": 0.25}
 _BLACK: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+
+
+def _material(part: Part) -> dict[str, Any]:
+    if part.paint is not None:
+        return _PAINT | {"diffuse_reflectance": {"type": "rgb", "value": list(part.paint)}}
+    return _METAL if part.metal else _PLASTIC
 
 
 def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

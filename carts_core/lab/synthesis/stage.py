@@ -1,4 +1,4 @@
-"""The two instruments at each moment of a planned motion."""
+"""The arms at each moment of a planned motion."""
 
 from dataclasses import dataclass
 
@@ -26,6 +26,10 @@ class Stage:
     """True joint positions [rad, m], one table per arm."""
     times: Float[np.ndarray, " frames"]
     """[s]"""
+    scale: float = 1.0
+    """How many times larger the arms and their world are than the world of this stage."""
+    painted: bool = False
+    """Whether the robots' own colours are shown, and not an instrument's materials."""
 
     def Ts_world_link(self, frame: int, time_offset: float = 0.0) -> dict[int, Float[np.ndarray, "4 4"]]:
         """The place of every link at a frame, or shortly before or after it [s]."""
@@ -35,7 +39,9 @@ class Stage:
             if time_offset and len(joints) > 1:
                 positions = positions + time_offset * np.gradient(joints, self.times, axis=0)[frame]
             Ts_base_link = arm.robot.forward_kinematics(torch.from_numpy(positions)).numpy()
-            transforms.extend(arm.T_world_base @ Ts_base_link)
+            Ts_world_link = arm.T_world_base @ Ts_base_link
+            Ts_world_link[:, :3, 3] /= self.scale
+            transforms.extend(Ts_world_link)
         return dict(enumerate(transforms))
 
     def parts(self, frame: int) -> list[Part]:
@@ -44,7 +50,8 @@ class Stage:
         parts: list[Part] = []
         for index, arm in enumerate(self.arms):
             first = index * len(arm.robot.link_names)
-            shaft = max((mesh for mesh in arm.robot.meshes if mesh.link == 0), key=lambda mesh: np.ptp(mesh.vertices))
+            first_link = (mesh for mesh in arm.robot.meshes if mesh.link == 0)
+            shaft = max(first_link, key=lambda mesh: np.ptp(mesh.vertices), default=None)
             for mesh in arm.robot.meshes:
                 T_world_link = transforms[first + mesh.link]
                 rotation, translation = T_world_link[:3, :3], T_world_link[:3, 3]
@@ -52,10 +59,11 @@ class Stage:
                     Part(
                         arm=index,
                         link=first + mesh.link,
-                        vertices=mesh.vertices @ rotation.T + translation,
+                        vertices=mesh.vertices / self.scale @ rotation.T + translation,
                         normals=mesh.normals @ rotation.T,
                         faces=mesh.faces,
                         metal=bool(mesh is not shaft and mesh.color.mean() > _DARK),
+                        paint=tuple(float(value) for value in mesh.color) if self.painted else None,
                     )
                 )
         return parts

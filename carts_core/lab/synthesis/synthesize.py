@@ -11,8 +11,16 @@ from ...errors import SettingsError
 from ...files import OutputPath, holds_file, published
 from ...model.camera import Camera
 from ...settings import SynthesisConfig
+from .any_robot import (
+    check_instrument_distance,
+    enlarged,
+    enlargement,
+    measurement_error,
+    plan_arm,
+    small_world,
+)
 from .domains import Conditions, View
-from .layout import load_robot, place_arms, place_cameras
+from .layout import is_instrument, load_robot, place_arms, place_cameras
 from .measurement import measure
 from .motion import plan_motion, sample_times
 from .path_tracer import PathTracer
@@ -26,7 +34,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
-    """Render a sequence of two arms in all wanted domains.
+    """Render a sequence of two instruments, or of one arm of any other robot, in all wanted domains.
 
     The files appear under `output` when everything is there. Until then they lie beside it, and a run that was
     stopped goes on where it was when it is started again with the same settings.
@@ -41,7 +49,7 @@ def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progres
 
     Raises:
         SettingsError: `output` holds something already, or no motion fits the settings.
-        RobotError: the robot is not a PSM.
+        RobotError: the robot is not usable.
         CartsError: Mitsuba is not installed.
     """
     target = output if isinstance(output, OutputPath) else Path(output)
@@ -57,13 +65,18 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     """Write into `work` what is not there yet; `output` is where it will lie in the end."""
     frames = config.motion.frames
     report("tissue, robots and motion", 0, frames)
-    robot = load_robot(config)
-    cameras = place_cameras(config.endoscope)
-    arms = place_arms(robot, config.tip_link, cameras[0])
     tissue, other = _grow_tissues(config)
-    times = sample_times(config)
-    joints = plan_motion(arms, [tissue, other], cameras[0], config)
-    stage = Stage(arms, joints, times)
+    times, scale = sample_times(config), enlargement(config.endoscope)
+    cameras = place_cameras(small_world(config).endoscope)
+    robot, error = load_robot(config), config.error
+    if is_instrument(robot):
+        check_instrument_distance(config.endoscope)
+        arms = place_arms(robot, config.tip_link, cameras[0])
+        joints = plan_motion(arms, [tissue, other], cameras[0], config)
+    else:
+        arm, positions = plan_arm(robot, [tissue, other], cameras[0], config, scale)
+        arms, joints, error = (arm,), (positions,), measurement_error(robot, error)
+    stage = Stage(arms, joints, times, scale, painted=not is_instrument(robot))
 
     tracing = _Tracing(config, stage, cameras, tissue, other)
     for frame in range(frames):
@@ -72,12 +85,13 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
         report("frames", frame + 1, frames)
 
     measured = [
-        measure(table, times, config.error, config.rng("measurement", arm.name))
+        measure(table, times, error, config.rng("measurement", arm.name))
         for arm, table in zip(arms, joints, strict=True)
     ]
     write_table(work / "kinematics.csv", arms, times, measured)
     write_table(work / "truth.csv", arms, times, joints)
-    write_sequence_file(work / "sequence.toml", config, output, arms, cameras)
+    seen_by = [enlarged(camera, scale) for camera in cameras]
+    write_sequence_file(work / "sequence.toml", config, output, arms, seen_by)
 
 
 class _Tracing:

@@ -60,13 +60,17 @@ def write_sequence_file(
     sections = [
         'format = "carts-sequence/1"\n'
         f"name = {json.dumps(config.name)}\n"
-        f'description = "Two synthetic arms over made-up tissue; carts synthesize, seed {config.seed}."\n'
+        f'description = "{_arms(arms)} over made-up tissue; carts synthesize, seed {config.seed}."\n'
         f"domains = [{domains}]\n",
         '[kinematics]\ntable = "kinematics.csv"\ntruth = "truth.csv"\nframe = "frame"\ntimestamp = "time"\n',
         *(_camera_section(camera) for camera in cameras),
         *(_arm_section(arm, config, output) for arm in arms),
     ]
     write_text(path, "\n".join(sections))
+
+
+def _arms(arms: Sequence[Arm]) -> str:
+    return "Two synthetic arms" if len(arms) > 1 else "A synthetic arm"
 
 
 def _camera_section(camera: Camera) -> str:

@@ -6,7 +6,7 @@ import torch
 
 from carts_core.errors import RobotError
 from carts_core.lab.synthesis import EndoscopeConfig, SynthesisConfig
-from carts_core.lab.synthesis.layout import WORK_POINTS, load_robot, place_arms, place_cameras
+from carts_core.lab.synthesis.layout import WORK_POINTS, is_instrument, load_robot, place_arms, place_cameras
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 
@@ -54,8 +54,14 @@ def test_with_joints_at_zero_both_instruments_point_at_their_work(shipped_psm: R
         assert 0.10 < np.linalg.norm(target) < 0.16  # the remote centre is as far as in a real setup
 
 
-def test_a_robot_that_is_not_a_psm_is_refused(tmp_path) -> None:
+def test_a_robot_that_is_not_a_psm_is_no_instrument(tmp_path, shipped_psm: Robot) -> None:
     urdf = tmp_path / "two.urdf"
     urdf.write_text(ARM_URDF)
-    with pytest.raises(RobotError, match=r"has the joints turn \(revolute\).*need a PSM's seven"):
+    assert is_instrument(shipped_psm) and not is_instrument(load_robot(SynthesisConfig(robot=urdf)))
+
+
+def test_a_robot_that_cannot_move_is_refused(tmp_path) -> None:
+    urdf = tmp_path / "stiff.urdf"
+    urdf.write_text(ARM_URDF.replace('type="revolute"', 'type="fixed"'))
+    with pytest.raises(RobotError, match="no joint that moves"):
         load_robot(SynthesisConfig(robot=urdf))

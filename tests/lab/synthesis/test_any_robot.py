@@ -1,0 +1,92 @@
+"""A robot that is no instrument, a metre and more away."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from carts_core.errors import RobotError, SettingsError
+from carts_core.evaluation import dice
+from carts_core.lab.benchmark.seven_joint_arm import write_arm
+from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
+from carts_core.lab.synthesis.any_robot import enlarged, enlargement, measurement_error
+from carts_core.lab.synthesis.layout import place_cameras
+from carts_core.model.robot import Robot
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+from carts_core.settings import MeasurementError
+
+DISTANCE = 1.6
+
+
+def _config(robot: Path, **settings) -> SynthesisConfig:
+    return SynthesisConfig(
+        seed=4,
+        robot=robot,
+        domains=("regular", "smoke"),
+        endoscope=EndoscopeConfig(width=128, height=96, distance=DISTANCE),
+        motion=MotionConfig(frames=2, frame_rate=2.0),
+        render=RenderConfig(samples=2, robot_faces=4000, tissue_resolution=64, texture_resolution=128),
+        **settings,
+    )
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+    folder = tmp_path_factory.mktemp("arm")
+    return Sequence.open(synthesize(_config(write_arm(folder)), folder / "sequence"))
+
+
+def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(sequence: Sequence) -> None:
+    (arm,) = sequence.scene.arms
+    renderer = Renderer(sequence.scene)
+    for index in range(len(sequence)):
+        frame = sequence.frame(index)
+        assert frame.masks is not None and frame.truth is not None
+        assert 0.02 < frame.masks["left"].mean() < 0.6
+        true, measured = (
+            dice(renderer.segment(sequence.scene.state(joints))[0] >= 0, frame.masks["left"])
+            for joints in (frame.truth, frame.measured)
+        )
+        assert true > 0.97 and measured < true
+        assert (np.abs(frame.truth["arm"] - frame.measured["arm"]) > 0.005).all()
+        low, high = arm.robot.joint_limits.numpy().T
+        assert (frame.truth["arm"] > low).all() and (frame.truth["arm"] < high).all()
+        T_camera_base = sequence.scene.cameras[0].T_camera_world @ arm.T_world_base
+        tip = arm.robot.forward_kinematics(torch.from_numpy(frame.truth["arm"]))[-1].numpy()
+        assert 0.5 * DISTANCE < (T_camera_base @ tip)[2, 3] < 1.4 * DISTANCE, "in metres, and not in the small world's"
+
+
+def test_all_domains_show_the_same_arm(sequence: Sequence) -> None:
+    clear, smoke = (sequence.frame(0, domain) for domain in ("regular", "smoke"))
+    assert clear.masks is not None
+    inside = clear.masks["left"]
+    assert clear.images["left"][inside].std() > 5
+    assert not np.array_equal(clear.images["left"], smoke.images["left"])
+
+
+def test_a_camera_of_a_large_world_has_its_distance_and_sees_the_same_picture() -> None:
+    (near,) = place_cameras(EndoscopeConfig(distance=0.1))
+    far = enlarged(near, 16.0)
+    point = np.array([0.01, 0.02, 0.0, 1.0])
+    small, large = near.T_camera_world @ point, far.T_camera_world @ (point * (16, 16, 16, 1))
+    np.testing.assert_allclose(large[:3], 16.0 * small[:3])
+    assert [enlargement(EndoscopeConfig(distance=d)) for d in (0.1, 0.3, 1.6)] == [1.0, 1.0, 16.0]
+
+
+def test_joints_of_each_kind_have_errors_of_their_own(tmp_path: Path) -> None:
+    robot = Robot.load(write_arm(tmp_path))
+    assert measurement_error(robot, MeasurementError()).bias == (0.02,) * 7
+    chosen = MeasurementError(bias=(0.1,) * 7, drift=(0.0,) * 7, noise=(0.0,) * 7)
+    assert measurement_error(robot, chosen) is chosen
+
+
+def test_an_instrument_is_not_looked_at_from_a_metre_away(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"surgical instrument\. Give at most 0\.3 m"):
+        synthesize(_config(SynthesisConfig().robot), tmp_path / "sequence")
+
+
+def test_a_tip_that_the_robot_lacks_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="no_such_link"):
+        synthesize(_config(write_arm(tmp_path), tip_link="no_such_link"), tmp_path / "sequence")
