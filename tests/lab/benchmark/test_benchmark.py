@@ -15,7 +15,17 @@ from rich.console import Console
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Benchmark, Facts, Measurement, ResultsFile, Run, runner, write_report
+from carts_core.lab.benchmark import (
+    Benchmark,
+    Facts,
+    Measurement,
+    ResultsFile,
+    Run,
+    plan,
+    runner,
+    synthetic_room_source,
+    write_report,
+)
 from carts_core.lab.benchmark.runner import _Bench
 from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
 
@@ -67,6 +77,22 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     assert len(count_runs) == RUNS
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
     assert f"{RUNS} of {RUNS}" in write_report(output_path(tmp_path, "bench"), measurements, facts, {}).read_text()
+
+
+def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdicts(
+    tiny_benchmark: Callable[..., Benchmark], tmp_path: Path
+) -> None:
+    tiny = tiny_benchmark()
+    rooms = synthetic_room_source(tiny.sources["synthetic"], None, tiny.scope)
+    results = ResultsFile(output_path(tmp_path, "rooms.jsonl"))
+    benchmark = Benchmark(tiny.scope, [rooms], tiny.extractor, results, plan(tiny.scope, [rooms]))
+    benchmark.run(QUIET)
+    by_method = {m.run.method: m for m in benchmark.measurements()}
+    assert set(by_method) == {"ours", "acs", "sequence"}
+    for measurement in by_method.values():
+        assert measurement.run.source == "rooms synthetic" and measurement.run.domain == rooms.rooms[0]
+        assert measurement.final.joint_mae_deg is not None and measurement.start is not None
+    assert by_method["ours"].verdict is not None and by_method["ours"].within is not None
 
 
 def test_a_stopped_benchmark_goes_on_where_it_was(
