@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -11,6 +11,9 @@ from ..errors import CartsError
 from ..stopping import when_stopped
 from ..wording import counted
 from .selection import Network, output_folder
+
+if TYPE_CHECKING:
+    from ..lab.baselines.weights import TrainedBaseline
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class Bench:
     """Frames of each sequence to evaluate, if not as many as usual."""
     seed: int | None = None
     """Seed of the synthetic sequence, if not the usual one."""
+    baselines: tuple[Path, ...] = ()
+    """Weights files of `carts baseline`: networks of others, a row each, evaluated on the frames of the main table."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
@@ -63,9 +68,10 @@ class Bench:
         sources = [made, synthetic_room_source(made, self.rooms, scope, seed), *family_sources(scope, seed)]
         if self.real is not None:
             sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
-        runs = plan(scope, sources)
+        baselines = self._baselines()
+        runs = plan(scope, sources, list(baselines))
         results = ResultsFile(folder / "measurements.jsonl")
-        benchmark = Benchmark(scope, sources, extractor, results, runs)
+        benchmark = Benchmark(scope, sources, extractor, results, runs, baselines)
         if results.unreadable:
             console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
         stages = folder / "stages.json"
@@ -88,3 +94,18 @@ class Bench:
         )
         page = write_report(folder, measurements, facts, known_stages(stages, extractor))
         console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")
+
+    def _baselines(self) -> "dict[str, TrainedBaseline]":
+        """Row -> network."""
+        from ..lab.baselines.weights import read_baseline
+
+        found: dict[str, TrainedBaseline] = {}
+        for path in self.baselines:
+            trained = read_baseline(path)
+            if trained.row in found:
+                raise CartsError(
+                    f"--baselines names two files of the row {trained.row}; {path} is the second. Give one of each "
+                    "network and augmentation, and the other in a run of its own."
+                )
+            found[trained.row] = trained
+        return found

@@ -12,6 +12,7 @@ import tyro
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..stopping import exit_status, message, stopped_by_signals
+from .baseline import Baseline
 from .batch import Batch
 from .bench import Bench
 from .calibrate import Calibrate
@@ -56,6 +57,7 @@ Command = (
     | Annotated[Robots, tyro.conf.subcommand("robots")]
     | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Baseline, tyro.conf.subcommand("baseline")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 

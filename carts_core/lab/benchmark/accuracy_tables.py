@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 from ...html import Cell, Table
 from . import paper
-from .frame import TOLERANCE
+from .frame import TOLERANCE, WIDE_TOLERANCE
 from .measurement import Score
+from .methods import BASELINES, METHODS, RENDERING
 from .scope import SYNTHETIC
 from .statistics import Measurements, Spread, scores
 from .tables import DOMAIN_LABELS, NOTHING, SHORT_LABELS, paper_note, spread_text
@@ -21,30 +22,46 @@ ROWS = (
 """Label, method and number of steps of the main table's rows."""
 
 
+def baseline_rows(data: Measurements) -> tuple[tuple[str, str, None], ...]:
+    """The same of networks of others, and of the surface network alone, where they were measured."""
+    known = {measurement.run.method for measurement in data.all}
+    return tuple((METHODS[name].label, name, None) for name in (*BASELINES, RENDERING) if name in known)
+
+
 def main_tables(data: Measurements) -> list[Table]:
     """Dice and NSD of every method in every domain, from the measured joint positions."""
+    figures = (
+        ("Dice", _dice, None),
+        (f"NSD at {TOLERANCE:g} px", _nsd, TOLERANCE),
+        (f"NSD at {WIDE_TOLERANCE:g} px", _wide, WIDE_TOLERANCE),
+    )
     tables = []
     for source in data.sources():
         domains = data.domains(source)
-        for name, value in (("Dice", _dice), ("NSD", _nsd)):
+        for name, value, tolerance in figures:
             rows = tuple(
                 (Cell(label), *(_main_cell(data, source, domain, method, steps, value) for domain in domains))
-                for label, method, steps in ROWS
+                for label, method, steps in (*baseline_rows(data), *ROWS)
             )
             caption = f"{name} in percent, mean ± standard deviation over frames, started at the measured kinematics."
-            if value is _nsd:
-                caption += f" Normalized surface distance within {TOLERANCE:g} px; the paper does not give it."
+            if tolerance is not None:
+                caption += f" Normalized surface distance within {tolerance:g} px; the paper does not give it."
             header = ("method", *(DOMAIN_LABELS[domain] for domain in domains))
             tables.append(Table(f"{source.capitalize()} frames: {name}", caption, header, rows))
     return tables
 
 
 def _main_cell(
-    data: Measurements, source: str, domain: str, method: str, steps: int | None, value: Callable[[Score], float]
+    data: Measurements,
+    source: str,
+    domain: str,
+    method: str,
+    steps: int | None,
+    value: Callable[[Score], float | None],
 ) -> Cell:
     chosen = data.of(source=source, domain=domain, method=method, error_deg=None)
     text = spread_text(Spread.of(value(score) for score in scores(chosen, steps)))
-    if value is _nsd or steps == 30:
+    if value is not _dice or steps == 30:
         return Cell(text)
     column = paper.COLUMNS.get((source, domain))
     return Cell(text, paper_note(paper.DICE.get(method, {}).get(column or ""), column))
@@ -147,3 +164,7 @@ def _dice(score: Score) -> float:
 
 def _nsd(score: Score) -> float:
     return score.nsd
+
+
+def _wide(score: Score) -> float | None:
+    return score.nsd_wide

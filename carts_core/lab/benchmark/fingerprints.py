@@ -24,6 +24,8 @@ _MEASURED = (
     "settings/presets.py",
     "settings/sequence.py",
     "settings/stages.py",
+    "lab/baselines/networks.py",
+    "lab/benchmark/baseline.py",
     "lab/benchmark/frame.py",
     "lab/benchmark/occlusion.py",
     "lab/benchmark/together.py",
@@ -36,7 +38,9 @@ def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
     return fingerprints.code_fingerprint(patterns)
 
 
-def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source: str) -> str:
+def run_fingerprint(
+    run: Run, scope: Scope, extractor: FeatureExtractor, source: str, baseline: str | None = None
+) -> str:
     """SHA-256 over everything that a run's result depends on, but the machine.
 
     Args:
@@ -44,9 +48,11 @@ def run_fingerprint(run: Run, scope: Scope, extractor: FeatureExtractor, source:
         scope: with the number of steps in the paper's setting.
         extractor: the network and its device.
         source: fingerprint of the images and kinematics.
+        baseline: of the weights of a baseline, where the run is one's.
     """
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
     company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
     parts = (settings, company, extractor.fingerprint, str(extractor.device), source, TOLERANCE, code_fingerprint())
+    parts += (baseline,) if baseline is not None else ()
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

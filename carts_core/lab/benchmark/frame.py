@@ -32,6 +32,8 @@ from .scope import Run
 
 TOLERANCE = 2.0
 """Of the normalized surface distance [px]."""
+WIDE_TOLERANCE = 5.0
+"""Of a second one [px]."""
 _SEED = 0
 """Of the signs of errors made on purpose."""
 
@@ -56,7 +58,7 @@ class Truth:
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
         """The score of a mask without kinematics."""
-        return Score(None, *self._overlap(mask), None, None, None, seconds)
+        return Score(None, *self._overlap(mask), None, None, None, seconds, self._wide(mask))
 
     def score(
         self,
@@ -66,7 +68,7 @@ class Truth:
         renderer: Renderer,
         seconds: float,
         *,
-        depth: bool = True,
+        whole: bool = True,
     ) -> Score:
         """The score of an estimate.
 
@@ -76,23 +78,26 @@ class Truth:
             loss: the optimizer's.
             renderer: of the camera, at its size.
             seconds: until the estimate was known [s].
-            depth: whether to look for the tips, too, which takes longer than all the rest.
+            whole: whether to look for the tips and the second surface distance, too, which takes longer than all the
+                rest.
         """
         state, scene = state.to("cpu"), renderer.scene
         names = [arm.name for arm in scene.arms]
         estimate = dict(zip(names, (v.double().numpy() for v in state.joint_positions), strict=True))
         visible = visible_joints(known, self.measured_joints)
+        mask = renderer.segment(state)[0] >= 0
         return Score(
             loss,
-            *self._overlap(renderer.segment(state)[0] >= 0),
+            *self._overlap(mask),
             joint_mae_deg=joint_mae_deg(scene, estimate, self.joint_positions, self.measured_joints),
             visible_joint_mae_deg=None
             if visible is None
             else joint_mae_deg(scene, estimate, self.joint_positions, visible),
             tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
-            if depth
+            if whole
             else None,
             seconds=seconds,
+            nsd_wide=self._wide(mask) if whole else None,
         )
 
     def within(
@@ -115,10 +120,16 @@ class Truth:
         return (len(ratios), one, two) if ratios else None
 
     def _overlap(self, mask: np.ndarray) -> tuple[float, float]:
-        truth = self.mask
-        if self.hidden is not None:
-            mask, truth = mask & ~self.hidden, truth & ~self.hidden
-        return dice(mask, truth), normalized_surface_distance(mask, truth, TOLERANCE)
+        seen, truth = self._compared(mask)
+        return dice(seen, truth), normalized_surface_distance(seen, truth, TOLERANCE)
+
+    def _wide(self, mask: np.ndarray) -> float:
+        return normalized_surface_distance(*self._compared(mask), WIDE_TOLERANCE)
+
+    def _compared(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.hidden is None:
+            return mask, self.mask
+        return mask & ~self.hidden, self.mask & ~self.hidden
 
 
 def visible_joints(
@@ -239,7 +250,7 @@ def _followed(
         best.append(len(trace) if optimizer.best is iterate else best[-1])
         known, first = iterate.uncertainty, not trace
         loss = None if isinstance(optimizer.settings, SurfaceSolver) else iterate.loss
-        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, depth=first))
+        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, whole=first))
 
 
 def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:

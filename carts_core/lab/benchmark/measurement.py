@@ -25,6 +25,8 @@ class Score:
     way from start to end."""
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
+    nsd_wide: float | None = None
+    """The same as `nsd` within `frame.WIDE_TOLERANCE`; None on the way from start to end."""
 
 
 @dataclass(frozen=True)

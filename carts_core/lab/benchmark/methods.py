@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import get_args
 
 from ...settings import DescentSolver, Loss, SolverName, SolverSettings, SurfaceSolver, solver
+from ...settings.baseline import Augmentation, BaselineName
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class Method:
     """Frames are corrected together, as a sequence."""
     masks_given: bool = False
     """The given masks are what is fitted, and no network is used."""
+    baseline: bool = False
+    """It is a network of others, whose weights have to be given."""
 
 
 def _ours(_: int) -> SolverSettings:
@@ -39,6 +43,7 @@ def _start(_: int) -> SolverSettings:
 
 METHODS = {
     "unet": Method("U-Net alone", None),
+    "surface": Method("surface network alone, given the rendering", None),
     "start": Method("CaRTS without optimization", _start),
     "l1": Method("CaRTS L1 (paper's setting)", lambda _: DescentSolver.paper(50, Loss.L1)),
     "paper": Method("CaRTS ACS (paper's setting)", DescentSolver.paper),
@@ -53,5 +58,29 @@ METHODS = {
     "sequence": Method("ours, sequence mode", _ours, together=True),
     "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
+_NETWORKS: dict[BaselineName, str] = {
+    "unet": "U-Net",
+    "hrnet": "HRNet",
+    "swin": "Swin",
+    "colleoni": "Colleoni's",
+}
+_AUGMENTATIONS: dict[Augmentation, str] = {
+    "none": "no augmentation",
+    "smoke": "simulated smoke",
+    "autoaugment": "AutoAugment",
+    "elastic": "elastic",
+    "projective": "projective",
+}
+assert set(_NETWORKS) == set(get_args(BaselineName)) and set(_AUGMENTATIONS) == set(get_args(Augmentation))
+BASELINES = {
+    f"{network}_{change}": Method(f"{label}, {what}", None, baseline=True)
+    for network, label in _NETWORKS.items()
+    for change, what in _AUGMENTATIONS.items()
+}
+"""Rows of networks of others, by network and augmentation; measured where weights are given."""
+METHODS |= BASELINES
 MAIN = ("unet", "start", "l1", "paper", "ours")
 """Methods of the main table: each frame alone, in one camera."""
+RENDERING = "surface"
+"""The surface network's mask of an image and of what is rendered at the measured joint positions: two inputs, as
+Colleoni et al. have them, and where ours begins."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence as Items
 
 from ...settings import DOMAINS
-from .methods import MAIN, METHODS
+from .methods import MAIN, METHODS, RENDERING
 from .occlusion import OCCLUSION
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Run, Scope
 from .sources import Source
@@ -12,11 +12,16 @@ from .wrong_inputs import wrong_inputs
 _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
 
-def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
+def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> list[Run]:
     """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
 
     Frames on which not all methods are evaluated come after that, then frames that are corrected together, other rooms,
     and instruments that no training has last.
+
+    Args:
+        scope: how much is measured.
+        sources: where frames come from.
+        baselines: names in `methods.BASELINES` whose weights are given.
     """
     rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
     sources = [source for source in sources if source not in (*rooms, *families)]
@@ -24,7 +29,7 @@ def plan(scope: Scope, sources: Items[Source]) -> list[Run]:
     for turn in range(max((len(source.frames) for source in sources), default=0)):
         for source in sources:
             if turn < len(source.frames):
-                runs += _runs_of_frame(scope, source, source.frames[turn])
+                runs += _runs_of_frame(scope, source, source.frames[turn], baselines)
     for source in sources:
         for frame in source.further:
             runs += _runs_of_further_frame(scope, source, frame)
@@ -56,8 +61,8 @@ def _runs_in_rooms(source: Source) -> list[Run]:
     ]
 
 
-def _runs_of_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
-    runs = [Run(source.name, domain, frame, method) for domain in DOMAINS for method in MAIN]
+def _runs_of_frame(scope: Scope, source: Source, frame: int, baselines: Items[str]) -> list[Run]:
+    runs = [Run(source.name, domain, frame, method) for domain in DOMAINS for method in (*MAIN, RENDERING, *baselines)]
     if source.name == SYNTHETIC:
         domains, ours, papers, hard = (
             scope.error_domains,

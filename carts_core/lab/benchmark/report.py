@@ -115,6 +115,7 @@ def _row(measurement: Measurement) -> dict[str, object]:
         **{f"dice_best_of_{steps}": best and best.dice for steps, best in bests.items()},
         "nsd_start": start and start.nsd,
         "nsd": final.nsd,
+        "nsd_wide": final.nsd_wide,
         "joint_mae_deg_start": start and start.joint_mae_deg,
         "joint_mae_deg": final.joint_mae_deg,
         "visible_joint_mae_deg": final.visible_joint_mae_deg,

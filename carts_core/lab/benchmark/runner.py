@@ -1,6 +1,6 @@
 """Does the runs that are not known yet, one after the other."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +14,12 @@ from ...optimization import Backgrounds, FreeParameters, MaskPredictor
 from ...recording import Frame
 from ...rendering import Renderer
 from ...wording import counted
+from ..baselines.weights import TrainedBaseline
+from .baseline import segment_rendered, segment_with
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
 from .measurement import Measurement
-from .methods import METHODS
+from .methods import METHODS, RENDERING
 from .occlusion import OCCLUSION, occlude
 from .scope import Run, Scope
 from .sources import Recording, Source
@@ -37,6 +39,7 @@ class Benchmark:
         extractor: the feature network.
         results: the results file.
         runs: what is measured, in order.
+        baselines: name in `methods.BASELINES` -> its network; every baseline among the runs.
     """
 
     def __init__(
@@ -46,10 +49,12 @@ class Benchmark:
         extractor: FeatureExtractor,
         results: ResultsFile,
         runs: Iterable[Run],
+        baselines: Mapping[str, TrainedBaseline] | None = None,
     ) -> None:
         self.scope, self.extractor, self.results = scope, extractor, results
+        self.baselines = dict(baselines or {})
         self.sources = {source.name: source for source in sources}
-        self.runs = {run: run_fingerprint(run, scope, extractor, self.sources[run.source].fingerprint) for run in runs}
+        self.runs = {run: self._fingerprint(run) for run in runs}
 
     def measurements(self) -> list[Measurement]:
         """What is known of the runs."""
@@ -73,7 +78,7 @@ class Benchmark:
             TimeRemainingColumn(),
         )
         with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
-            bench = {name: _Bench(source, bar) for name, source in self.sources.items()}
+            bench = {name: _Bench(source, bar, self.baselines) for name, source in self.sources.items()}
             task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
             while todo:
                 run = next(iter(todo))
@@ -88,6 +93,10 @@ class Benchmark:
                     bar.advance(task, todo.pop(measurement.run, None) is not None)
                 _log(console, f"{len(self.runs) - len(todo)} of {len(self.runs)}: {description}")
             bar.update(task, description="measured")
+
+    def _fingerprint(self, run: Run) -> str:
+        baseline = self.baselines[run.method].sha256 if METHODS[run.method].baseline else None
+        return run_fingerprint(run, self.scope, self.extractor, self.sources[run.source].fingerprint, baseline)
 
     def _group(self, run: Run) -> list[Run]:
         """The runs that are measured at once with this one."""
@@ -105,8 +114,8 @@ def _log(console: Console, line: str) -> None:
 class _Bench:
     """One source, opened when its first run comes."""
 
-    def __init__(self, source: Source, bar: Bar) -> None:
-        self._source, self._bar = source, bar
+    def __init__(self, source: Source, bar: Bar, baselines: Mapping[str, TrainedBaseline] | None = None) -> None:
+        self._source, self._bar, self._baselines = source, bar, baselines or {}
         self._opened: tuple[Recording, Renderer] | None = None
         self._calibrated: Scene | None = None
 
@@ -131,6 +140,10 @@ class _Bench:
         truth = self._truth(frame)
         if covered:
             frame, truth = self._covered(frame, truth)
+        if method.baseline:
+            return segment_with(self._baselines[run.method], run, recording.scene, frame, truth, extractor.device)
+        if run.method == RENDERING:
+            return segment_rendered(run, recording.scene, frame, extractor, truth)
         if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
         settings = method.settings(scope.steps(run))

@@ -30,9 +30,9 @@ from carts_core.lab.benchmark.runner import _Bench
 from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
 
 QUIET = Console(quiet=True)
-RUNS = 51
-"""30 of the main table, 2 with an error at the start, 3 with something wrong, 6 with occluders, 4 with both cameras, 2
-with masks as the target, 4 in sequence mode."""
+RUNS = 57
+"""30 of the main table, 6 of the surface network alone, 2 with an error at the start, 3 with something wrong, 6 with
+occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode."""
 
 
 @pytest.fixture

@@ -1,0 +1,198 @@
+"""Networks of others: built, trained for a step, written, read, and put into the benchmark."""
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from carts_core.errors import SettingsError, WeightsError
+from carts_core.files import output_path
+from carts_core.lab.baselines import frames as frames_module
+from carts_core.lab.baselines.augmentation import SMOKE_STRENGTH, augmentation, diamond_square, smoked
+from carts_core.lab.baselines.frames import TrainingFrames, make_chunk, missing_chunks
+from carts_core.lab.baselines.networks import Baseline
+from carts_core.lab.baselines.training import train_baseline
+from carts_core.lab.baselines.weights import read_baseline, save_baseline, start_from
+from carts_core.networks.weights import read_weights
+from carts_core.settings import Architecture
+from carts_core.settings.baseline import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
+
+SMALLEST = {
+    "unet": {"unet": Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)},
+    "hrnet": {"decoder": (8, 8, 8, 8, 8)},
+    "swin": {"width": 12, "decoder": (8, 8, 8, 8, 8)},
+    "colleoni": {"decoder": (8, 8, 8, 8, 8)},
+}
+
+
+def _smallest(name: BaselineName) -> BaselineNetwork:
+    return BaselineNetwork(name, **SMALLEST[name])
+
+
+class _Frames(TrainingFrames):
+    """Frames with a bright square, which is the instrument, and rendered where it is."""
+
+    def __init__(self, count: int) -> None:
+        rng = np.random.default_rng(0)
+        self._images = torch.from_numpy(rng.integers(0, 90, (count, 3, 192, 256), np.uint8))
+        self._masks = torch.zeros(count, 192, 256, dtype=torch.uint8)
+        self._masks[:, 60:120, 80:160] = 1
+        self._images[:, :, 60:120, 80:160] += 120
+        self._given = torch.zeros(count, 6, 192, 256, dtype=torch.int8)
+        self._given[:, 0, 60:120, 80:160] = 127
+
+
+@pytest.mark.parametrize("name", get_args(BaselineName))
+def test_each_network_learns_for_some_steps_and_is_the_same_after_it_was_written_and_read(
+    name: BaselineName, tmp_path: Path
+) -> None:
+    training = BaselineTraining(augmentation="none", frames=104, steps=3, batch_size=2, warmup=0, threads=1)
+    lines: list[str] = []
+    before = Baseline(_smallest(name))
+    result = train_baseline(_smallest(name), training, _Frames(104), tmp_path / "run", lines.append)
+    read = read_baseline(result.weights)
+    assert read.row == f"{name}_none" and read.training["steps"] == result.steps == 3
+    assert read.network.settings == _smallest(name)
+    changed = [
+        key for key, value in read.network.state_dict().items() if not torch.equal(value, before.state_dict()[key])
+    ]
+    assert len(changed) > 10
+    images, given, _ = _Frames(2).batch([0, 1])
+    with torch.no_grad():
+        logits = read.network(images.float() / 255, given)
+        nowhere = read.network(images.float() / 255, 0 * given)
+    assert logits.shape == (2, 1, 192, 256) and bool(logits.isfinite().all())
+    assert torch.equal(logits, nowhere) is (name != "colleoni")
+
+
+def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp_path: Path) -> None:
+    def training(steps: int) -> BaselineTraining:
+        return BaselineTraining(
+            augmentation="none", frames=110, steps=steps, batch_size=2, warmup=0, threads=1, learning_rate=1e-2
+        )
+
+    first = train_baseline(_smallest("unet"), training(5), _Frames(110), tmp_path)
+    result = train_baseline(_smallest("unet"), training(30), _Frames(110), tmp_path)
+    assert (first.steps, result.steps) == (5, 30)
+    assert result.dice > 0.9 and result.processor_seconds > first.processor_seconds
+    with pytest.raises(SettingsError, match=r"other settings .*batch_size"):
+        other = BaselineTraining(augmentation="none", frames=110, batch_size=3, warmup=0, learning_rate=1e-2)
+        train_baseline(_smallest("unet"), other, _Frames(110), tmp_path)
+
+
+@pytest.mark.parametrize("name", get_args(Augmentation))
+def test_every_augmentation_keeps_types_and_sizes_and_moves_the_mask_with_the_image(name: Augmentation) -> None:
+    torch.manual_seed(0)
+    change = augmentation(name, np.random.default_rng(0))
+    mask = torch.zeros(1, 96, 128)
+    mask[:, 30:60, 40:90] = 1
+    image = (200 * mask).to(torch.uint8).repeat(3, 1, 1) + 20
+    altered = moved = 0
+    for _ in range(20):
+        new_image, new_mask = change(image, mask)
+        assert new_image.dtype == torch.uint8 and new_image.shape == image.shape
+        assert new_mask.shape == mask.shape and bool(((new_mask == 0) | (new_mask == 1)).all())
+        altered += not torch.equal(new_image, image)
+        moved += not torch.equal(new_mask, mask)
+        if name in ("elastic", "projective") and bool((new_mask > 0).any()):
+            inside, outside = new_image[:, new_mask[0] > 0].float(), new_image[:, new_mask[0] == 0].float()
+            assert inside.mean() > outside.mean() + 80
+    assert (altered > 0) is (name != "none")
+    assert (moved > 0) is (name in ("autoaugment", "elastic", "projective"))
+
+
+def test_smoke_brightens_one_image_in_five_and_never_by_more_than_its_strength() -> None:
+    rng = np.random.default_rng(1)
+    image = torch.full((3, 48, 64), 55, dtype=torch.uint8)
+    smoky = [smoked(image, rng) for _ in range(300)]
+    share = np.mean([not torch.equal(one, image) for one in smoky])
+    assert 0.13 < share < 0.27
+    assert max(int(one.max()) for one in smoky) <= 55 + SMOKE_STRENGTH * 200 + 1
+    assert min(int(one.min()) for one in smoky) >= 55
+    field = diamond_square(65, rng)
+    assert field.shape == (65, 65) and field.min() == 0 and field.max() == 1 and np.isfinite(field).all()
+
+
+def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames_module, "CHUNK", 2)
+    folder, other = output_path(tmp_path / "a"), output_path(tmp_path / "b")
+    assert missing_chunks(folder, 3) == [0, 1]
+    make_chunk(folder, 0, seed=5)
+    make_chunk(other, 0, seed=5)
+    assert missing_chunks(folder, 3) == [1]
+    (file,) = (tmp_path / "a").iterdir()
+    assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+    images, given, masks = TrainingFrames(folder, [0]).batch([0, 1])
+    assert images.shape == (2, 3, 192, 256) and given.shape == (2, 6, 192, 256) and masks.shape == (2, 1, 192, 256)
+    assert 0 < masks.mean() < 0.6 and float(given.abs().max()) <= 1.01
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match=r"frames_000.safetensors cannot be read .* Delete the file"):
+        TrainingFrames(folder, [0])
+
+
+def test_weights_of_something_else_are_refused_in_words(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    with pytest.raises(WeightsError, match="missing"):
+        read_baseline(path)
+    save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(WeightsError, match="says format None"):
+        read_baseline(path)
+    network = Baseline(_smallest("unet"))
+    save_baseline(network, output_path(tmp_path, "u.safetensors"), {"augmentation": "smoke"})
+    assert read_baseline(tmp_path / "u.safetensors").row == "unet_smoke"
+    with torch.no_grad():
+        next(network.parameters()).fill_(float("nan"))
+    save_baseline(network, output_path(tmp_path, "n.safetensors"), {"augmentation": "smoke"})
+    with pytest.raises(WeightsError, match="not finite"):
+        read_baseline(tmp_path / "n.safetensors")
+
+
+def test_an_encoder_starts_from_a_file_with_timms_names_and_refuses_one_of_another(tmp_path: Path) -> None:
+    import timm  # noqa: PLC0415
+
+    theirs = timm.create_model("hrnet_w18_small", pretrained=False).state_dict()
+    save_file({name: value.contiguous() for name, value in theirs.items()}, tmp_path / "h.safetensors")
+    network = Baseline(_smallest("hrnet"))
+    assert start_from(network, tmp_path / "h.safetensors") > 300
+    assert any(torch.equal(value, theirs["conv1.weight"]) for value in network.state_dict().values())
+    save_file({"something.weight": torch.zeros(3)}, tmp_path / "x.safetensors")
+    with pytest.raises(WeightsError, match="no tensor of the encoder 'hrnet_w18_small'"):
+        start_from(network, tmp_path / "x.safetensors")
+
+
+def test_a_u_net_starts_from_a_feature_network_of_the_same_architecture_only(small_weights: Path) -> None:
+    theirs = read_weights(small_weights).network
+    same = Baseline(BaselineNetwork("unet", unet=theirs.architecture))
+    start_from(same, small_weights)
+    assert all(torch.equal(value, same.body.state_dict()[key]) for key, value in theirs.state_dict().items())
+    with pytest.raises(WeightsError, match="Give a feature network of Architecture"):
+        start_from(Baseline(_smallest("unet")), small_weights)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "hrnet", "encoder": "hf-hub:someone/model"}, "encoder is 'hf-hub"),
+        ({"name": "hrnet", "width": 48}, "for swin only"),
+        ({"name": "swin", "width": 50}, "multiple of 12"),
+        ({"name": "unet", "decoder": (1, 2)}, "five channel counts"),
+        ({"name": "unet", "size": (250, 192)}, "multiples of 32"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_in_words(options: dict, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        BaselineNetwork(**options)
+
+
+def test_an_encoder_that_timm_does_not_know_is_refused_in_words() -> None:
+    with pytest.raises(SettingsError, match="knows no encoder 'hrnet_w1'"):
+        Baseline(BaselineNetwork("hrnet", "hrnet_w1"))
+
+
+def test_the_encoder_is_that_of_the_network_unless_another_is_named() -> None:
+    names = {name: BaselineNetwork(name).timm_encoder for name in get_args(BaselineName)}
+    assert names["hrnet"] == "hrnet_w18_small" and names["swin"].startswith("swin_") and names["unet"] == ""
+    assert BaselineNetwork("hrnet", "hrnet_w48").timm_encoder == "hrnet_w48"
