@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float
 
+from ..model.scene import Scene
 from ..recording import Frame, Sequence
 from .messages import FrameMessage, StreamError, decoded
 
@@ -38,6 +40,24 @@ class Source(Protocol):
     def close(self) -> None:
         """End it; may be called from any thread, more than once."""
         ...
+
+
+def mounts_of(
+    scene: Scene, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Camera -> T_mount_world [m] of a frame, of the cameras that move; poses that were sent count before the frame's.
+
+    Args:
+        scene: with the cameras' places on their mounts.
+        frame: of a recording or a stream.
+        camera_poses: camera -> T_camera_world [m].
+    """
+    sent = {
+        camera.name: np.linalg.inv(camera.T_camera_world) @ camera_poses[camera.name]
+        for camera in scene.cameras
+        if camera.name in camera_poses
+    }
+    return {**frame.mounts, **sent}
 
 
 class Assembler:

@@ -3,10 +3,12 @@
 import json
 import queue
 import threading
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
@@ -15,7 +17,9 @@ from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.scene import Scene
 from ..project import Edits, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
+from ..recording.camera_motion import ORIENTATION, POSITION
 from .loop import Tracked
+from .moments import mounts_of
 from .tracker import LiveVerdict
 
 _WAITING = 32
@@ -26,7 +30,8 @@ class Recorder:
     """Writes what was tracked, on a thread of its own.
 
     The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
-    corrected ones, `sequence.toml`, and at the end the project `sequence.carts`. Each frame is on disk with its row.
+    corrected ones, `camera_CAMERA.csv` with where each camera's mount was, `sequence.toml`, and at the end the project
+    `sequence.carts`. Each frame is on disk with its row.
 
     Args:
         sequence: whose arms and cameras these are.
@@ -46,7 +51,9 @@ class Recorder:
             raise OutputError(f"--record {folder} is there already. Name a new folder.")
         self._scene, self._provenance, self._folder = sequence.scene.with_cameras(cameras), provenance, folder
         self._output = output_path(folder)
-        write_text(self._output / "sequence.toml", _sequence_file(sequence, self._scene))
+        self._sequence = sequence
+        self._moving: set[str] = set()
+        self._describe()
         self._waiting: queue.Queue[Tracked | None] = queue.Queue(_WAITING)
         self._edits: list[dict[Key, JointCorrection]] = []
         self._error: Exception | None = None
@@ -90,6 +97,24 @@ class Recorder:
                 except Exception as error:  # Reported at the end; the stream goes on.
                     self._error = error
 
+    def _describe(self) -> None:
+        """Write the sequence file; again when a camera begins to move."""
+        write_text(self._output / "sequence.toml", _sequence_file(self._sequence, self._scene, self._moving))
+
+    def _write_mounts(self, number: int, name: str, tracked: Tracked) -> None:
+        """A row for each camera, since any may begin to move."""
+        mounts = mounts_of(self._scene, tracked.moment.frame, tracked.moment.camera_poses)
+        for camera in self._scene.cameras:
+            path = self._output / _motion_file(camera.name)
+            if number == 0:
+                append_line(path, ",".join(["frame", *POSITION, *ORIENTATION]).encode())
+            T = mounts.get(camera.name, np.eye(4))
+            values = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+            append_line(path, ",".join([name, *(f"{value:.9f}" for value in values)]).encode())
+        if not mounts.keys() <= self._moving:
+            self._moving |= mounts.keys()
+            self._describe()
+
     def _write_one(self, tracked: Tracked) -> None:
         number, frame, estimate = len(self._edits), tracked.moment.frame, tracked.estimate
         name = f"{number:06d}"
@@ -103,6 +128,7 @@ class Recorder:
             columns = ",".join(["frame", "time", *joint_columns(self._scene)])
             append_line(self._output / "kinematics.csv", columns.encode())
             append_line(self._output / "corrected.csv", lines[0].encode())
+        self._write_mounts(number, name, tracked)
         values = ",".join([name, f"{estimate.time:.6f}", *(f"{value:.9f}" for value in measured)])
         append_line(self._output / "kinematics.csv", values.encode())
         append_line(self._output / "corrected.csv", lines[1].encode())
@@ -115,7 +141,11 @@ class Recorder:
         self._edits.append(edits)
 
 
-def _sequence_file(sequence: Sequence, scene: Scene) -> str:
+def _motion_file(camera: str) -> str:
+    return f"camera_{file_name(camera)}.csv"
+
+
+def _sequence_file(sequence: Sequence, scene: Scene, moving: Collection[str]) -> str:
     """The description of what is recorded; images have no distortion any more."""
     lines = [
         "# Recorded by carts live.",
@@ -156,4 +186,7 @@ def _sequence_file(sequence: Sequence, scene: Scene) -> str:
             f"T_camera_world = {np.asarray(camera.T_camera_world).tolist()}",
             f"images = {json.dumps(f'images/{file_name(camera.name)}/' + '{frame}.png')}",
         ]
+        if camera.name in moving:
+            motion = json.dumps(_motion_file(camera.name))
+            lines.append(f'motion = {{ table = {motion}, pose = "T_mount_world" }}')
     return "\n".join(lines) + "\n"

@@ -23,6 +23,7 @@ from ..recording import Frame
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.live import LiveSettings
 from ..settings.stages import Stage
+from .moments import mounts_of
 
 _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""
@@ -198,12 +199,8 @@ class LiveTracker:
         return FrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, backgrounds)
 
     def _variables(self, frame: Frame, camera_poses: Mapping[str, np.ndarray]) -> Variables:
-        mounts = {
-            camera.name: np.linalg.inv(camera.T_camera_world) @ camera_poses[camera.name]
-            for camera in self._scene.cameras
-            if camera.name in camera_poses
-        }
-        state = self._scene.state(frame.measured, self._predictor.device, {**frame.mounts, **mounts})
+        mounts = mounts_of(self._scene, frame, camera_poses)
+        state = self._scene.state(frame.measured, self._predictor.device, mounts)
         return Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _error_model(self, variables: Variables) -> ErrorModel:

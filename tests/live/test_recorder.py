@@ -1,0 +1,58 @@
+"""A stream of a camera that moves, on disk."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from moving import swing
+
+from carts_core.live.loop import Tracked
+from carts_core.live.moments import Moment
+from carts_core.live.recorder import Recorder
+from carts_core.live.tracker import Effort, LiveEstimate, LiveVerdict
+from carts_core.project import Provenance, Source
+from carts_core.recording import Sequence
+
+FRAMES = 4
+
+
+def record(sequence: Sequence, folder: Path, poses: list[dict[str, np.ndarray]]) -> Sequence:
+    """Record frames whose cameras are at poses, as they were sent, and open what was recorded."""
+    recorder = Recorder(sequence, ("left",), folder, Provenance(Source.HAND))
+    for number, sent in enumerate(poses):
+        frame = replace(sequence.frame(number), timestamp=0.1 * number)
+        joints = {arm: values.copy() for arm, values in frame.measured.items()}
+        estimate = LiveEstimate(
+            frame.frame_id,
+            0.1 * number,
+            LiveVerdict.GOOD,
+            Effort.SMALL,
+            0.01,
+            sequence.scene.state(joints),
+            joints,
+            {arm: np.full_like(values, 1e-3) for arm, values in joints.items()},
+            0.0,
+        )
+        recorder(Tracked(Moment(frame, sent), estimate, 0.0))
+    path = recorder.close()
+    assert path is not None
+    return Sequence.open(path)
+
+
+def test_a_camera_that_begins_to_move_is_recorded_with_where_it_was(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=FRAMES))
+    T = sequence.scene.cameras[0].T_camera_world
+    mounts = np.linalg.inv(swing(FRAMES).Ts_world_mount)
+    found = record(sequence, tmp_path / "recorded", [{}, *({"left": T @ moved} for moved in mounts[1:])])
+    assert found.moving_cameras == ("left",)
+    assert np.allclose(found.mounts(0)["left"], np.eye(4), atol=1e-8)
+    for index in range(1, FRAMES):
+        assert np.allclose(found.mounts(index)["left"], mounts[index], atol=1e-7)
+
+
+def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    found = record(Sequence.open(tiny_sequence(frames=2)), tmp_path / "recorded", [{}, {}])
+    assert not found.moving_cameras and len(found) == 2
