@@ -118,7 +118,12 @@ class Context:
             found = Figures(self._loss, self.state.scores.dice if self.state.scores else None)
             figures = {} if found == Figures() else {index: found}
         self._editor.save(figures)
-        self.change(project=self._editor.view, unsaved=self._editor.unsaved)
+        self._follow()
+
+    def _follow(self) -> None:
+        """Bring what is said of the project up to date."""
+        editor = self._editor
+        self.change(project=editor.view, unsaved=editor.unsaved, can_undo=editor.can_undo, can_redo=editor.can_redo)
 
     def leave_frame(self) -> None:
         """Save the shown frame before another one is shown. Errors as `save`."""
@@ -137,7 +142,8 @@ class Context:
         if not pose.equals(self.state.pose):
             self.change(pose=pose, scores=None, maps=None)
             self._measure_pins()
-        self.change(maps=maps or self.state.maps, project=self._editor.view, unsaved=self._editor.unsaved)
+        self.change(maps=maps or self.state.maps)
+        self._follow()
         if self._truths(self.state) != self._truths(before):
             self.change(scores=None)
         if self.state.ignore_region != before.ignore_region:

@@ -10,23 +10,33 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_viewer import intents
+from carts_viewer.background import Background
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context
 from carts_viewer.handlers.annotating import AnnotatingHandler
 from carts_viewer.handlers.browsing import BrowsingHandler
-from carts_viewer.handlers.exporting import Deliver, ExportingHandler
+from carts_viewer.handlers.exporting import Deliver, shown_mask
 from carts_viewer.handlers.finding import FindingHandler
 from carts_viewer.handlers.importing import ImportingHandler
-from carts_viewer.handlers.jobs import JobsHandler
+from carts_viewer.handlers.marking import MarkingHandler
 from carts_viewer.handlers.optimizing import OptimizingHandler
 from carts_viewer.handlers.painting import PaintingHandler
 from carts_viewer.handlers.posing import PosingHandler
-from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.people import LONGEST_NAME
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
+_BEGINNING = (
+    intents.Solve,
+    intents.TakeSolved,
+    intents.Export,
+    intents.OptimizeFrames,
+    intents.Calibrate,
+    intents.RepeatJob,
+)
+"""What ends a run here before it begins."""
 WATCH_EVERY = 1.0
 """How often the project's file is checked while nothing is edited [s]."""
 
@@ -40,6 +50,7 @@ class Controller:
         session: Session,
         renderer: OverlayRenderer,
         optimizers: OptimizerFactory,
+        background: Background,
         deliver: Deliver,
     ) -> None:
         """
@@ -48,29 +59,24 @@ class Controller:
             session: the recording and its project.
             renderer: renders poses.
             optimizers: makes optimizers.
+            background: takes what takes long.
             deliver: sends a file to a tab.
         """
         self._context = context = Context(state, session, renderer)
+        self._background = background
         self._editor = session.editor
         self._watch_at = 0.0
         self._incident: str | None = None
         self._optimizing = run = OptimizingHandler(context, optimizers)
         self._browsing = BrowsingHandler(context, run)
         self._annotating = AnnotatingHandler(context, run, self._browsing.show)
-        self._propagating = PropagatingHandler(context, run, optimizers)
-        self._exporting = ExportingHandler(context, run, deliver)
-        self._jobs = JobsHandler(context, run, optimizers, self._propagating, self._exporting)
         self._handlers: dict[type[intents.Intent], Callable[[Any], None]] = {
             intents.Browsing: self._browsing.handle,
             intents.Posing: PosingHandler(context, run).handle,
             intents.Optimizing: self._optimizing.handle,
             intents.Annotation: self._annotating.handle,
-            # What takes long is queued; the rest of its kind is done at once.
-            intents.Solve: self._jobs.handle,
-            intents.Export: self._jobs.handle,
-            intents.Jobs: self._jobs.handle,
-            intents.Propagating: self._propagating.handle,
-            intents.Exporting: self._exporting.handle,
+            intents.Marking: MarkingHandler(context, run).handle,
+            intents.ExportMask: lambda intent: deliver(intent.client_id, *shown_mask(context)),
             intents.Painting: PaintingHandler(context, run).handle,
             intents.ImportMasks: ImportingHandler(context, run).handle,
             intents.Finding: FindingHandler(context, run, self._browsing.show).handle,
@@ -78,6 +84,7 @@ class Controller:
             # Nothing to do: it has woken the worker, which now may send the next overlay.
             intents.Drawn: lambda _: None,
             intents.Released: lambda _: self._released(),
+            intents.SetName: lambda intent: self._name(intent.name),
             intents.DismissError: lambda _: context.change(error=None),
         }
 
@@ -92,15 +99,46 @@ class Controller:
         Raises:
             CartsError: with a text for people; the state is still a valid one.
         """
+        if self._background.takes(intent):
+            self._hand_on(intent)
+            return
         handle = next((handle for kind, handle in self._handlers.items() if isinstance(intent, kind)), None)
         if handle is None:
             raise unknown(intent)
         handle(intent)
-        self._jobs.settle()
+
+    def _hand_on(self, intent: intents.Intent) -> None:
+        """Have the background do something, with what is saved here and chosen here."""
+        if isinstance(intent, _BEGINNING):
+            self._optimizing.end("Stopped: a job was started")
+            self._context.save()
+            self._context.change(playing=False, error=None)
+        try:
+            self._background.handle(intent, self._editor.person, self.state)
+        finally:
+            self.follow()
+
+    def follow(self) -> None:
+        """Bring the state up to date with what others, and the background, have done."""
+        state, shared = self.state, self._background.state
+        if (state.jobs, state.solve, state.export) != (shared.jobs, shared.solve, shared.export):
+            self._context.change(jobs=shared.jobs, solve=shared.solve, export=shared.export)
+        people, person = self._editor.people, self._editor.person
+        others = tuple((one.name, one.index) for one in people.persons if one is not person and one.present)
+        if others != state.others:
+            self._context.change(others=others)
+        person.index = state.index
+        if self._editor.view is not state.project:
+            self._context.refresh()
+
+    def _name(self, name: str) -> None:
+        chosen = " ".join(name.split())[:LONGEST_NAME]
+        self._editor.person.chosen = chosen
+        self._context.change(name=chosen)
 
     def wait_time(self) -> float | None:
         """How long nothing needs to be done unless somebody asks [s]; None for ever."""
-        handlers = (self._optimizing, self._propagating, self._exporting, self._jobs, self._browsing)
+        handlers = (self._optimizing, self._browsing)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
@@ -115,15 +153,8 @@ class Controller:
         return watch if draft is None else min(draft, watch)
 
     def advance(self) -> None:
-        """Do one bit of what is going on: an iteration, a frame to be solved or exported, the next frame of playing."""
+        """Do one bit of what is going on: an iteration, the next frame of playing."""
         self._optimizing.advance()
-        try:
-            self._propagating.advance()
-            self._exporting.advance()
-        except Exception as error:
-            self._jobs.fail(str(error))
-            raise
-        self._jobs.advance()
         self._browsing.advance()
         if self._editor.overdue_in() == 0.0:
             self._context.save()
@@ -151,22 +182,14 @@ class Controller:
         self._context.change(error=text, busy=None)
         if stop:
             self._optimizing.end("Stopped by an error", save=False)
-            # What is solved is not lost to an error of something else; its own errors have saved it already.
-            with suppress(CartsError):
-                self._propagating.finish()
-            self._exporting.cancel()
-            self._jobs.fail(text)
             self._context.change(playing=False)
 
     def close(self) -> None:
-        """Save what is under way; exports are abandoned.
+        """Save what is under way.
 
         Raises:
             CartsError: it could not be saved.
         """
-        self._exporting.cancel()
-        self._propagating.finish()
-        self._jobs.close()
         self._context.save()
 
     def say(self, text: str | None) -> None:

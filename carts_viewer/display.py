@@ -15,14 +15,14 @@ from carts_viewer.scene_view import SceneView
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState
 from carts_viewer.strokes import Tool
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 
 class PageDisplay:
-    """The page as the worker sees it; used on the worker's thread."""
+    """A tab as the worker sees it; used on the worker's thread."""
 
     def __init__(
-        self, page: Page, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
+        self, page: TabPage, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
     ) -> None:
         self._page = page
         self._scene = session.scene
@@ -32,7 +32,10 @@ class PageDisplay:
         self._panels = panels
         self._rate_limit = RateLimit()
         self._shown: ViewState | None = None
-        self.drawn = self._rate_limit.drawn
+
+    def drawn(self) -> None:
+        """The tab has drawn the newest picture; any thread may say so."""
+        self._rate_limit.drawn(self._page.client.client_id)
 
     def ready_in(self) -> float:
         """How long until the page can take another picture [s]; 0 when it can now."""
@@ -47,12 +50,12 @@ class PageDisplay:
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
             overlays = {name: self._overlay(state, name) for name in self._seen(state)}
             # Together, or a new frame would be seen for a moment under the old frame's overlay.
-            with self._page.server.atomic():
+            with self._page.atomic():
                 if new_frame:
                     self._scene_view.show_frame(state.frame.images[state.camera], camera)
                 self._scene_view.show_overlay(overlays[state.camera], camera)
                 self._show_others(state, old, overlays)
-            self._page.server.flush()
+            self._page.flush()
             self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
             self._rate_limit.sent()
             # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
@@ -108,11 +111,10 @@ class PageDisplay:
                 self._scene_view.hide_beside(camera)
 
     def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
-        """Acknowledge strokes that are in the overlay that was just sent: their tabs need not draw them any more."""
-        clients = self._page.server.get_clients()
-        for tab, number in new.items():
-            if old.get(tab) != number and tab in clients:
-                self._page.call(clients[tab], "painted", number)
+        """Acknowledge strokes that are in the overlay that was just sent: the tab need not draw them any more."""
+        own = self._page.client.client_id
+        if own in new and old.get(own) != new[own]:
+            self._page.call("painted", new[own])
 
     def show_panels(self, state: ViewState) -> None:
         """Bring every widget up to date."""

@@ -52,7 +52,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
         context.save()
         review = reviewed(index, session.editor.view.review(index))
         changes = {**edits, **review, Key.verdict(index): fit.verdict}
-        session.editor.project.apply(f"Optimize, frame {name}", changes, {index: Figures(fit.loss, fit.dice)})
+        session.editor.apply(f"Optimize, frame {name}", changes, {index: Figures(fit.loss, fit.dice)})
         context.refresh()
         taken += 1
         yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: {fit.verdict.verdict}, loss {fit.loss:.3g}")
@@ -95,7 +95,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Ite
     if session.editor.view.records.get(-1) is not before.records.get(-1):
         raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
     context.save()
-    session.editor.project.apply(f"Calibrate on {len(indices)} frames", edits)
+    session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
     yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}")
 

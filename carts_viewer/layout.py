@@ -2,7 +2,6 @@
 
 import viser
 
-from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.page_state import PageState
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.curves import CurvesPanel
@@ -11,7 +10,7 @@ from carts_viewer.panels.find import FindPanel
 from carts_viewer.panels.fit import FitPanel
 from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.importing import ImportPanel
-from carts_viewer.panels.inputs import Panel
+from carts_viewer.panels.inputs import Emit, Panel, Waits
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel
 from carts_viewer.panels.keyframes import KeyframesPanel
@@ -20,6 +19,7 @@ from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
 from carts_viewer.panels.paint import PaintPanel
+from carts_viewer.panels.people import PeoplePanel
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
 from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
@@ -29,7 +29,7 @@ from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
 from carts_viewer.timeline_data import TimelineData
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _WIDTH = 312.0
 """Of either side [px]."""
@@ -48,7 +48,9 @@ class Layout:
         joints: the one with the joints' sliders.
     """
 
-    def __init__(self, page: Page, session: Session, storage: Storage, state: ViewState, queue: IntentQueue) -> None:
+    def __init__(
+        self, page: TabPage, session: Session, storage: Storage, state: ViewState, emit: Emit, waits: Waits
+    ) -> None:
         """Build the panels.
 
         Args:
@@ -56,11 +58,10 @@ class Layout:
             session: the open sequence.
             storage: its project.
             state: what is shown first.
-            queue: takes the intents.
+            emit: takes the intents.
+            waits: whether an intent waits for the worker.
         """
-        emit, waits = queue.put, queue.waits
-        gui = page.server.gui
-        choose_theme(gui, light=False)
+        gui = page.gui
         gui.set_panel_label("CaRTS")
         gui.main_panel.dock_left()
         gui.main_panel.set_width(_WIDTH)
@@ -91,6 +92,7 @@ class Layout:
                 ImportPanel(page, session, emit),
                 FindPanel(page, session, emit, waits),
                 HistoryPanel(page, emit),
+                PeoplePanel(page, state, emit, waits),
             ]
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))

@@ -1,9 +1,6 @@
 """What the page's own scripts draw over the picture: cameras with their fit, keypoints, clicks, the frame."""
 
-import uuid
 from typing import Any
-
-import viser
 
 from carts_core.project import by_hand
 from carts_viewer.marks import keypoints_in_image, labelled_keypoints
@@ -11,32 +8,25 @@ from carts_viewer.panels.fit import quality
 from carts_viewer.panels.review import BY_HAND
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 
 class PageState:
-    """Sends every tab what it needs to know, when it has changed and when the tab is new."""
+    """Sends a tab what it needs to know, when it has changed."""
 
-    def __init__(self, page: Page, session: Session) -> None:
+    def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page
         self._session = session
         self._points = labelled_keypoints(session.scene)
         self._labels = {point: label for label, point in self._points.items()}
-        self._server = uuid.uuid4().hex
         self._sent: dict[str, Any] = {}
-
-        @page.on_connect
-        def _(client: viser.ClientHandle) -> None:
-            if self._sent:
-                page.call(client, "setPage", self._sent)
 
     def show(self, state: ViewState) -> None:
         """Send what has changed."""
         message = self._message(state)
         if message != self._sent:
             self._sent = message
-            for client in self._page.server.get_clients().values():
-                self._page.call(client, "setPage", message)
+            self._page.call("setPage", message)
 
     def _message(self, state: ViewState) -> dict[str, Any]:
         scene, names = self._session.scene, [camera.name for camera in self._session.scene.cameras]
@@ -65,11 +55,12 @@ class PageState:
                 }
             )
         return {
-            "server": self._server,
             "cameras": cameras,
             "active": names.index(state.camera),
             "chosen": state.keypoints.chosen,
             "frame": state.index,
+            "names": names,
+            "name": state.name,
             "domain": state.domain,
             "label": state.frame.frame_id,
             "review": BY_HAND if by_hand(state.project, state.index) else str(state.review.state),

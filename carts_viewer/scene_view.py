@@ -46,27 +46,24 @@ _SPACING = 1.01
 
 
 class SceneView:
-    """What all tabs see; every tab chooses for itself from where."""
+    """What a tab sees; it chooses for itself from where."""
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, state: SceneState, camera: str) -> None:
+    def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
         """
         Args:
-            server: The page's server.
+            shown: Where nodes are added, of all tabs or of one.
             scene: The recording's arms and cameras.
             state: A pose of it, which decides how far from the lens the frame is put.
             camera: The camera to begin with.
         """
-        self._server = server
+        self._shown = shown
         self._scene = scene
         self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
         self._links: list[list[viser.FrameHandle]] = []
         self._outlines: dict[str, viser.LineSegmentsHandle] = {}
         self._planes: dict[str, tuple[Camera, viser.ImageHandle]] = {}
         self._others: dict[str, tuple[tuple[Camera, Camera], viser.ImageHandle]] = {}
-        server.scene.set_up_direction("-y")
-        initial = server.initial_camera
-        initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
-        self._world = server.scene.add_frame(WORLD, show_axes=False)
+        self._world = shown.add_frame(WORLD, show_axes=False)
         self._measured: list[list[viser.FrameHandle]] = []
         self._add_arms()
         self._add_cameras()
@@ -96,7 +93,7 @@ class SceneView:
             if name in self._others and self._others[name][0] == key:
                 self._others[name][1].image = picture
                 continue
-            handle = self._server.scene.add_image(
+            handle = self._shown.add_image(
                 name,
                 picture,
                 width * share,
@@ -163,7 +160,7 @@ class SceneView:
             self._planes[name][1].image = image
             return
         fx, fy, cx, cy = camera.intrinsics
-        handle = self._server.scene.add_image(
+        handle = self._shown.add_image(
             name,
             image,
             camera.width / fx * z,
@@ -188,7 +185,7 @@ class SceneView:
         ]
         edges = [(corner, corners[(number + 1) % 4]) for number, corner in enumerate(corners)]
         rays = [((0.0, 0.0, 0.0), corner) for corner in corners]
-        return self._server.scene.add_line_segments(
+        return self._shown.add_line_segments(
             name, np.array([*edges, *rays], np.float32), color, thickness=2.0, thickness_units="screen"
         )
 
@@ -200,13 +197,11 @@ class SceneView:
             # The axes of the base, and of the tip's link.
             for link in (0, -1):
                 name = arm.robot.link_names[link]
-                self._server.scene.add_frame(
-                    f"{WORLD}/{number}/{name}/axes", axes_length=_AXES, axes_radius=0.03 * _AXES
-                )
+                self._shown.add_frame(f"{WORLD}/{number}/{name}/axes", axes_length=_AXES, axes_radius=0.03 * _AXES)
 
     def _add_arm(self, root: str, arm: Arm, color: Colour, opacity: float | None) -> list[viser.FrameHandle]:
         """The links of an arm with their meshes."""
-        scene = self._server.scene
+        scene = self._shown
         links = [scene.add_frame(f"{root}/{name}", show_axes=False) for name in arm.robot.link_names]
         for part, mesh in enumerate(arm.robot.meshes):
             scene.add_mesh_simple(
@@ -223,7 +218,7 @@ class SceneView:
 
     def _add_grid(self) -> None:
         """A grid of centimetres behind the arms, across the line of vision of the shown camera."""
-        self._server.scene.add_grid(
+        self._shown.add_grid(
             GRID,
             width=20 * _GRID_CELL,
             height=20 * _GRID_CELL,

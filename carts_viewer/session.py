@@ -19,7 +19,6 @@ from carts_core.project import (
     Edits,
     JointCorrection,
     Key,
-    Project,
     ProjectState,
     Provenance,
     Source,
@@ -27,6 +26,7 @@ from carts_core.project import (
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.editing import Editor
 from carts_viewer.joint_range import JointRange, joint_range
+from carts_viewer.people import People, Person
 from carts_viewer.start.roots import Roots
 from carts_viewer.state import Pose
 
@@ -43,11 +43,20 @@ class Session:
         roots: folders that files may be brought in from: that of the sequence, and others that somebody allowed.
     """
 
-    def __init__(self, sequence: Sequence, project: Project, folders: Iterable[Path] = ()) -> None:
+    def __init__(
+        self, sequence: Sequence, people: People, person: Person | None = None, folders: Iterable[Path] = ()
+    ) -> None:
+        """
+        Args:
+            sequence: the recording.
+            people: everybody who edits its project.
+            person: who edits it here; None: somebody new.
+            folders: what files may be brought in from, besides the sequence's own.
+        """
         self._sequence = sequence
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
-        self.editor = Editor(project)
+        self.editor = Editor(people, person or people.join())
         self.ranges = tuple(
             joint_range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
         )

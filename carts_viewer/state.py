@@ -205,6 +205,14 @@ class ViewState:
     """Of the shown pose; None until they are computed, which is after its picture has been sent."""
     jobs: tuple[Job, ...] = ()
     """What takes long, oldest first."""
+    can_undo: bool = False
+    """Whether there may be something that whoever works here can take back."""
+    can_redo: bool = False
+    """Whether there is something that they can do again."""
+    name: str = ""
+    """How others call whoever works here."""
+    others: tuple[tuple[str, int], ...] = ()
+    """Who else is at work now, and on which frame."""
     busy: str | None = None
     """What the worker is preparing, for people."""
     export: ExportState | None = None

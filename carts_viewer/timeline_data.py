@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-import viser
-
 from carts_core.project import FitVerdict, ProjectState, ReviewState, Source, by_hand
 from carts_core.project.fit_verdict import VERDICTS
 from carts_core.project.state import Record
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _REVIEWS = (
     ReviewState.UNTOUCHED,
@@ -28,9 +26,9 @@ _MOST_IDS = 5000
 
 
 class TimelineData:
-    """Sends every tab what is known of the frames, whole when the tab is new, and then what has changed."""
+    """Sends a tab what is known of the frames, whole at first, and then what has changed."""
 
-    def __init__(self, page: Page, session: Session) -> None:
+    def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page
         self._ids = session.sequence.frame_ids
         stamps = session.sequence.timestamps
@@ -39,10 +37,7 @@ class TimelineData:
         self._records: Mapping[int, Record] = {}
         self._codes: dict[int, int] = {}
         self._solving: list[int] | None = None
-
-        @page.on_connect
-        def _(client: viser.ClientHandle) -> None:
-            page.call(client, "setTimeline", self._whole())
+        page.call("setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:
         """Send what has changed; a gesture that is not finished changes nothing."""
@@ -53,8 +48,7 @@ class TimelineData:
         if changed or solving != self._solving:
             self._solving = solving
             message = {"whole": False, "codes": changed, "solving": solving}
-            for client in self._page.server.get_clients().values():
-                self._page.call(client, "setTimeline", message)
+            self._page.call("setTimeline", message)
 
     def _whole(self) -> dict[str, Any]:
         codes = [number for pair in list(self._codes.items()) for number in pair]

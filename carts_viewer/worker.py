@@ -4,13 +4,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
+from queue import SimpleQueue
 
 from carts_core.errors import CartsError
 from carts_viewer import intents
-from carts_viewer.controller import Controller
-from carts_viewer.intent_queue import IntentQueue
-from carts_viewer.state import ViewState
+from carts_viewer.intent_queue import Asked, IntentQueue
+from carts_viewer.tab import Tab
+from carts_viewer.tabs import Tabs
 
 _log = logging.getLogger(__name__)
 
@@ -18,30 +18,17 @@ _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intent
 """Intents that may begin what takes long."""
 
 
-class Display(Protocol):
-    """Where states are shown."""
-
-    def ready_in(self) -> float:
-        """How long until the page can take another picture [s]; 0 when it can now."""
-        ...
-
-    def show_picture(self, state: ViewState) -> None:
-        """Send frame, overlay and 3D scene, as far as they changed."""
-
-    def show_panels(self, state: ViewState) -> None:
-        """Bring every widget up to date."""
-
-
 class Worker:
-    """Drains the queue, newest wins; pictures go out as fast as the page draws them and the last one always does."""
+    """Drains the queue, newest wins; pictures go out as fast as each page draws them and the last one always does.
 
-    def __init__(self, queue: IntentQueue, controller: Controller, display: Display) -> None:
+    Tabs take turns: whatever goes on in one of them holds up the others for a single step of it.
+    """
+
+    def __init__(self, queue: IntentQueue[Tab], tabs: Tabs) -> None:
         self._queue = queue
-        self._controller = controller
-        self._display = display
+        self._tabs = tabs
+        self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._stop = threading.Event()
-        self._shown: ViewState | None = None
-        self._pictured: ViewState | None = None
         self._startup: Callable[[], None] | None = None
         self._rest = threading.Condition()
         self._resting = False
@@ -58,41 +45,68 @@ class Worker:
         self._queue.wake()
         self._thread.join(timeout=30.0)
 
+    def call(self, work: Callable[[], None]) -> None:
+        """Do something on the worker's thread, before the intents that wait. Any thread may ask."""
+        self._calls.put(work)
+        self._queue.wake()
+
     def settled(self, timeout: float) -> bool:
         """Wait until nothing is left to do or to show; False when that took longer than `timeout` [s]."""
         end = time.monotonic() + timeout
         with self._rest:
-            while not (self._resting and self._queue.empty()):
+            while not (self._resting and self._queue.empty() and self._calls.empty()):
                 if not self._rest.wait(min(0.05, max(0.0, end - time.monotonic()))) and time.monotonic() > end:
                     return False
         return True
 
     def report(self, text: str | None) -> None:
-        """Show what is being prepared, at once; called on the worker's thread from within the work."""
-        self._controller.say(text)
-        self._display.show_panels(self._controller.state)
+        """Show in all tabs what is being prepared, at once; called on the worker's thread from within the work."""
+        for tab in self._tabs:
+            tab.controller.say(text)
+            tab.show_panels()
 
     def _work(self) -> None:
-        self._attempt(self._publish)
+        self._publish()
         if self._startup is not None:
-            self._attempt(self._startup)
+            self._attempt(self._startup, *self._tabs)
         while not self._stop.is_set():
-            self._attempt(self._round)
+            self._round()
         # What somebody did just before the end is saved, too; nothing long is begun.
-        for intent in self._queue.take(0.0):
-            if not isinstance(intent, _BEGINNING):
-                self._attempt(lambda intent=intent: self._controller.handle(intent))
+        for asked in self._queue.take(0.0):
+            if not isinstance(asked.intent, _BEGINNING):
+                self._handle(asked)
 
     def _round(self) -> None:
         wait_time = self._wait_time()
-        self._set_resting(wait_time is None and self._queue.empty())
-        waits = [wait for wait in (wait_time, self._controller.overdue_in()) if wait is not None]
-        waiting = self._queue.take(min(waits, default=None))
+        self._set_resting(wait_time is None and self._queue.empty() and self._calls.empty())
+        waits = [wait_time, *(tab.controller.overdue_in() for tab in self._tabs)]
+        known = [wait for wait in waits if wait is not None]
+        waiting = self._queue.take(min(known, default=None) if self._calls.empty() else 0.0)
         self._set_resting(False)
-        for intent in waiting:
-            self._attempt(lambda intent=intent: self._controller.handle(intent))
-        self._attempt(self._controller.advance, stop=True)
+        while not self._calls.empty():
+            self._attempt(self._calls.get_nowait(), *self._tabs)
+        for asked in waiting:
+            self._handle(asked)
+        for tab in self._tabs:
+            self._attempt(tab.controller.advance, tab, stop=True)
+        self._advance_background()
+        for tab in self._tabs:
+            self._attempt(tab.controller.follow, tab)
+            if tab.controller.state.busy is not None:
+                tab.controller.say(None)
         self._publish()
+
+    def _handle(self, asked: Asked[Tab]) -> None:
+        # One of a tab that is gone for good has nobody to do it for.
+        if asked.tab in self._tabs:
+            self._attempt(lambda: asked.tab.controller.handle(asked.intent), asked.tab)
+
+    def _advance_background(self) -> None:
+        try:
+            self._tabs.background.advance()
+        except Exception as error:
+            text = self._fail(error, *self._tabs)
+            self._tabs.background.fail(text)
 
     def _set_resting(self, resting: bool) -> None:
         with self._rest:
@@ -100,32 +114,27 @@ class Worker:
             self._rest.notify_all()
 
     def _wait_time(self) -> float | None:
-        """How long to wait for an intent: not while there is work, and no longer than a picture waits for the page."""
-        wait_time = self._controller.wait_time()
-        if self._pictured is not self._controller.state:
-            ready = self._display.ready_in()
-            return ready if wait_time is None else min(ready, wait_time)
-        return wait_time
+        """How long to wait for an intent: not while there is work, and no longer than a picture waits for its page."""
+        waits = [self._tabs.background.wait_time()]
+        for tab in self._tabs:
+            waits += [tab.controller.wait_time(), tab.picture_wait()]
+        return min((wait for wait in waits if wait is not None), default=None)
 
     def _publish(self) -> None:
-        if self._pictured is not self._controller.state and self._display.ready_in() <= 0.0:
-            self._attempt(self._controller.map)
-            self._attempt(lambda: self._display.show_picture(self._controller.state))
-            # Numbers come after the picture: somebody may be dragging.
-            self._attempt(self._controller.score)
-            # Also after an error, which would otherwise be met again at once, and for ever.
-            self._pictured = self._controller.state
-        if self._shown is not self._controller.state:
-            self._display.show_panels(self._controller.state)
-            self._shown = self._controller.state
+        for tab in self._tabs:
+            tab.publish(lambda work, tab=tab: self._attempt(work, tab))
 
-    def _attempt(self, work: Callable[[], None], *, stop: bool = False) -> None:
-        """Do something; an error is shown in the page and the worker goes on."""
+    def _attempt(self, work: Callable[[], None], *tabs: Tab, stop: bool = False) -> None:
+        """Do something; an error is shown in these tabs and the worker goes on."""
         try:
             work()
-        except CartsError as error:
-            self._controller.fail(error, stop=stop)
         except Exception as error:
+            self._fail(error, *tabs, stop=stop)
+
+    def _fail(self, error: Exception, *tabs: Tab, stop: bool = False) -> str:
+        if not isinstance(error, CartsError):
             # The traceback helps whoever reads the terminal; the page shows what happened.
-            _log.exception("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"))
-            self._controller.fail(error, stop=stop)
+            _log.error("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"), exc_info=error)
+        for tab in tabs:
+            tab.controller.fail(error, stop=stop)
+        return str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"

@@ -64,7 +64,7 @@ class Photographer:
 
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""
-        self.page.locator(f"[id='{self.app.page.element_id(self.app.page.find(label))}']").click()
+        self.page.locator(f"[id='{self.app.page.element_id(self.app.view.page.find(label))}']").click()
         self.page.get_by_role("option", name=option, exact=True).click()
         self.page.wait_for_timeout(500)
 

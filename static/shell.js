@@ -1,4 +1,4 @@
-// What belongs to one tab of the browser: its theme, where it was before the server was started anew, the sheet of keys,
+// What belongs to one tab of the browser: its theme, where it is, the link that leads there, the sheet of keys,
 // and on a small screen the few buttons that reading and reviewing needs. Needs page.js.
 (() => {
   "use strict";
@@ -14,10 +14,73 @@
     ask(`theme ${name}`);
   }
 
-  // ---- Where this tab was -------------------------------------------------------------------------------------------
+  // ---- Who this tab is, and where -----------------------------------------------------------------------------------
 
-  let server = null; // which one answers; another one knows nothing of our widgets
   const tabs = () => [...document.querySelectorAll("[role=tab][data-dock-tab]")];
+
+  // A tab that is duplicated takes the session's storage along, so what it calls itself lies there only while it loads.
+  const key = sessionStorage.getItem("carts-key") ?? Math.random().toString(36).slice(2) + Date.now().toString(36);
+  sessionStorage.removeItem("carts-key");
+  window.addEventListener("pagehide", () => sessionStorage.setItem("carts-key", key));
+  window.addEventListener("pageshow", () => sessionStorage.removeItem("carts-key"));
+
+  /** Where the address leads: project, frame (from 1), camera and domain, as far as it says so. */
+  function linked() {
+    const said = new URL(location.href).searchParams;
+    const project = window.cartsConfiguration.project;
+    if (said.has("project") && said.get("project") !== project) {
+      return { problem: `This link is for ${said.get("project")}; open here is ${project || "no recording"}.` };
+    }
+    const frame = Number.parseInt(said.get("frame"), 10);
+    return {
+      frame: Number.isFinite(frame) ? frame - 1 : null, camera: said.get("camera"), domain: said.get("domain"),
+    };
+  }
+
+  /** The address of what this tab shows. */
+  function link(detail) {
+    const address = new URL(location.href);
+    const place = {
+      project: window.cartsConfiguration.project, frame: detail.frame + 1,
+      camera: detail.names[detail.active], domain: detail.domain,
+    };
+    for (const [name, value] of Object.entries(place)) address.searchParams.set(name, value);
+    return address.href;
+  }
+
+  let welcome = false; // whether the server has given this connection its place
+  let asked = 0;
+  function sayHello() {
+    if (welcome || !window.cartsConfiguration.project || !window.carts?.connected?.()) return;
+    asked += 1;
+    if (asked > 20 && asked % 10) return;
+    const { problem, ...place } = linked();
+    const name = localStorage.getItem("carts-name") ?? "";
+    ask(`hello ${JSON.stringify({ tab: key, name, theme: wanted(), ...place })}`);
+    if (problem && asked === 1) tell(problem);
+  }
+  setInterval(sayHello, 150);
+
+  /** A short note over the picture. */
+  function tell(text) {
+    const note = document.createElement("div");
+    note.className = "carts-note";
+    note.setAttribute("role", "status");
+    note.textContent = text;
+    document.body.append(note);
+    setTimeout(() => note.remove(), 8000);
+  }
+
+  async function copyLink() {
+    if (!latest) return;
+    const address = link(latest);
+    try {
+      await navigator.clipboard.writeText(address);
+      tell("The link is in the clipboard.");
+    } catch {
+      window.prompt("The link to this frame:", address); // no clipboard without https
+    }
+  }
 
   function chooseTabs(labels) {
     for (const label of labels ?? []) {
@@ -29,22 +92,14 @@
   }
 
   function onPage({ detail }) {
-    if (server !== null && server !== detail.server) {
-      location.reload();
-      return;
-    }
-    const first = server === null;
-    server = detail.server;
+    const first = latest === null;
+    welcome = true;
     const before = remembered("carts-tab");
-    if (first) {
-      if (wanted() === "light") ask("theme light");
-      if (before && before.server !== server && before.title === document.title) {
-        ask(`restore ${JSON.stringify({ frame: before.frame, camera: before.camera, domain: before.domain })}`);
-      }
-      if (before) setTimeout(() => chooseTabs(before.tabs), 400);
-      if (before && before.server !== server) return; // until what was asked for is there
-    }
+    if (first && before) setTimeout(() => chooseTabs(before.tabs), 400);
+    localStorage.setItem("carts-name", detail.name);
     remember(detail);
+    const address = link(detail);
+    if (address !== location.href) history.replaceState(null, "", address);
   }
 
   let latest = null;
@@ -53,10 +108,7 @@
     if (!latest) return;
     const chosen = tabs().filter((tab) => tab.getAttribute("aria-selected") === "true").map((tab) => tab.textContent);
     const before = remembered("carts-tab");
-    sessionStorage.setItem("carts-tab", JSON.stringify({
-      server, title: document.title, frame: latest.frame, camera: latest.active, domain: latest.domain,
-      tabs: chosen.length ? chosen : before?.tabs ?? [],
-    }));
+    sessionStorage.setItem("carts-tab", JSON.stringify({ tabs: chosen.length ? chosen : before?.tabs ?? [] }));
   }
 
   document.addEventListener("carts-page", onPage);
@@ -68,6 +120,7 @@
   setInterval(() => {
     const on = window.carts?.connected?.() ?? true;
     if (on && away) setTimeout(() => chooseTabs(remembered("carts-tab")?.tabs), 900);
+    if (!on) welcome = false;
     away = !on;
   }, 300);
 
@@ -150,6 +203,9 @@
   }, 300);
 
   Object.assign(window.carts, {
+    copyLink, key,
+    /** A server that was started since this page was loaded knows nothing of our widgets. */
+    meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
     showSheet: () => showSheet(true),
     toggleTheme: () =>
       chooseTheme(document.documentElement.dataset.mantineColorScheme === "light" ? "dark" : "light"),

@@ -39,6 +39,10 @@ class Latency:
     """Whether the last overlay was not the one of the last value or frame."""
 
 
+_KEY = "bench"
+"""What the measuring tab calls itself, so that the next one takes its place."""
+
+
 def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True) -> Latency:
     """Drag the first joint's slider and wait for overlays.
 
@@ -50,11 +54,11 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
     """
     arm = app.state.frame.measured
     name = next(iter(arm))
-    slider = app.page.element_id(app.joints.slider(name, 0))
-    shown = _record_pictures(app, name)
     times: list[float] = []
     stale = False
-    with RawTab(app.url, app.page.drawn_id if draws else None) as tab:
+    with RawTab(app.url, app.page.drawn_id if draws else None, key=_KEY) as tab:
+        slider = app.page.element_id(app.view.layout.joints.slider(name, 0))
+        shown = _record_pictures(app, name)
         app.wait_until_shown()
         for _ in range(drags):
             start = float(np.degrees(arm[name][0]))
@@ -87,12 +91,12 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
         frames: How many frames to go forth before going back.
         pause: Between two keys [s].
     """
-    forth, back = (app.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
     count = min(frames, len(app.sequence)) - 1
-    lap = [forth] * count + [back] * count
     app.queue.put(intents.ShowFrame(0))
     times: list[float] = []
-    with RawTab(app.url, app.page.drawn_id) as tab:
+    with RawTab(app.url, app.page.drawn_id, key=_KEY) as tab:
+        forth, back = (app.view.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
+        lap = [forth] * count + [back] * count
         app.wait_until_shown()
         for number in range(len(lap) + moves):
             seen, pressed = len(tab.overlays), time.perf_counter()
@@ -104,7 +108,7 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
             times.append(tab.overlays[-1][0] - pressed)
             app.wait_until_shown()
             time.sleep(pause)
-        stale = tab.overlays[-1][1] != app.scene_view.sent(OVERLAY)
+        stale = tab.overlays[-1][1] != app.view.scene.sent(OVERLAY)
     # The first lap has read the frames.
     return _latency(times[len(lap) :], stale)
 
@@ -117,14 +121,14 @@ def _latency(times: list[float], stale: bool) -> Latency:
 def _record_pictures(app: ViewerApp, arm: str) -> list[tuple[float, float]]:
     """A list that fills with the time and the first joint [rad] of every picture that the worker starts to make."""
     shown: list[tuple[float, float]] = []
-    show = app.display.show_picture
+    show = app.view.display.show_picture
     row = [own.name for own in app.scene.arms].index(arm)
 
     def recorded(state: Any) -> None:
         shown.append((time.perf_counter(), float(state.pose.scene.joint_positions[row][0])))
         show(state)
 
-    app.display.show_picture = recorded
+    app.view.display.show_picture = recorded
     return shown
 
 

@@ -1,6 +1,8 @@
 """A tab without a browser, to measure and to attack the viewer with."""
 
 import asyncio
+import itertools
+import json
 import threading
 import time
 from collections import deque
@@ -28,11 +30,21 @@ _CAMERA = {
 }
 
 
+_NUMBERS = itertools.count(1)
+
+
 class RawTab:
     """Speaks viser's protocol, sets widgets to anything, and notes what arrives. Used as a context."""
 
     def __init__(
-        self, url: str, drawn: str | None = None, *, keep: int | None = None, origin: str | None = None
+        self,
+        url: str,
+        drawn: str | None = None,
+        *,
+        keep: int | None = None,
+        origin: str | None = None,
+        hello: bool = True,
+        key: str | None = None,
     ) -> None:
         """
         Args:
@@ -40,6 +52,8 @@ class RawTab:
             drawn: Id of the field in which a tab says that it has drawn an overlay; None for a tab that never says so.
             keep: How many overlays to remember; None for all.
             origin: The header of this name; None for none, as programs do.
+            hello: Whether it asks for its place in the viewer, as our page does, and waits for it.
+            key: What it calls itself then; None for a name of its own.
         """
         self._url = url.replace("http://", "ws://")
         self._drawn = drawn
@@ -49,6 +63,11 @@ class RawTab:
         self._connection: ClientConnection | None = None
         self._drawings = 0
         self._joined = threading.Event()
+        self._hello = hello
+        self.key = key or f"raw {next(_NUMBERS)}"
+        """What the tab calls itself."""
+        self._asked: str | None = None
+        self._saying: asyncio.Task[None] | None = None
         self.overlays: deque[tuple[float, bytes]] = deque(maxlen=keep)
         """Time of arrival [s, perf_counter] and PNG of every overlay."""
         self.values: dict[str, Any] = {}
@@ -119,6 +138,9 @@ class RawTab:
         if self.connected:
             await self._connection.close()
         await asyncio.gather(self._reader, return_exceptions=True)
+        if self._saying is not None:
+            self._saying.cancel()
+            await asyncio.gather(self._saying, return_exceptions=True)
 
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -135,10 +157,29 @@ class RawTab:
             for message in inner["messages"]:
                 await self._note(message, arrived)
 
+    async def _say_hello(self) -> None:
+        """Ask for a place until there is one."""
+        count = 0
+        while not self._joined.is_set() and self.connected:
+            count += 1
+            if self._asked is not None:
+                said = json.dumps({"tab": self.key})
+                await self._push(
+                    msgspec.msgpack.encode(_update(self._asked, f"{self.key.replace(' ', '')} {count} hello {said}"))
+                )
+            await asyncio.sleep(0.1)
+
     async def _note(self, message: dict[str, Any], arrived: float) -> None:
         updates, props = message.get("updates", {}), message.get("props", {})
         if message["type"] == "ReplayDoneMessage":
+            if not self._hello:
+                self._joined.set()
+            else:
+                self._saying = asyncio.create_task(self._say_hello())
+        if message["type"] == "RunJavascriptMessage" and '"setPage"' in message["source"]:
             self._joined.set()
+        if props.get("label") == "asked":
+            self._asked = message["uuid"]
         if message["type"] == "GuiUpdateMessage" and "value" in updates:
             self.values[message["uuid"]] = updates["value"]
         if "uuid" in message:

@@ -23,6 +23,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.scene_view import OVERLAY
+from carts_viewer.tab import Tab, View
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
@@ -90,9 +91,6 @@ class Soaking:
         self._app = app
         self._run_seconds = run
         self._random = random.Random(seed)
-        page, arm = app.page, app.scene.arms[0]
-        self._frame, self._opacity, self._run = (page.element_id(page.find(x)) for x in ("Frame", "Opacity %", "Run"))
-        self._joints = [app.joints.slider(arm.name, joint) for joint in range(len(arm.robot.joint_names))]
         self._tabs: list[RawTab] = []
         self.seen = Soak()
 
@@ -103,7 +101,7 @@ class Soaking:
         threading.excepthook = lambda arguments: self.seen.exceptions.append(repr(arguments.exc_value))
         start = time.monotonic()
         try:
-            self._tabs = [self._open() for _ in range(_TABS)]
+            self._tabs = [self._open(f"soak {number}") for number in range(_TABS)]
             while self.seen.minutes < minutes:
                 self._round()
                 self.seen.minutes = (time.monotonic() - start) / 60
@@ -115,26 +113,39 @@ class Soaking:
             threading.excepthook = hook
         return self.seen
 
-    def _open(self) -> RawTab:
-        return RawTab(self._app.url, self._app.page.drawn_id, keep=1).__enter__()
+    def _open(self, key: str) -> RawTab:
+        return RawTab(self._app.url, self._app.page.drawn_id, keep=1, key=key).__enter__()
+
+    def _place(self, tab: RawTab) -> Tab:
+        return next(place for place in self._app.tabs if place.key == tab.key)
+
+    def _view(self, tab: RawTab) -> View:
+        view = self._place(tab).view
+        assert view is not None
+        return view
+
+    def _set(self, tab: RawTab, label: str, value: object) -> None:
+        tab.set(self._app.page.element_id(self._view(tab).page.find(label)), value)
 
     def _round(self) -> None:
         dice = self._random
-        dice.choice(self._tabs).set(self._run, True)
+        runner = dice.choice(self._tabs)
+        self._set(runner, "Run", True)
         end = time.monotonic() + self._run_seconds
         while time.monotonic() < end:
             # Watching: a change of opacity needs a new picture, but does not end the run.
-            dice.choice(self._tabs).set(self._opacity, dice.randrange(20, 100, 5))
+            self._set(dice.choice(self._tabs), "Opacity %", dice.randrange(20, 100, 5))
             time.sleep(0.5)
-        self.seen.iterations += max(len(self._app.state.run.curves.loss) - 1, 0)
+        self.seen.iterations += max(len(self._place(runner).controller.state.run.curves.loss) - 1, 0)
         count = len(self._app.sequence)
         place = dice.randrange(count)
         for _ in range(40):
             place = (place + 1) % count
-            dice.choice(self._tabs).set(self._frame, place + 1)
+            self._set(dice.choice(self._tabs), "Frame", place + 1)
             self.seen.frames += 1
             time.sleep(_STEP)
-        slider, tab = dice.choice(self._joints), dice.choice(self._tabs)
+        tab, arm = dice.choice(self._tabs), self._app.scene.arms[0]
+        slider = self._view(tab).layout.joints.slider(arm.name, dice.randrange(len(arm.robot.joint_names)))
         value = slider.value
         for step in range(20):
             tab.set(self._app.page.element_id(slider), value + 0.1 * (step + 1))
@@ -142,25 +153,25 @@ class Soaking:
         # In the middle of a drag: its tab is closed, and a new one comes.
         self._tabs.remove(tab)
         tab.__exit__()
-        self._tabs.append(self._open())
+        self._tabs.append(self._open(tab.key))
         self.seen.reloads += 1
         self._check()
         self.seen.rounds += 1
 
     def _check(self) -> None:
-        """Wait until everything is at rest; then every tab shows the state, and nothing has gone wrong."""
-        state = self._app.wait_until_shown(60.0)
-        if state.error is not None:
-            self.seen.exceptions.append(state.error)
+        """Wait until everything is at rest; then every tab shows its state, and nothing has gone wrong."""
+        self._app.wait_until_shown(60.0)
         end = time.monotonic() + 10.0
-        sent = self._app.scene_view.sent(OVERLAY)
-        while time.monotonic() < end and any(_newest(tab) != sent for tab in self._tabs):
+        while time.monotonic() < end and any(_newest(tab) != self._view(tab).scene.sent(OVERLAY) for tab in self._tabs):
             time.sleep(0.05)
-        # Drawn anew, by somebody who has never drawn anything.
-        right = OverlayRenderer(self._app.sequence).overlay(
-            state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
-        )
         for number, tab in enumerate(self._tabs):
+            state = self._place(tab).controller.state
+            if state.error is not None:
+                self.seen.exceptions.append(state.error)
+            # Drawn anew, by somebody who has never drawn anything.
+            right = OverlayRenderer(self._app.sequence).overlay(
+                state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
+            )
             png = cv2.imdecode(np.frombuffer(_newest(tab), np.uint8), cv2.IMREAD_UNCHANGED)
             if png is None or not np.array_equal(cv2.cvtColor(png, cv2.COLOR_BGRA2RGBA), right):
                 self.seen.stale.append(f"round {self.seen.rounds}, tab {number}, frame {state.index}")

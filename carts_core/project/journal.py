@@ -131,6 +131,28 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
     return Script(position=target), entries
 
 
+def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
+    """What brings back what a step has changed, and a later step by which some of it is another one now, if any."""
+    edits: dict[Key[Any], Any] = {}
+    later: list[int] = []
+
+    def newest(about: tuple[str, int, str], last: int) -> tuple[int, Any]:
+        row = memory.execute(
+            "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? "
+            "AND step <= ? ORDER BY step DESC LIMIT 1",
+            (*about, last),
+        ).fetchone()
+        return (0, None) if row is None else row
+
+    for kind, frame, name in memory.execute("SELECT kind, frame, name FROM changes WHERE step = ?", (step,)).fetchall():
+        about, key = (kind, frame, name), Key(Kind(kind), frame, name)
+        edits[key] = decode(key.kind, newest(about, step - 1)[1])
+        number, value = newest(about, position)
+        if value != newest(about, step)[1]:
+            later.append(number)
+    return edits, min(later, default=None)
+
+
 def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
     """Keep figures of (frame, revision), too."""
     for key in figures:

@@ -15,7 +15,7 @@ from .changes import Action, Change, Listener, Listeners
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
 from .place import default_path
-from .state import ExportRecord, ProjectState, Step
+from .state import ExportRecord, ProjectState, Step, by_revision, step_at
 from .store import Store
 from .values import Figures
 
@@ -126,7 +126,7 @@ class Project:
                 return None
             step = Step(state.position + 1, _step_name(name), time.time())
             after = state.after(step, changed)
-            known = _by_revision(after, figures or {})
+            known = by_revision(after, figures or {})
             store = self._writer()
             script = journal.append(store.memory, step, changed, len(state.steps))
             store.commit(journal.add_figures(store.memory, script, known))
@@ -172,6 +172,27 @@ class Project:
             moved = replace(state.with_entries(entries), position=position)
             return self._saved(moved, "undo" if back else "redo", step, entries.keys())
 
+    def reverting(self, number: int) -> Edits:
+        """The edits that take back one step and leave every later one as it is; nothing is changed.
+
+        Args:
+            number: of a step that is done.
+
+        Raises:
+            ProjectError: there is no such step, or a later one has changed the same.
+        """
+        with self._edit:
+            state = self.state
+            if not 1 <= number <= state.position:
+                raise ProjectError(f"no step {number} is done; {counted(state.position, 'step')} are.")
+            edits, later = journal.before(self._writer().memory, number, state.position)
+            if later is not None:
+                raise ProjectError(
+                    f"step {number} ({state.steps[number - 1].name}) cannot be taken back alone: step {later} "
+                    f"({state.steps[later - 1].name}) has changed the same since. Take that back first."
+                )
+            return edits
+
     def history(self) -> tuple[Step, ...]:
         """All steps, oldest first; those with a number above `state.position` are undone."""
         return self.state.steps
@@ -185,10 +206,10 @@ class Project:
             ProjectError: there is no such frame, or it could not be saved.
         """
         with self._edit:
-            known = _by_revision(state, figures)
+            known = by_revision(state, figures)
             # The state may be of a branch of the history that was dropped since.
             known = {
-                key: value for key, value in known.items() if _step_at(state, key[1]) == _step_at(self.state, key[1])
+                key: value for key, value in known.items() if step_at(state, key[1]) == step_at(self.state, key[1])
             }
             if known:
                 store = self._writer()
@@ -277,13 +298,3 @@ def _step_name(name: str) -> str:
     if not 1 <= len(text) <= LONGEST_NAME:
         raise ProjectError(f"a step's name has {len(text)} characters, but must have 1 to {LONGEST_NAME}.")
     return text
-
-
-def _by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tuple[int, int], Figures]:
-    for frame in figures:
-        check_edit(state.identity, Key.review(frame), None)
-    return {(frame, state.revision(frame)): value for frame, value in figures.items()}
-
-
-def _step_at(state: ProjectState, number: int) -> tuple[Step, ...]:
-    return state.steps[max(number - 1, 0) : number]

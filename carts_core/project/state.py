@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
-from .keys import WHOLE_PROJECT, Edits, Key, Kind
+from .keys import WHOLE_PROJECT, Edits, Key, Kind, check_edit
 from .values import Figures, JointCorrection, Review, ReviewState, Source
 
 V = TypeVar("V")
@@ -205,3 +205,19 @@ class ProjectState:
             for frame, record in self.records.items()
         }
         return replace(self, steps=self.steps[: self.position], records=records)
+
+
+def by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tuple[int, int], Figures]:
+    """Figures of frames by frame and revision in this state.
+
+    Raises:
+        ProjectError: there is no such frame.
+    """
+    for frame in figures:
+        check_edit(state.identity, Key.review(frame), None)
+    return {(frame, state.revision(frame)): value for frame, value in figures.items()}
+
+
+def step_at(state: ProjectState, number: int) -> tuple[Step, ...]:
+    """The step with this number, as a tuple; empty where there is none."""
+    return state.steps[max(number - 1, 0) : number]

@@ -11,7 +11,7 @@ from carts_core.errors import CartsError
 from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
-from carts_core.project import Key, Review, ReviewState, Source, next_unreviewed, worst_first
+from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import LONGEST_NOTE
 from carts_viewer import intents
 from carts_viewer.checks import unknown
@@ -70,24 +70,23 @@ class AnnotatingHandler:
     @handle.register
     def _(self, intent: intents.Undo) -> None:
         self._finish("Stopped by undo")
-        self._go_to(self._session.editor.view.position - 1)
+        self._changed(self._session.editor.undo())
 
     @handle.register
     def _(self, intent: intents.Redo) -> None:
         self._finish("Stopped by redo")
-        self._go_to(self._session.editor.view.position + 1)
+        self._changed(self._session.editor.redo())
 
     @handle.register
     def _(self, intent: intents.GoToStep) -> None:
         self._finish("Stopped by undo")
-        self._go_to(intent.position)
+        self._changed(self._session.editor.go_to(intent.position))
 
     def _finish(self, reason: str) -> None:
         self._open_run.end(reason)
         self._context.save()
 
-    def _go_to(self, position: int) -> None:
-        change = self._session.editor.go_to(position)
+    def _changed(self, change: Change | None) -> None:
         self._context.forget_pins()
         frames = () if change is None else change.frames
         index = self._context.state.index

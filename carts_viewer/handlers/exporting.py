@@ -115,14 +115,6 @@ class ExportingHandler:
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
-    def _(self, intent: intents.ExportMask) -> None:
-        state = self._context.state
-        name = file_name(f"{self._session.sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
-        correction = state.project.get(Key.mask_correction(state.index, state.camera))
-        mask = self._context.renderer.mask(state.pose.scene, state.camera, correction)
-        self._deliver(intent.client_id, name, mask_png(mask))
-
-    @handle.register
     def _(self, intent: intents.Export) -> None:
         if self._job is not None:
             raise CartsError("Something is being exported already. Wait, or cancel that first.")
@@ -179,6 +171,14 @@ class ExportingHandler:
     def _report(self, **changes: object) -> None:
         if self._context.state.export is not None:
             self._context.change(export=replace(self._context.state.export, **changes))
+
+
+def shown_mask(context: Context) -> tuple[str, bytes]:
+    """The mask of the shown frame and camera as it was corrected: name and content of a PNG file."""
+    state, sequence = context.state, context.session.sequence
+    name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
+    mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)
+    return name, mask_png(mask)
 
 
 class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):

@@ -72,8 +72,7 @@ class FindingHandler:
             edits[Key.review(index)] = None if review == Review() else review
         # All frames in a name would be a long one.
         self._context.save()
-        editor = self._context.session.editor
-        editor.project.apply(f"{_STEPS[intent.state]} {len(frames)} frames", edits)
+        self._context.session.editor.apply(f"{_STEPS[intent.state]} {len(frames)} frames", edits)
         self._context.refresh()
 
     def _found(self) -> list[int]:

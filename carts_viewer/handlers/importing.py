@@ -37,5 +37,6 @@ class ImportingHandler:
         self._open_run.end("Stopped: masks were imported")
         self._context.save()
         report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)
+        session.editor.claim()
         self._context.refresh()
         self._context.change(layer=Layer.IMPORTED, imported=report.sentence(), error=None)

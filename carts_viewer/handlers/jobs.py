@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import singledispatchmethod
 from typing import Any
 
@@ -18,11 +18,28 @@ from carts_viewer.handlers.exporting import ExportingHandler
 from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.job_work import Progress, calibrate, optimize_frames
 from carts_viewer.jobs import Job, JobList, JobState
+from carts_viewer.people import Person
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.solved import Comparison
+from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
 """How often it is written down how far a job is [s]."""
+_CHOICES = "index frame domain camera pose settings free solver every_camera direction filter".split()
+"""What of a tab's state a job depends on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asker:
+    """Who has asked for a job, and what they had chosen then."""
+
+    person: Person
+    state: ViewState
+
+    def choose(self, context: Context) -> None:
+        """Have a job do what it does with these choices, in this person's name."""
+        context.session.editor.person = self.person
+        context.change(**{name: getattr(self.state, name) for name in _CHOICES})
 
 
 class JobsHandler:
@@ -43,9 +60,18 @@ class JobsHandler:
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         project = context.session.editor.project
         self._list = JobList(project.path, kept=project.writable)
+        self._asker: Asker | None = None
+        """Who asks for what is queued now."""
+        self._asked: dict[int, Asker] = {}
+        """By number of job; a job of an earlier viewer has none."""
         self._work: Iterator[Progress] | None = None
         self._saved_at = 0.0
         self._publish()
+
+    def ask(self, intent: intents.Intent, asker: Asker) -> None:
+        """Do what somebody's intent asks for, with what they have chosen; errors as `handle`."""
+        self._asker = asker
+        self.handle(intent)
 
     @singledispatchmethod
     def handle(self, intent: intents.Intent) -> None:
@@ -64,7 +90,7 @@ class JobsHandler:
 
     @handle.register
     def _(self, intent: intents.Solve) -> None:
-        index = self._context.state.index
+        index = self._choices.index
         self._queue(
             "solve", "Solve all frames" if intent.whole else "Solve between keyframes", {**asdict(intent), "at": index}
         )
@@ -139,6 +165,8 @@ class JobsHandler:
 
     def _queue(self, kind: str, title: str, options: dict[str, Any]) -> None:
         job = self._list.add(kind, title, options)
+        if self._asker is not None:
+            self._asked[job.number] = self._asker
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
             # At once, so that whoever asked for what cannot be learns it now.
             self._begin(job)
@@ -146,6 +174,9 @@ class JobsHandler:
 
     def _begin(self, job: Job) -> None:
         self._list.change(job.number, "begun", state=JobState.RUNNING, began=time.time())
+        asker = self._asked.pop(job.number, None)
+        if asker is not None:
+            asker.choose(self._context)
         try:
             if job.kind == "solve":
                 self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)))
@@ -227,10 +258,9 @@ class JobsHandler:
         return next((job for job in self._list.jobs if job.state is JobState.RUNNING), None)
 
     def _frames(self, which: str) -> list[int]:
-        state = self._context.state
         view = self._context.session.editor.view
         if which == "found":
-            frames = found(view, state.filter)
+            frames = found(view, self._choices.filter)
         elif which == "all":
             frames = list(range(len(self._context.session.sequence)))
         else:
@@ -238,6 +268,10 @@ class JobsHandler:
         if not frames:
             raise CartsError("There is no such frame. Choose others.")
         return frames
+
+    @property
+    def _choices(self) -> ViewState:
+        return self._context.state if self._asker is None else self._asker.state
 
     def _publish(self) -> None:
         self._context.change(jobs=self._list.jobs)

@@ -1,4 +1,4 @@
-"""What intents about keyframes do: marking them, and solving the frames between them together."""
+"""What intents about solving many frames together do."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 
 from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
-from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kept
+from carts_core.project import Figures, Key, ProjectState, between_kept
 from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.checks import unknown
@@ -70,20 +70,6 @@ class PropagatingHandler:
                 pass
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
-
-    @handle.register
-    def _(self, intent: intents.HoldKeyframe) -> None:
-        state = self._context.state
-        on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
-        self._open_run.end("Stopped: the frame was marked")
-        name = "Make a keyframe" if on else "Make no keyframe"
-        self._context.edit(name, {Key.keyframe(state.index): Keyframe(on)})
-
-    @handle.register
-    def _(self, intent: intents.SetDirection) -> None:
-        if intent.direction not in ("forward", "backward"):
-            raise CartsError(f"There is no direction {intent.direction!r}.")
-        self._context.change(direction=intent.direction)
 
     def solve(self, whole: bool, at: int) -> None:
         """Begin to solve all frames, or those between the kept frames around the frame `at`.
@@ -197,7 +183,7 @@ class PropagatingHandler:
             return "Stopped before a frame was solved"
         if figures:
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
-            self._session.editor.project.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
+            self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
             self._context.refresh()
         text = f"{'Stopped: ' if run.cancelled else ''}{len(figures)} frames solved, one step of undo"
         return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
@@ -216,7 +202,7 @@ class PropagatingHandler:
             edits.update({**outcome.edits, **reviewed(index, now.review(index))})
             del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
-        self._session.editor.project.apply(f"Take {len(taken)} solved frames", edits, figures)
+        self._session.editor.apply(f"Take {len(taken)} solved frames", edits, figures)
         listed = self._context.state.solve.listed if self._context.state.solve else ()
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()

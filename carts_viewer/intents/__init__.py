@@ -24,6 +24,7 @@ from .base import Intent as Intent
 from .base import Latest as Latest
 from .base import Refresh as Refresh
 from .base import Released as Released
+from .base import SetName as SetName
 from .browsing import Browsing as Browsing
 from .browsing import CompareWith as CompareWith
 from .browsing import MoveFrame as MoveFrame
@@ -83,6 +84,7 @@ from .posing import Posing as Posing
 from .posing import SetJoint as SetJoint
 from .propagating import DropSolved as DropSolved
 from .propagating import HoldKeyframe as HoldKeyframe
+from .propagating import Marking as Marking
 from .propagating import Propagating as Propagating
 from .propagating import SetDirection as SetDirection
 from .propagating import Solve as Solve

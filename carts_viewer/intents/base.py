@@ -40,5 +40,12 @@ class Released(Latest):
 
 
 @dataclass(frozen=True)
+class SetName(Latest):
+    """Choose the name that stands in the history; empty for none."""
+
+    name: str
+
+
+@dataclass(frozen=True)
 class DismissError(Latest):
     """Take the error message off the page."""

@@ -12,7 +12,7 @@ class Exporting(Intent):
 
 
 @dataclass(frozen=True)
-class ExportMask(Exporting):
+class ExportMask(Intent):
     """Send this frame's mask, as a PNG, to the tab that asked."""
 
     client_id: int

@@ -12,7 +12,12 @@ class Propagating(Intent):
 
 
 @dataclass(frozen=True)
-class HoldKeyframe(Propagating):
+class Marking(Intent):
+    """An intent about how the shown frame takes part in solving many, and how that begins."""
+
+
+@dataclass(frozen=True)
+class HoldKeyframe(Marking):
     """Make the shown frame a keyframe, or none; None changes over."""
 
     on: bool | None = None
@@ -32,7 +37,7 @@ class StopSolving(Propagating):
 
 
 @dataclass(frozen=True)
-class SetDirection(Propagating):
+class SetDirection(Marking):
     """Choose where solving begins: at the first frame, or at the last one."""
 
     direction: Direction

@@ -10,7 +10,7 @@ from carts_viewer.handlers.browsing import SPEEDS
 from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Scores, ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _SOURCES = {
     Source.MEASURED: "joints as measured",
@@ -23,8 +23,8 @@ _SOURCES = {
 class BrowsePanel:
     """Frame slider, transport buttons, domain and camera."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit, waits: Waits) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
         sequence = session.sequence
         self._session = session
         self._waits = waits

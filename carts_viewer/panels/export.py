@@ -11,7 +11,7 @@ from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _PARTS = {"Arm": "arms", "Link": "links"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
@@ -25,8 +25,8 @@ _NOT_KEPT = "This project ends with the viewer, and its exports with it: downloa
 class ExportPanel:
     """The mask of this frame, or frames in any format, with progress, a way to stop it and where it is."""
 
-    def __init__(self, page: Page, session: Session, storage: Storage, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, storage: Storage, emit: Emit) -> None:
+        gui = page.gui
         cameras = len(session.scene.cameras)
         self._camera_names = [camera.name for camera in session.scene.cameras]
         self._kept = storage.scratch is None

@@ -9,7 +9,7 @@ from carts_viewer.finding import ANY, BY_HAND, NOT_CHECKED, FrameFilter, found
 from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _LISTED = 150
 _BULK = {"Accept all": ReviewState.ACCEPTED, "Reject all": ReviewState.REJECTED, "Reset all": ReviewState.UNTOUCHED}
@@ -18,8 +18,8 @@ _BULK = {"Accept all": ReviewState.ACCEPTED, "Reject all": ReviewState.REJECTED,
 class FindPanel:
     """Conditions, the frames that meet them as links, and buttons for all of those."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit, waits: Waits) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
         self._waits = waits
         self._ids = session.sequence.frame_ids
         self._known: tuple[ProjectState | None, FrameFilter] = (None, FrameFilter())

@@ -7,7 +7,7 @@ from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _POSSIBLE, _LIKELY = 0.1, 0.5
 """Probabilities of a failure from which a single camera's fit is doubtful and has failed; as the verdict's own [1]."""
@@ -16,8 +16,8 @@ _POSSIBLE, _LIKELY = 0.1, 0.5
 class FitPanel:
     """The verdict, always in view, and a button that asks the images for one."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
         self._cameras = [camera.name for camera in session.scene.cameras]
         self._text = gui.add_html("")
         self._check = gui.add_button(

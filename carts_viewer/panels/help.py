@@ -9,14 +9,15 @@ from carts_viewer import intents
 from carts_viewer.keys import Shortcut, key_table, shortcuts
 from carts_viewer.layers import Layer
 from carts_viewer.panels.inputs import Emit
-from carts_viewer.transport.page import OWN_KEYS, Page
+from carts_viewer.transport.page import OWN_KEYS
+from carts_viewer.transport.tab_page import TabPage
 
 
 class HelpPanel:
     """Registers the shortcuts and explains everything in a few words."""
 
-    def __init__(self, page: Page, layers: list[Layer], perturb: Callable[[], intents.Intent], emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, layers: list[Layer], perturb: Callable[[], intents.Intent], emit: Emit) -> None:
+        gui = page.gui
         own = {}
         for shortcut in shortcuts(layers):
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
@@ -30,7 +31,7 @@ class HelpPanel:
 
 
 def _listen(
-    page: Page, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], intents.Intent], emit: Emit
+    page: TabPage, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], intents.Intent], emit: Emit
 ) -> None:
     @command.on_trigger
     async def _(event: viser.CommandEvent) -> None:
@@ -38,5 +39,5 @@ def _listen(
             emit(shortcut.action)
         elif shortcut.action == "perturb":
             emit(perturb())
-        elif event.client is not None:
-            page.call(event.client, "toggleView")
+        else:
+            page.call("toggleView")

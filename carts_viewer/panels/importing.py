@@ -7,7 +7,7 @@ from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _BY_NAME = "By name"
 _HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, keypoints of SurgPose, or a folder of PNGs"
@@ -16,8 +16,8 @@ _HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, key
 class ImportPanel:
     """A path, a camera, a button, and what was imported last."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
         cameras = [camera.name for camera in session.scene.cameras]
         with gui.add_folder("Masks of others", expand_by_default=False):
             self._place = gui.add_text("From", "", hint=_HINT)

@@ -8,7 +8,7 @@ from carts_viewer import intents
 from carts_viewer.jobs import Job, JobState
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"
 _FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "All": "all"}
@@ -17,8 +17,8 @@ _FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "All": "
 class JobsPanel:
     """Queues jobs and shows how they go."""
 
-    def __init__(self, page: Page, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, emit: Emit) -> None:
+        gui = page.gui
         self._numbers: dict[str, int] = {}
         self._shown: tuple[Job, ...] | None = None
         with gui.add_folder("New job"):

@@ -12,7 +12,7 @@ from carts_viewer.joint_range import JointRange
 from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _WINDOWS = {"± 5": 5.0, "± 20": 20.0, "Full range": math.inf}
 _STEP = 0.05
@@ -22,7 +22,7 @@ _STEP = 0.05
 class JointsPanel:
     """One tab per arm with its joints, and the buttons that concern all arms."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         """
         Args:
             page: Where to build the widgets, in the current container.
@@ -31,10 +31,10 @@ class JointsPanel:
             emit: Takes the intents.
             waits: Whether a slider is ahead of the state.
         """
-        gui = page.server.gui
+        gui = page.gui
         self._session = session
         self._waits = waits
-        self._server = page.server
+        self._page = page
         self._window = 5.0
         self._sliders: dict[tuple[str, int], tuple[JointRange, viser.GuiSliderHandle[float]]] = {}
         self._centred_on: object = None
@@ -88,7 +88,7 @@ class JointsPanel:
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
         joints = self._session.joints(state.pose.scene)
-        with self._server.atomic():
+        with self._page.atomic():
             if self._centred_on != state.frame.index:
                 self._centred_on = state.frame.index
                 self._centre(state, joints)
@@ -102,8 +102,8 @@ class JointsPanel:
         if state.joint is not None:
             write(self._nudged, next(name for name, joint in self._names.items() if joint == state.joint))
 
-    def _add_arm(self, page: Page, arm: str, state: ViewState, emit: Emit) -> None:
-        gui = page.server.gui
+    def _add_arm(self, page: TabPage, arm: str, state: ViewState, emit: Emit) -> None:
+        gui = page.gui
         joints = self._session.joints(state.pose.scene)[arm]
         for joint, limits in enumerate(limits for limits in self._session.ranges if limits.arm == arm):
             low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)

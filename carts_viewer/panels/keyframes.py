@@ -8,7 +8,7 @@ from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _LONGEST_LIST = 200
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
@@ -17,8 +17,8 @@ _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "ba
 class KeyframesPanel:
     """Marks keyframes and solves between them, with progress and a way to stop."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
         self._ids = session.sequence.frame_ids
         self._seen: tuple[ProjectState | None, int] = (None, -1)
         self._solvable, self._plan = False, ""

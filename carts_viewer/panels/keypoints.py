@@ -7,7 +7,7 @@ from carts_viewer.marks import labelled_keypoints
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _NEAREST = "Nearest to the pointer"
 
@@ -15,8 +15,8 @@ _NEAREST = "Nearest to the pointer"
 class KeypointsPanel:
     """The keypoint to place by a click or a drag, and the residuals of those that were placed."""
 
-    def __init__(self, page: Page, session: Session, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
         self._labels = {point: label for label, point in labelled_keypoints(session.scene).items()}
         with gui.add_folder("Keypoints"):
             gui.add_html(

@@ -10,7 +10,7 @@ from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 SOLVER_LABELS = {
     SolverName.SURFACE: "Surface maps (default)",
@@ -29,8 +29,8 @@ UNDETERMINED = "Not determined by this image"
 class OptimizePanel:
     """The buttons that drive a run, and its state in words."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit) -> None:
+        gui = page.gui
         self._session = session
         self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY, color="teal")
         self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, color="gray", disabled=True)

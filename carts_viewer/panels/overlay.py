@@ -11,7 +11,7 @@ from carts_viewer.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
 from carts_viewer.panels.inputs import Emit, Waits, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _NOTHING = "Nothing"
 _RAMPS = {
@@ -23,8 +23,8 @@ _RAMPS = {
 class OverlayPanel:
     """Layer and opacity, with a legend and the fit to the truth."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
         sequence = session.sequence
         self._waits, self._session = waits, session
         self._arms = [arm.name for arm in sequence.scene.arms]

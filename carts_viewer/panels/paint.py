@@ -9,7 +9,7 @@ from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, 
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.strokes import DIAMETERS, Target, Tool
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _ICONS = {
     Tool.OFF: viser.Icon.POINTER,
@@ -28,10 +28,10 @@ _MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
 
 
 class PaintPanel:
-    """Tools and layers; it also sends the chosen tool to every tab."""
+    """Tools and layers; it also sends the chosen tool to the tab."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
         self._page, self._scene, self._waits = page, session.scene, waits
         self._sent: dict[str, object] = self._message(state)
         with gui.add_folder("Paint", expand_by_default=False):
@@ -49,8 +49,7 @@ class PaintPanel:
             on_click(button, lambda _, target=target: intents.SetTarget(target), emit)
         on_input(self._size, intents.SetDiameter, emit)
         on_click(self._clear, lambda _: intents.ClearLayer(), emit)
-
-        page.on_connect(lambda client: page.call(client, "setBrush", self._sent))
+        page.call("setBrush", self._sent)
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets, and the pages' scripts, up to date."""
@@ -72,8 +71,7 @@ class PaintPanel:
         message = self._message(state)
         if message != self._sent:
             self._sent = message
-            for client in self._page.server.get_clients().values():
-                self._page.call(client, "setBrush", message)
+            self._page.call("setBrush", message)
 
     def _message(self, state: ViewState) -> dict[str, object]:
         """What a page must know to draw strokes by itself."""

@@ -6,7 +6,7 @@ from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _LISTED = 60
 """Steps in the list, around the present one."""
@@ -15,8 +15,8 @@ _LISTED = 60
 class SavedPanel:
     """Whether everything is saved, a banner where it is not or in another file, and undo and redo, always at hand."""
 
-    def __init__(self, page: Page, storage: Storage, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, storage: Storage, emit: Emit) -> None:
+        gui = page.gui
         self._storage = storage
         self._notice = gui.add_html("", visible=False)
         self._noticed: str | None = None
@@ -45,14 +45,14 @@ class SavedPanel:
         self._text.content = (
             f'<p class="carts-caption carts-saved" title="{escaped(str(path))}"><span>{text}</span></p>'
         )
-        self._undo.disabled, self._redo.disabled = state.project.undoable is None, state.project.redoable is None
+        self._undo.disabled, self._redo.disabled = not state.can_undo, not state.can_redo
 
 
 class HistoryPanel:
     """The list of steps."""
 
-    def __init__(self, page: Page, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, emit: Emit) -> None:
+        gui = page.gui
         self._positions: dict[str, int] = {}
         with gui.add_folder("History"):
             self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")

@@ -8,7 +8,7 @@ from carts_core.project import Kind, ProjectState, ReviewState, by_hand
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 STATE_COLORS = {
     ReviewState.UNTOUCHED: "#6b7280",
@@ -26,8 +26,8 @@ BY_HAND = "moved by hand"
 class ReviewPanel:
     """Review state and note of the shown frame, where to go next, and how many frames are in which state."""
 
-    def __init__(self, page: Page, emit: Emit, waits: Waits) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
         self._waits = waits
         self._counted: ProjectState | None = None
         with gui.add_folder("Review"):

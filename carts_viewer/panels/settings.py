@@ -15,7 +15,7 @@ from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_in
 from carts_viewer.presets import PRESETS
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import TabPage
 
 _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsics": "Camera intrinsics"}
 
@@ -26,8 +26,8 @@ class SettingsPanel:
     Stages are not edited here: a settings file holds them (`carts evaluate --settings`).
     """
 
-    def __init__(self, page: Page, state: ViewState, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, state: ViewState, emit: Emit) -> None:
+        gui = page.gui
         self._gui = gui
         self._widgets: dict[type, dict[str, Any]] = {}
         self._error: viser.GuiHtmlHandle | None = None
@@ -92,8 +92,8 @@ class SettingsPanel:
 class FreePanel:
     """Which joints and which calibration the optimizer may move."""
 
-    def __init__(self, page: Page, session: Session, state: ViewState, emit: Emit) -> None:
-        gui = page.server.gui
+    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit) -> None:
+        gui = page.gui
         self._joints: dict[tuple[str, str], Any] = {}
         self._groups: dict[str, Any] = {}
         with gui.add_folder("Free parameters", expand_by_default=False):

@@ -28,7 +28,7 @@ class FramePicture:
         self._shown: tuple[int, str] | None = None
         frame = sequence.frame(0)
         state = sequence.scene.state(frame.measured, mounts=frame.mounts)
-        self._view = SceneView(page.server, sequence.scene, state, sequence.scene.cameras[0].name)
+        self._view = SceneView(page.server.scene, sequence.scene, state, sequence.scene.cameras[0].name)
 
     def show(
         self,

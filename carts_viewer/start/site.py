@@ -164,7 +164,7 @@ class Site:
             gui = self.page.server.gui
             gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
             self.document.on_chosen(lambda name, value: self.post(lambda: self._chosen(name, value)))
-            self.page.on_clicked(lambda u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v))))
+            self.page.on_clicked(lambda _, u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v))))
             self._listening = True
         self.place = make()
         self.place.show()

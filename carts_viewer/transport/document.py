@@ -13,6 +13,7 @@ import viser
 
 from carts_core.console import visible
 from carts_viewer.transport.page import Page
+from carts_viewer.transport.tab_page import call
 
 _LONGEST = 4096
 """Longest value that is taken [characters]."""
@@ -56,7 +57,7 @@ class Document:
             self._send(client)
 
     def _send(self, client: viser.ClientHandle) -> None:
-        self._page.call(client, "showDocument", *self._shown)
+        call(client, "showDocument", *self._shown)
 
 
 def _choice(text: str) -> tuple[str, str] | None:

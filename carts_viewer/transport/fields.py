@@ -8,7 +8,7 @@ import viser
 
 
 def on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:
-    """Call back with the finite numbers that a tab has written into a field behind its own name and a counter."""
+    """Call back with a tab's number and the finite numbers that it has written behind its own name and a counter."""
 
     @field.on_update
     async def _(event: viser.GuiEvent) -> None:
@@ -17,7 +17,7 @@ def on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., N
         except ValueError:
             return
         if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
-            callback(*numbers)
+            callback(event.client_id, *numbers)
 
 
 def said(value: Any) -> str:

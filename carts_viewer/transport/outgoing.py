@@ -7,6 +7,7 @@ middle ("deque mutated during iteration"), and what it was to show stays hidden.
 
 import asyncio
 import dataclasses
+import warnings
 
 from viser.infra import _infra
 from viser.infra._async_message_buffer import AsyncMessageBuffer
@@ -39,4 +40,6 @@ class MessageBuffer(AsyncMessageBuffer):
 
 def queue_safely() -> None:
     """Have every server that starts from now on, and every tab that joins it, use such queues."""
+    # A tab that has just gone is normal, and what was on its way to it is no loss.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     _infra.AsyncMessageBuffer = MessageBuffer  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]

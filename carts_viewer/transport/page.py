@@ -13,7 +13,8 @@ import http
 import io
 import json
 import mimetypes
-from collections.abc import Callable, Sequence
+import secrets
+from collections.abc import Callable
 from typing import Any
 
 import viser
@@ -27,7 +28,8 @@ from carts_viewer.transport.guard import Guard, check_address
 from carts_viewer.transport.index import TITLE, index_of_viser
 from carts_viewer.transport.media import MEDIA, Media
 from carts_viewer.transport.outgoing import queue_safely
-from carts_viewer.transport.viser_private import command_id, element_id, on_sent, run_script, value_of, widgets
+from carts_viewer.transport.tab_page import call
+from carts_viewer.transport.viser_private import element_id, on_sent, run_script, value_of
 
 OWN_KEYS = ("[", "]", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -72,6 +74,8 @@ class Page:
         self._title = title
         self.key_groups: list[Any] = []
         """What the sheet of keys lists: names of groups, each with pairs of key and meaning."""
+        self.project = ""
+        """Name of the recording that is shown; empty while none is."""
         self.media = Media()
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
@@ -80,16 +84,19 @@ class Page:
         self.url = self._guard.url(self.server.get_port())
         self._fields: dict[str, viser.GuiTextHandle] = {}
         self._add_fields()
-        self._greetings: list[Callable[[viser.ClientHandle], None]] = []
-        self.server.on_client_connect(self._greet)
+        self._orient()
+        self._name = secrets.token_hex(8)
+        self.server.on_client_connect(lambda client: call(client, "meet", self._name))
+        self._farewells: list[Callable[[int], None]] = []
+        self.server.on_client_disconnect(self._part)
 
-    def on_connect(self, callback: Callable[[viser.ClientHandle], None]) -> None:
-        """Call `callback(client)` for every tab that joins from now on, until the page is cleared."""
-        self._greetings.append(callback)
+    def on_disconnect(self, callback: Callable[[int], None]) -> None:
+        """Call `callback(client_id)` whenever a tab is gone, until the page is cleared."""
+        self._farewells.append(callback)
 
-    def _greet(self, client: viser.ClientHandle) -> None:
-        for callback in list(self._greetings):
-            callback(client)
+    def _part(self, client: viser.ClientHandle) -> None:
+        for callback in list(self._farewells):
+            callback(client.client_id)
 
     def _add_fields(self) -> None:
         """Invisible fields into which a tab writes what happened there; each does not know of the others."""
@@ -102,11 +109,19 @@ class Page:
             title: The browser tab's new title.
         """
         self._title = title
-        self._greetings.clear()
+        self._farewells.clear()
         self.key_groups = []
+        self.project = ""
         self.server.gui.reset()
         self.server.scene.reset()
         self._add_fields()
+        self._orient()
+
+    def _orient(self) -> None:
+        """OpenCV's axes, and everybody's first view along the lens."""
+        self.server.scene.set_up_direction("-y")
+        initial = self.server.initial_camera
+        initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
 
     def reload(self) -> None:
         """Have every tab load the page anew."""
@@ -126,109 +141,54 @@ class Page:
             if event.client_id is not None:
                 callback(event.client_id)
 
-    def on_released(self, callback: Callable[[], None]) -> None:
-        """Call `callback` on the event loop whenever somebody lets go of a slider or leaves a field."""
+    def on_released(self, callback: Callable[[int], None]) -> None:
+        """Call `callback(client_id)` on the event loop when somebody lets go of a slider or leaves a field."""
 
         @self._fields["released"].on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
-                callback()
+                callback(event.client_id)
 
-    def on_pointed(self, callback: Callable[[float, float, float], None]) -> None:
-        """Call `callback(u, v, camera)` on the event loop whenever somebody points at a place of a camera's image.
+    def on_pointed(self, callback: Callable[[int, float, float, float], None]) -> None:
+        """Call `callback(client_id, u, v, camera)` on the event loop when somebody points at a place of an image.
 
         u and v are shares of its width and height, from its upper left corner, and the camera is an index; any numbers,
         if the tab is none of ours.
         """
         on_numbers(self._fields["pointed"], 3, callback)
 
-    def on_activated(self, callback: Callable[[float], None]) -> None:
-        """Call `callback(camera)` on the event loop when somebody chooses a camera's image; any number, as above."""
+    def on_activated(self, callback: Callable[[int, float], None]) -> None:
+        """Call `callback(client_id, camera)` on the event loop when somebody chooses a camera's image; any number."""
         on_numbers(self._fields["activated"], 1, callback)
 
     def on_painted(self, callback: Callable[[int, str], None]) -> None:
         """Call `callback(client_id, text)` on the event loop whenever a tab says that it has painted; any text."""
         on_text(self._fields["painted"], callback)
 
-    def on_pressed(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
-        on_text(self._fields["pressed"], lambda _, key: callback(key))
+    def on_pressed(self, callback: Callable[[int, str], None]) -> None:
+        """Call `callback(client_id, key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
+        on_text(self._fields["pressed"], callback)
 
     def on_asked(self, callback: Callable[[int, str], None]) -> None:
         """Call `callback(client_id, text)` on the event loop when a tab asks for something in words; any text."""
         on_text(self._fields["asked"], callback)
 
-    def on_picked(self, callback: Callable[[float], None]) -> None:
-        """Call `callback(index)` on the event loop whenever somebody picks a frame; any number, as above."""
+    def on_picked(self, callback: Callable[[int, float], None]) -> None:
+        """Call `callback(client_id, index)` on the event loop when somebody picks a frame; any number, as above."""
         on_numbers(self._fields["picked"], 1, callback)
 
     def on_chosen(self, callback: Callable[[str], None]) -> None:
         """Call `callback(text)` on the event loop for everything that somebody chooses in a document; any text."""
         on_sent(self._fields["chosen"], lambda value: callback(said(value)))
 
-    def on_clicked(self, callback: Callable[[float, float], None]) -> None:
-        """Call `callback(u, v)` on the event loop when somebody clicks in the image; shares as in `on_pointed`."""
+    def on_clicked(self, callback: Callable[[int, float, float], None]) -> None:
+        """Call `callback(client_id, u, v)` on the event loop when somebody clicks in the image, as in `on_pointed`."""
         on_numbers(self._fields["clicked"], 2, callback)
-
-    def call(self, client: viser.ClientHandle, name: str, *arguments: Any) -> None:
-        """Call `window.carts[name](*arguments)` in one client's page; unknown names are ignored there."""
-        values = ", ".join(json.dumps(argument) for argument in arguments)
-        source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({values});"
-        run_script(client, source)
-
-    def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
-        """Lay out consecutive buttons of the current container side by side.
-
-        Args:
-            handles: The buttons, in order.
-            weights: Relative widths; equal when left out.
-        """
-        shares = [1.0] * len(handles) if weights is None else list(weights)
-        self._side_by_side([element_id(handle) for handle in handles], shares, "div:has(> [id='{}'])")
-
-    def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:
-        """Lay out consecutive checkboxes or number fields of the current container in columns, in reading order.
-
-        Args:
-            handles: The widgets, in order.
-            count: How many to a line.
-            narrow_labels: Give labels no more room than they need, and the fields the rest.
-        """
-        for first in range(0, len(handles), count):
-            group = [element_id(handle) for handle in handles[first : first + count]]
-            # A short last line keeps the width of the others.
-            box = "div:has(> .mantine-Flex-root > div [id='{}'])"
-            self._side_by_side(group, [1.0] * len(group), box, total=float(count))
-            if narrow_labels:
-                labels = ", ".join(f"{box.format(name)} > .mantine-Flex-root > div:first-child" for name in group)
-                self.server.gui.add_html(f"<style>{labels} {{ width: auto !important; white-space: nowrap }}</style>")
-
-    def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
-        """Turn the boxes around these elements into parts of a line, by a style sheet that names their ids."""
-        total = sum(shares) if total is None else total
-        boxes = [box.format(name) for name in ids]
-        rules = [
-            f"{', '.join(boxes)} {{ display: inline-block; box-sizing: border-box; vertical-align: top; "
-            "margin-inline: 0 !important; padding-inline: 4px !important }"
-        ]
-        for one, share in zip(boxes, shares, strict=True):
-            # The line is as wide as single elements, which keep 10 px from either side of the panel.
-            rules.append(f"{one} {{ width: calc((100% - 12px) * {share / total:.4f}) }}")
-        rules.append(f"{boxes[0]} {{ margin-left: 6px !important }}")
-        self.server.gui.add_html(f"<style>{' '.join(rules)}</style>")
 
     @property
     def drawn_id(self) -> str:
         """The `id` of the field in which a tab says that it has drawn an overlay."""
         return element_id(self._fields["drawn"])
-
-    def find(self, label: str) -> Any:
-        """The widget with this label (for tests and scripts)."""
-        return next(handle for handle in widgets(self.server) if getattr(handle, "label", None) == label)
-
-    def command_id(self, label: str) -> str:
-        """The id by which a tab triggers the command with this label (for tests and scripts)."""
-        return command_id(self.server, label)
 
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
@@ -270,7 +230,8 @@ class Page:
 
     def _index(self) -> bytes:
         ids = {name: element_id(field) for name, field in self._fields.items()}
-        configuration = json.dumps({**ids, "keys": OWN_KEYS, "keyGroups": self.key_groups})
+        said = {"keys": OWN_KEYS, "keyGroups": self.key_groups, "project": self.project, "server": self._name}
+        configuration = json.dumps({**ids, **said})
         return (
             index_of_viser()
             .replace(

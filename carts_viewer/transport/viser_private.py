@@ -16,24 +16,27 @@ def element_id(handle: Any) -> str:
     return handle._impl.uuid
 
 
-def widgets(server: viser.ViserServer) -> Iterable[Any]:
-    """All widgets that hold a value."""
-    return server.gui._gui_input_handle_from_uuid.values()
+def widgets(gui: viser.GuiApi) -> Iterable[Any]:
+    """All widgets of all tabs, or of one, that hold a value."""
+    return gui._gui_input_handle_from_uuid.values()
 
 
 def value_of(server: viser.ViserServer, element: str) -> Any:
-    """The present value of the widget with this id; None when there is no such widget."""
-    handle = server.gui._gui_input_handle_from_uuid.get(element)
-    return None if handle is None else handle._impl.value
+    """The present value of the widget with this id, of all tabs or of one; None when there is no such widget."""
+    for owner in (server, *server.get_clients().values()):
+        handle = owner.gui._gui_input_handle_from_uuid.get(element)
+        if handle is not None:
+            return handle._impl.value
+    return None
 
 
-def command_id(server: viser.ViserServer, label: str) -> str:
+def command_id(gui: viser.GuiApi, label: str) -> str:
     """The id by which a tab triggers the command with this label.
 
     Raises:
         StopIteration: there is no such command.
     """
-    commands = server.gui._command_handle_from_uuid
+    commands = gui._command_handle_from_uuid
     return next(element for element, command in commands.items() if command.label == label)
 
 

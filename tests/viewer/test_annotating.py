@@ -41,7 +41,7 @@ def test_looking_at_a_frame_keeps_its_figures_and_is_no_step(desk: Desk) -> None
 
 def test_a_kept_run_is_one_step_with_loss_settings_and_review(desk: Desk) -> None:
     desk.do(intents.Perturb(2.0, 0), intents.Run())
-    desk.controller.advance()
+    desk.advance()
     assert desk.state.unsaved and len(desk.saved.steps) == 1
     desk.finish()
     step, correction = desk.saved.steps[-1], desk.saved.joints(0)["PSM1"]
@@ -55,8 +55,8 @@ def test_a_kept_run_is_one_step_with_loss_settings_and_review(desk: Desk) -> Non
 
 def test_resetting_a_run_that_goes_on_leaves_no_trace_and_a_finished_one_a_step(desk: Desk) -> None:
     desk.do(intents.Run())
-    desk.controller.advance()
-    desk.controller.advance()
+    desk.advance()
+    desk.advance()
     desk.do(intents.Reset())
     assert not desk.saved.steps and desk.state.pose.source is Source.MEASURED
     desk.do(intents.Run())

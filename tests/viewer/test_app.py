@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from places import place_of, widget
 from viewer_canvas import decoded
 from waiting import get, wait_for
 from websockets.exceptions import InvalidStatus
@@ -41,13 +42,13 @@ def _picture(png: bytes) -> np.ndarray:
 def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer(masks=False)
     app.queue.put(intents.ShowLayer(Layer.MASK))
-    slider = app.joints.slider("PSM1", 0)
     with RawTab(app.url) as tab:
+        slider = app.view.layout.joints.slider("PSM1", 0)
         for value in np.linspace(-5.0, 5.0, 100):
             tab.set(app.page.element_id(slider), float(value))
         wait_for(lambda: app.state.pose.scene.joint_positions[0][0] == pytest.approx(math.radians(5.0)))
         state = app.wait_until_shown()
-        wait_for(lambda: tab.overlays[-1][1] == app.scene_view.sent(OVERLAY))
+        wait_for(lambda: tab.overlays[-1][1] == app.view.scene.sent(OVERLAY))
         fresh = OverlayRenderer(app.sequence).arm_ids(state.pose.scene, "left")
         assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
         assert 1 <= len(tab.overlays) < 100
@@ -57,16 +58,16 @@ def test_a_value_is_not_lost_to_a_panel_that_is_brought_up_to_date_at_that_momen
     open_viewer: Callable[..., ViewerApp],
 ) -> None:
     app = open_viewer()
-    slider = app.joints.slider("PSM1", 0)
-    before = slider.value
-    go_on: Any = slider._impl.sync_cb
-
-    def write_meanwhile(*arguments: Any) -> None:
-        slider.value = before
-        go_on(*arguments)
-
-    slider._impl.sync_cb = write_meanwhile
     with RawTab(app.url) as tab:
+        slider = app.view.layout.joints.slider("PSM1", 0)
+        before = slider.value
+        go_on: Any = slider._impl.sync_cb
+
+        def write_meanwhile(*arguments: Any) -> None:
+            slider.value = before
+            go_on(*arguments)
+
+        slider._impl.sync_cb = write_meanwhile
         tab.set(app.page.element_id(slider), before + 2.0)
         wait_for(lambda: abs(math.degrees(app.state.pose.scene.joint_positions[0][0]) - before - 2.0) < 0.01)
         wait_for(lambda: abs(slider.value - before - 2.0) < 0.01)
@@ -77,8 +78,8 @@ def test_a_raw_client_cannot_move_a_joint_out_of_its_limits(
     open_viewer: Callable[..., ViewerApp], value: float
 ) -> None:
     app = open_viewer()
-    slider = app.joints.slider("PSM1", 0)
     with RawTab(app.url) as tab:
+        slider = app.view.layout.joints.slider("PSM1", 0)
         tab.set(app.page.element_id(slider), value)
         wait_for(lambda: math.isfinite(slider.value) and abs(slider.value) < 1e6)
         state = app.wait_until_shown()
@@ -87,23 +88,34 @@ def test_a_raw_client_cannot_move_a_joint_out_of_its_limits(
     assert state.error is None
 
 
-def test_a_choice_that_does_not_exist_is_put_right_in_every_tab(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_a_choice_that_does_not_exist_is_put_right(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer(cameras=("left", "right"))
-    dropdown = app.page.find("Camera")
-    with RawTab(app.url) as rogue, RawTab(app.url) as other:
+    with RawTab(app.url) as rogue:
+        dropdown = app.view.page.find("Camera")
         rogue.set(app.page.element_id(dropdown), "no such camera")
         wait_for(lambda: dropdown.value == "left")
-        wait_for(lambda: other.values.get(app.page.element_id(dropdown)) == "left")
+        wait_for(lambda: rogue.values.get(app.page.element_id(dropdown)) == "left")
     assert app.state.camera == "left" and app.state.error is None
 
 
-def test_two_tabs_see_one_state(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_every_tab_has_its_own_frame(open_viewer: Callable[..., ViewerApp]) -> None:
     app = open_viewer()
-    slider = app.page.element_id(app.page.find("Frame"))
     with RawTab(app.url) as first, RawTab(app.url) as second:
-        first.set(slider, 3)
-        wait_for(lambda: second.values.get(slider) == 3)
-        assert app.wait_until_shown().index == 2
+        first.set(app.page.element_id(widget(app, first, "Frame")), 3)
+        wait_for(lambda: place_of(app, first).controller.state.index == 2)
+        second.set(app.page.element_id(widget(app, second, "Frame")), 2)
+        wait_for(lambda: place_of(app, second).controller.state.index == 1)
+        app.wait_until_shown()
+        assert [place_of(app, tab).controller.state.index for tab in (first, second)] == [2, 1]
+
+
+def test_a_tab_that_reloads_is_where_it_was(open_viewer: Callable[..., ViewerApp]) -> None:
+    app = open_viewer()
+    with RawTab(app.url, key="mine") as tab, RawTab(app.url):
+        tab.set(app.page.element_id(widget(app, tab, "Frame")), 3)
+        wait_for(lambda: app.state.index == 2)
+    with RawTab(app.url), RawTab(app.url, key="mine") as again:
+        assert place_of(app, again).controller.state.index == 2 == widget(app, again, "Frame").value - 1
 
 
 def test_a_missing_image_is_an_error_in_the_page_and_the_server_stays_up(open_viewer: Callable[..., ViewerApp]) -> None:
@@ -134,14 +146,16 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
         return read(index, *arguments)
 
     monkeypatch.setattr(app.sequence, "frame", slow)
-    before = app.state
-    sent = app.scene_view.sent(FRAME)
-    app.queue.put(intents.ShowFrame(5))
-    assert asked.wait(30)
-    assert app.state.frame is before.frame and app.scene_view.sent(FRAME) == sent
-    decoded.set()
-    state = app.wait_until_shown()
-    assert state.index == state.frame.index == 5 and app.scene_view.sent(FRAME) != sent
+    with RawTab(app.url):
+        app.wait_until_shown()
+        before = app.state
+        sent = app.view.scene.sent(FRAME)
+        app.queue.put(intents.ShowFrame(5))
+        assert asked.wait(30)
+        assert app.state.frame is before.frame and app.view.scene.sent(FRAME) == sent
+        decoded.set()
+        state = app.wait_until_shown()
+        assert state.index == state.frame.index == 5 and app.view.scene.sent(FRAME) != sent
 
 
 def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
@@ -157,14 +171,18 @@ def test_the_offset_between_the_clocks_is_shown_and_hidden_where_there_are_none(
     app = open_viewer(edit=describe, prepare=add_times)
     app.queue.put(intents.ShowFrame(1))
     app.wait_until_shown()
-    captions = [panel._caption.content for panel in app.display._panels if isinstance(panel, BrowsePanel)]
-    assert ["at 0.150 s" in caption for caption in captions] == [True]
-    offset = app.page.find("Time offset [s]")
-    assert offset.visible and offset.value == -0.035
-    app.queue.put(intents.SetTimeOffset(-0.02))
-    app.wait_until_shown()
-    assert offset.value == -0.02
-    assert not open_viewer().page.find("Time offset [s]").visible
+    with RawTab(app.url):
+        app.wait_until_shown()
+        captions = [panel._caption.content for panel in app.view.display._panels if isinstance(panel, BrowsePanel)]
+        assert ["at 0.150 s" in caption for caption in captions] == [True]
+        offset = app.view.page.find("Time offset [s]")
+        assert offset.visible and offset.value == -0.035
+        app.queue.put(intents.SetTimeOffset(-0.02))
+        app.wait_until_shown()
+        assert offset.value == -0.02
+    other = open_viewer()
+    with RawTab(other.url):
+        assert not other.view.page.find("Time offset [s]").visible
 
 
 def test_closing_ends_the_reading_of_frames_in_advance(open_viewer: Callable[..., ViewerApp]) -> None:
@@ -360,9 +378,11 @@ def test_a_copy_that_was_rescued_is_said_when_its_project_is_opened(open_viewer:
     app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     app.queue.put(intents.Released())
     assert not app.wait_until_shown().unsaved
-    (saved,) = (panel for panel in app.display._panels if isinstance(panel, SavedPanel))
-    assert saved._notice.visible and newest.name in saved._notice.content
-    assert "<b>Saved</b> in sequence.carts" in saved._text.content
+    with RawTab(app.url):
+        app.wait_until_shown()
+        (saved,) = (panel for panel in app.view.display._panels if isinstance(panel, SavedPanel))
+        assert saved._notice.visible and newest.name in saved._notice.content
+        assert "<b>Saved</b> in sequence.carts" in saved._text.content
 
 
 def test_a_project_of_another_sequence_is_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:

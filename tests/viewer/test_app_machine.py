@@ -197,7 +197,7 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
         @rule()
         def reopen(self) -> None:
             self.model.release()
-            self.desk.controller.close()
+            self.desk.close()
             self.desk = self.desk.reopened()
             self.model.index = 0
 

@@ -7,6 +7,7 @@ import pytest
 
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
+from carts_viewer.scene_view import FRAME, OVERLAY, SceneView
 from tools.bench_viewer import frame_latency, memory_while_optimizing, slider_latency
 from tools.soak import Soaking
 
@@ -35,9 +36,10 @@ def test_a_short_soak_sees_what_it_is_there_for(
     assert seen.rounds == seen.reloads == 1 and seen.frames == 40 and seen.iterations > 0
     assert not seen.stale and not seen.exceptions and seen.growth == seen.spread == 0.0
     # A server that no longer sends overlays, and one whose worker fails, are noticed.
-    monkeypatch.setattr(app.scene_view, "show_overlay", lambda *_: None)
+    overlay, frame = SceneView.show_overlay, SceneView.show_frame
+    monkeypatch.setattr(SceneView, "show_overlay", lambda own, *a: None if OVERLAY in own._planes else overlay(own, *a))
     assert Soaking(app, run=0.5).soak(0.01).stale
-    monkeypatch.setattr(app.scene_view, "show_frame", lambda *_: 1 / 0)
+    monkeypatch.setattr(SceneView, "show_frame", lambda own, *a: 1 / 0 if FRAME in own._planes else frame(own, *a))
     assert any("unexpected error" in line for line in Soaking(app, run=0.5).soak(0.01).exceptions)
 
 

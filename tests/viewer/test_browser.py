@@ -88,7 +88,7 @@ def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
     tab = open_tab(app)
     tab.canvas.eventually_registered()
     before = tab.canvas.screenshot()
-    slider = app.joints.slider("PSM1", 0)
+    slider = app.view.layout.joints.slider("PSM1", 0)
     value = round(slider.value + 4.0, 2)
     tab.type_value(slider, value)
     eventually(
@@ -104,7 +104,7 @@ def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value(
     app = open_marked()
     tab = open_tab(app)
     tab.canvas.eventually_registered()
-    slider = app.joints.slider("PSM1", 0)
+    slider = app.view.layout.joints.slider("PSM1", 0)
     thumb = tab.page.locator(f"[id='{app.page.element_id(slider)}'] [role=slider]").bounding_box()
     assert thumb is not None
     x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
@@ -139,7 +139,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     tab = open_tab(app)
     tab.button("Perturb all joints")
     eventually(lambda: app.state.undoable, lambda count: count == 1)
-    start = app.scene_view.sent("/overlay")
+    start = app.view.scene.sent("/overlay")
     tab.button("Run")
     eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
     curves = app.state.run.curves
@@ -148,7 +148,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
     expect(tab.page.get_by_text(f"kept {loss[curves.best]:.3g} of iteration {curves.best}").first).to_be_visible()
     app.wait_until_shown()
-    assert app.scene_view.sent("/overlay") != start
+    assert app.view.scene.sent("/overlay") != start
     charts = tab.page.evaluate(
         "Object.values(window.__viserTestpoints.uplots).map(entry => Array.from(entry.chart.data[1]))"
     )
@@ -224,7 +224,10 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     expect(tab.page.locator("rect.carts-solving")).to_be_visible()
     # Another tab goes on browsing meanwhile.
     other.page.keyboard.press("n")
-    eventually(lambda: app.state.index, lambda index: index == 2)
+    eventually(lambda: other.state.index, lambda index: index == 1)
+    place = other.place_in_viewer
+    other.page.close()
+    eventually(lambda: place.person.present, lambda present: not present)
     expect(tab.page.get_by_text("15 frames solved")).to_be_visible(timeout=60_000)
     expect(stop).to_be_hidden()
     assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 15
@@ -248,7 +251,7 @@ def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
     app = open_viewer(frames=12)
     tab = open_tab(app)
     (app.sequence.path.parent / "regular" / "left" / "012.png").unlink()  # Too far away to be read in advance.
-    tab.type_value(app.page.find("Frame"), 12)
+    tab.type_value(app.view.page.find("Frame"), 12)
     message = tab.page.locator(".carts-error[role=alert]")
     expect(message).to_contain_text("012.png", timeout=20_000)
     note = tab.page.get_by_text("That did not work")
@@ -256,17 +259,20 @@ def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
     tab.button("Dismiss")
     expect(message).to_be_hidden()
     expect(note).to_be_hidden()
-    tab.type_value(app.page.find("Frame"), 2)
+    tab.type_value(app.view.page.find("Frame"), 2)
     eventually(lambda: app.state.index, lambda index: index == 1)
 
 
-def test_two_tabs_show_the_same(open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
+def test_two_tabs_on_one_frame_show_the_same(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
     app = open_marked()
     first, second = open_tab(app), open_tab(app, (1000, 900))
-    slider = app.joints.slider("PSM1", 1)
+    second.place_in_viewer.put(intents.SetOpacity(1.0))
+    slider = first.slider("PSM1", 1)
     value = round(slider.value - 3.0, 2)
     first.type_value(slider, value)
-    field = second.page.locator(f"[id='{app.page.element_id(slider)}'] + * input")
+    field = second.page.locator(f"[id='{app.page.element_id(second.slider('PSM1', 1))}'] + * input")
     expect(field).to_have_value(f"{value:g}", timeout=20_000)
     assert first.canvas.eventually_registered() <= 1.5
     assert second.canvas.eventually_registered() <= 1.5
@@ -334,7 +340,7 @@ def test_reviewing_is_saved_as_the_page_says_and_is_there_in_another_server(
     app = open_viewer()
     tab = open_tab(app)
     tab.page.get_by_text("Review", exact=True).first.click()
-    note = tab.page.locator(".mantine-TextInput-input:visible")
+    note = tab.page.locator(".mantine-TextInput-input:visible").first
     note.click()
     note.press_sequentially("smoke on the left", delay=20)
     expect(tab.page.get_by_text("Not saved yet")).to_be_visible()

@@ -88,7 +88,7 @@ def test_undo_returns_to_the_frame_of_the_change(desk: Desk) -> None:
 def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     desk.do(intents.Perturb(2.0, 0), intents.Run())
     assert desk.state.run.phase is Phase.RUNNING
-    desk.controller.advance()
+    desk.advance()
     first = desk.state
     assert len(first.run.curves.loss) == 1 and first.maps is not None
     state = desk.finish()
@@ -107,7 +107,7 @@ def test_a_suspicion_against_base_frames_lasts_until_something_changes(
 ) -> None:
     monkeypatch.setattr(FrameOptimizer, "base_frame_gain", lambda self: 0.4)
     desk.do(intents.Run())
-    desk.controller.advance()
+    desk.advance()
     assert desk.state.run.base_frame_gain is None
     assert desk.finish().run.base_frame_gain == 0.4
     assert desk.do(intent).run.base_frame_gain is None
@@ -115,9 +115,9 @@ def test_a_suspicion_against_base_frames_lasts_until_something_changes(
 
 def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:
     desk.do(intents.Run())
-    desk.controller.advance()
+    desk.advance()
     desk.do(intents.Pause())
-    assert desk.state.run.phase is Phase.PAUSED and desk.controller.wait_time() is None
+    assert desk.state.run.phase is Phase.PAUSED and desk.wait_time() is None
     desk.do(intents.Run())
     assert len(desk.finish().run.curves.loss) == 5
 
@@ -134,8 +134,8 @@ def test_reset_returns_to_the_start_of_the_run(desk: Desk, finished: bool) -> No
     desk.do(intents.Perturb(2.0, 0))
     start = desk.joint()
     desk.do(intents.Run())
-    desk.controller.advance()
-    desk.controller.advance()
+    desk.advance()
+    desk.advance()
     if finished:
         desk.finish()
     state = desk.do(intents.Reset())
@@ -155,10 +155,10 @@ def test_a_whole_run_is_one_step_of_undo(desk: Desk) -> None:
 @pytest.mark.parametrize("intent", ENDING_A_RUN)
 def test_a_run_stops_when_what_it_works_on_changes(desk: Desk, intent: intents.Intent) -> None:
     desk.do(intents.Run())
-    desk.controller.advance()
+    desk.advance()
     state = desk.do(intent)
     assert state.run.phase is Phase.IDLE
-    assert desk.controller.wait_time() is None
+    assert desk.wait_time() is None
 
 
 def test_a_setting_out_of_range_is_kept_out_and_run_says_why(desk: Desk) -> None:
@@ -191,7 +191,7 @@ def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk)
 
 def test_a_run_with_all_cameras_has_a_map_for_each(desk: Desk) -> None:
     desk.do(intents.SetCameras(True), intents.Run())
-    desk.controller.advance()
+    desk.advance()
     maps = desk.state.maps
     assert maps is not None and maps.cameras == ("left", "right") and len(maps.iterate.attention) == 2
 
@@ -217,17 +217,17 @@ def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
 
 def test_playing_goes_round(desk: Desk) -> None:
     desk.do(intents.ShowFrame(2), intents.SetSpeed(60.0), intents.Play(True))
-    desk.controller.advance()
+    desk.advance()
     assert desk.state.index == 0 and desk.state.playing
     assert not desk.do(intents.Play()).playing
 
 
 def test_an_error_of_what_is_going_on_stops_it_and_is_part_of_the_state(desk: Desk) -> None:
     desk.do(intents.Export("masks", "All"), intents.Run(), intents.Play(True))
-    desk.controller.fail(CartsError("the disk is on fire"), stop=True)
+    desk.fail(CartsError("the disk is on fire"))
     state = desk.state
     assert state.error == "the disk is on fire" and not state.playing and state.export is None
-    assert state.run.phase is Phase.IDLE and desk.controller.wait_time() is None
+    assert state.run.phase is Phase.IDLE and desk.wait_time() is None
     assert desk.do(intents.DismissError()).error is None
 
 

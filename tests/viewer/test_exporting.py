@@ -125,12 +125,12 @@ def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None
 def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
     monkeypatch.setattr(exporting, "_BIT", 0.0)  # So that it cannot be done already.
     desk.do(intents.Export("coco", "All"))
-    desk.controller.advance()
+    desk.advance()
     while desk.state.export is not None and desk.state.export.done < written:
-        desk.controller.advance()
+        desk.advance()
     desk.do(intents.CancelExport())
     folder = desk.session.editor.project.path.with_name("sequence_exports")
-    assert desk.state.export is None and desk.controller.wait_time() is None
+    assert desk.state.export is None and desk.wait_time() is None
     assert list(folder.glob("*")) == [] and not desk.saved.exports
     exported(desk, intents.Export("coco", "All"))
 
@@ -166,7 +166,7 @@ def test_a_package_that_is_missing_is_named(desk: Desk, monkeypatch: pytest.Monk
     desk.do(intents.Export("coco", "All"))
     with pytest.raises(CartsError, match="COCO needs the package pycocotools"):
         desk.finish()
-    assert desk.state.export is None and desk.controller.wait_time() is None
+    assert desk.state.export is None and desk.wait_time() is None
 
 
 def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:

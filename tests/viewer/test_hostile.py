@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import viser
+from places import place_of, view_of, widget
 from waiting import get, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -29,7 +30,7 @@ class Victims:
     def __init__(self, app: ViewerApp, tab: RawTab) -> None:
         self.app = app
         self.tab = tab
-        self.slider = app.joints.slider("PSM1", 0)
+        self.slider = app.view.layout.joints.slider("PSM1", 0)
         self._before = app.state
         self._value = -5.0
 
@@ -41,11 +42,12 @@ class Victims:
         self.tab.set(self.app.page.element_id(self.slider), value)
         wait_for(lambda: abs(self.slider.value - value) < 1e-9)
         self.app.wait_until_shown()
-        wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
+        wait_for(lambda: self.tab.connected and self.tab.overlays[-1][1] == self.app.view.scene.sent(OVERLAY))
         assert get(self.app.url).status == 200
         # Whoever comes now gets all that the server has kept for newcomers.
         with RawTab(self.app.url) as late:
-            wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == self.app.scene_view.sent(OVERLAY))
+            sent = view_of(self.app, late).scene.sent
+            wait_for(lambda: bool(late.overlays) and late.overlays[-1][1] == sent(OVERLAY))
 
 
 @pytest.fixture
@@ -63,7 +65,7 @@ def victims(open_viewer: Callable[..., ViewerApp], caplog: pytest.LogCaptureFixt
 def _taken(rogue: RawTab, app: ViewerApp) -> None:
     """Wait until everything that the rogue has sent was read, which the server does in order."""
     text = f"rogue {time.perf_counter()}"
-    note = app.page.find("Note")
+    note = widget(app, rogue, "Note")
     rogue.set(app.page.element_id(note), text)
     wait_for(lambda: note.value == text)
     app.wait_until_shown()
@@ -72,28 +74,38 @@ def _taken(rogue: RawTab, app: ViewerApp) -> None:
 @pytest.mark.parametrize("label", ["Frame", "Frames/s", "Opacity %", "By [°, mm]", "Seed"])
 def test_numbers_that_are_none_or_beyond_all_range_change_nothing(victims: Victims, label: str) -> None:
     # A number of more than 64 bits, once the toolkit has it, cannot be sent to any tab: all of them are disconnected.
-    widget = victims.app.page.find(label)
-    before = widget.value
     with RawTab(victims.app.url) as rogue:
+        own = widget(victims.app, rogue, label)
+        before = own.value
         for value in (float("nan"), float("inf"), -float("inf"), 1e300, -1e300, "nan", "9" * 4000, None, [1], True):
-            rogue.set(victims.app.page.element_id(widget), value)
+            rogue.set(victims.app.page.element_id(own), value)
         _taken(rogue, victims.app)
-    assert widget.value == before
+        assert own.value == before
 
 
 def test_a_number_beyond_its_widgets_range_is_clamped(victims: Victims) -> None:
     app = victims.app
     with RawTab(app.url) as rogue:
         for label, value in (("Opacity %", 1e9), ("Frames/s", -1e9), ("Frame", -(2**40))):
-            rogue.set(app.page.element_id(app.page.find(label)), value)
+            rogue.set(app.page.element_id(widget(app, rogue, label)), value)
         _taken(rogue, app)
-    assert (app.state.opacity, app.state.fps, app.state.index) == (1.0, 0.5, 0)
+        state = place_of(app, rogue).controller.state
+    assert (state.opacity, state.fps, state.index) == (1.0, 0.5, 0)
+
+
+def test_what_one_tab_sends_for_another_ones_widgets_changes_nothing(victims: Victims) -> None:
+    app = victims.app
+    with RawTab(app.url) as rogue:
+        for label, value in (("Frame", 2), ("Opacity %", 10), ("Note", "not yours")):
+            rogue.set(app.page.element_id(app.view.page.find(label)), value)
+        _taken(rogue, app)
+    assert (app.state.index, app.state.opacity, app.view.page.find("Note").value) == (0, 0.5, "")
 
 
 def test_unknown_controls_and_everything_but_values_are_refused(victims: Victims) -> None:
     app = victims.app
-    known = app.page.element_id(app.page.find("Note"))
     with RawTab(app.url) as rogue:
+        known = app.page.element_id(widget(app, rogue, "Note"))
         rogue.set("no such widget", 1.0)
         rogue.press("no such command")
         for name in ("removed", "sync_cb", "update_cb", "disabled", "is_button", "uuid", "__class__", "props"):
@@ -107,7 +119,7 @@ def test_uploads_tunnels_and_other_messages_of_the_toolkit_are_refused(
     app = victims.app
     asked: list[str] = []
     monkeypatch.setattr(app.page.server, "request_share_url", lambda *_: asked.append("tunnel"))
-    source = app.page.element_id(app.page.find("Note"))
+    source = app.page.element_id(app.view.page.find("Note"))
     part = {"source_component_uuid": source, "transfer_uuid": "x", "part_index": 0, "content": b"x" * 1000}
     upload = {
         "source_component_uuid": source,
@@ -141,7 +153,7 @@ def test_a_message_that_is_too_large_ends_the_connection_it_came_by_and_no_other
     app = victims.app
     huge: dict[str, Any] = {
         "type": "GuiUpdateMessage",
-        "uuid": app.page.element_id(app.page.find("Note")),
+        "uuid": app.page.element_id(app.view.page.find("Note")),
         "updates": {"value": "x" * size},
     }
     with RawTab(app.url) as rogue:
@@ -150,18 +162,19 @@ def test_a_message_that_is_too_large_ends_the_connection_it_came_by_and_no_other
         except ConnectionClosed:
             pass
         assert rogue.close_code() == 1009
-    assert app.page.find("Note").value == ""
+    assert app.view.page.find("Note").value == ""
 
 
 def test_a_text_that_is_too_long_is_cut_off(victims: Victims) -> None:
     app = victims.app
     with RawTab(app.url) as rogue:
-        rogue.set(app.page.element_id(app.page.find("Note")), "x" * 900_000)
-        wait_for(lambda: bool(app.state.review.note))
-        app.queue.put(intents.Released())
+        note = widget(app, rogue, "Note")
+        rogue.set(app.page.element_id(note), "x" * 900_000)
+        wait_for(lambda: bool(place_of(app, rogue).controller.state.review.note))
+        place_of(app, rogue).put(intents.Released())
         app.wait_until_shown()
-    assert 0 < len(app.state.review.note) < 20_000
-    assert len(app.page.find("Note").value) == len(app.state.review.note)
+        assert 0 < len(app.state.review.note) < 20_000
+        assert len(note.value) == len(app.state.review.note)
 
 
 def test_another_sites_page_gets_no_connection(victims: Victims) -> None:
@@ -242,7 +255,8 @@ def test_the_token_of_one_server_opens_no_other(shared_page: Page) -> None:
 
 
 def test_a_program_that_has_the_address_gets_in_with_it(shared_page: Page) -> None:
-    with RawTab(f"http://127.0.0.1:{shared_page.server.get_port()}/?{shared_page.url.partition('?')[2]}") as tab:
+    url = f"http://127.0.0.1:{shared_page.server.get_port()}/?{shared_page.url.partition('?')[2]}"
+    with RawTab(url, hello=False) as tab:
         assert tab.connected
 
 

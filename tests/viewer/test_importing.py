@@ -20,6 +20,7 @@ from carts_viewer.imported import with_imported
 from carts_viewer.layers import Layer, imported, label_color
 from carts_viewer.panels.overlay import offered_layers
 from carts_viewer.running import OptimizerFactory
+from carts_viewer.people import People
 from carts_viewer.session import Session
 
 
@@ -117,7 +118,7 @@ def test_folders_that_were_allowed_may_be_imported_from(plain: Desk, tmp_path_fa
     write_theirs(folder)
     with pytest.raises(CartsError, match="outside of the allowed folders"):
         plain.do(intents.ImportMasks(str(folder / "theirs.json")))
-    session = Session(plain.session.sequence, plain.session.editor.project, [folder])
+    session = Session(plain.session.sequence, People(plain.session.editor.project), folders=[folder])
     assert session.roots.checked(folder / "theirs.json") == folder / "theirs.json"
 
 
@@ -139,7 +140,7 @@ def test_somebody_types_where_the_masks_are_and_sees_them(
     tab = open_tab(app)
     tab.page.get_by_role("tab", name="Review").click()
     tab.page.get_by_text("Masks of others", exact=True).click()
-    label = tab.page.locator(f"label[for='{app.page.element_id(app.page.find('From'))}']")
+    label = tab.page.locator(f"label[for='{app.page.element_id(tab.find('From'))}']")
     field = label.locator("xpath=ancestor::div[1]/following-sibling::div//input")
     field.fill("theirs.json")
     field.press("Tab")

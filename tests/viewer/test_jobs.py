@@ -21,7 +21,7 @@ def test_what_takes_long_waits_for_what_runs_and_the_page_stays_usable(desk: Des
     desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"))
     desk.do(intents.Export("csv", "All"))
     assert states(desk) == [("optimize", "running"), ("export", "waiting")]
-    desk.controller.advance()
+    desk.advance()
     # Meanwhile somebody works on.
     assert desk.do(intents.ShowFrame(2), intents.SetReview(ReviewState.REJECTED)).index == 2
     desk.finish()
@@ -39,7 +39,7 @@ def test_a_job_that_waits_or_runs_can_be_cancelled_and_started_again(desk: Desk)
     desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"), intents.Calibrate(2))
     desk.do(intents.CancelJob(2), intents.CancelJob(1))
     assert states(desk) == [("optimize", "cancelled"), ("calibrate", "cancelled")]
-    assert desk.controller.wait_time() is None and not desk.saved.steps
+    assert desk.wait_time() is None and not desk.saved.steps
     desk.do(intents.RepeatJob(1))
     assert states(desk)[-1] == ("optimize", "running")
     with pytest.raises(CartsError, match="not ended"):

@@ -65,9 +65,10 @@ class Lives:
         victim.start()
         theirs.close()
         assert ours.poll(120), "the app did not start"
-        ids: Widgets = ours.recv()
+        url = ours.recv()
         dice = random.Random(seed)
-        with RawTab(ids.url, keep=1) as tab:
+        with RawTab(url, keep=1) as tab:
+            ids: Widgets = ours.recv()
             client = Client(tab, ids, FRAMES, dice, self._unique, self._pixels)
             killer = threading.Timer(0.05 + 2.5 * dice.random(), victim.kill)
             killer.start()

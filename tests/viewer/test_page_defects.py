@@ -94,7 +94,7 @@ def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab
     app = open_viewer(frames=12, width=160, height=120, domains=("regular", "smoke"))
     tab = open_tab(app, (1280, 800))
     # A slider's ends are those of the frame that is shown.
-    slider = app.joints.slider("PSM1", 0)
+    slider = app.view.layout.joints.slider("PSM1", 0)
     assert slider.max - slider.min <= 12
     app.queue.put(intents.ShowFrame(11))
     app.wait_until_shown()

@@ -144,8 +144,8 @@ def test_ignored_pixels_change_the_surface_loss(desk: Desk) -> None:
 
 def test_painting_ends_a_run_and_keeps_what_it_reached(desk: Desk) -> None:
     desk.do(intents.Run())
-    desk.controller.advance()
-    desk.controller.advance()
+    desk.advance()
+    desk.advance()
     desk.do(_polygon(Target.IGNORE))
     assert [step.name.split(",")[0] for step in desk.saved.steps] == ["Optimize", "Ignore pixels"]
     assert "painted" in (desk.state.run.reason or "")

@@ -61,7 +61,7 @@ def solve_some(desk: Desk, frames: int) -> None:
     """Advance until so many frames are solved; some are looked at before the first one."""
     assert desk.state.solve is not None
     while desk.state.solve.done < frames:
-        desk.controller.advance()
+        desk.advance()
         assert desk.state.solve is not None and desk.state.solve.running
 
 
@@ -112,7 +112,7 @@ def test_stopping_keeps_what_is_solved_as_one_step(desk: Desk) -> None:
     state = desk.do(intents.StopSolving())
     assert not state.solving and state.solve is not None and state.solve.text.startswith("Stopped: 2 frames solved")
     assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, None, None] and state.undoable == 1
-    assert desk.controller.wait_time() is None
+    assert desk.wait_time() is None
 
 
 def test_a_frame_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
@@ -156,7 +156,7 @@ def test_an_image_that_is_missing_does_not_cost_the_frames_before_it(recording: 
 def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> None:
     desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
-    desk.controller.fail(CartsError("the export failed"), stop=True)
+    desk.fail(CartsError("the export failed"))
     assert not desk.state.solving and sources(desk) == [Source.PROPAGATED, *[None] * 4]
     assert desk.state.error == "the export failed"
 
@@ -164,7 +164,7 @@ def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> 
 def test_closing_saves_what_is_solved(desk: Desk) -> None:
     desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
-    desk.controller.close()
+    desk.close()
     assert sources(desk) == [Source.PROPAGATED, *[None] * 4]
 
 

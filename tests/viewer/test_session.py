@@ -11,6 +11,7 @@ import torch
 from carts_core.errors import CartsError
 from carts_core.project import Key, Kind, Project, Provenance, Source
 from carts_core.recording import Sequence
+from carts_viewer.people import People
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
 
@@ -20,7 +21,7 @@ HAND = Provenance(Source.HAND)
 @pytest.fixture
 def session(tiny_sequence: Callable[..., Path]) -> Session:
     sequence = Sequence.open(tiny_sequence(cameras=("left", "right"), domains=("regular", "smoke")))
-    return Session(sequence, Project.open(sequence))
+    return Session(sequence, People(Project.open(sequence)))
 
 
 def _pose(session: Session, index: int, camera: str = "left", domain: str = "regular") -> Pose:

@@ -47,10 +47,11 @@ def _live(sequence_path: Path, weights: Path, number: int, seed: int) -> int:
     victim.start()
     theirs.close()
     assert ours.poll(120), "the app did not start"
-    ids = ours.recv()
+    url = ours.recv()
     dice = random.Random(seed)
     before = _names(sequence_path)
-    with RawTab(ids.url, keep=1) as tab:
+    with RawTab(url, keep=1) as tab:
+        ids = ours.recv()
         pixels = iter([(row, column) for row in range(72) for column in range(96)])
         client = Client(tab, ids, FRAMES, dice, iter(range(seed * 10**6 + 1, 10**9)), pixels)
         assert victim.pid is not None
@@ -113,8 +114,9 @@ def test_a_note_that_nobody_has_left_yet_is_saved(
     victim = processes.Process(target=_serve_until_signal, args=(path, untrained_weights, theirs), daemon=True)
     victim.start()
     assert ours.poll(120), "the app did not start"
-    ids = ours.recv()
-    with RawTab(ids.url, keep=1) as tab:
+    url = ours.recv()
+    with RawTab(url, keep=1) as tab:
+        ids = ours.recv()
         time.sleep(1.0)
         tab.set(ids.note, "half a th")
         time.sleep(1.0)

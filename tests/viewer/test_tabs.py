@@ -1,4 +1,4 @@
-"""Several tabs at once, in headless Chromium: one state, shown by all of them, whoever comes, goes or reloads."""
+"""Several tabs at once, in headless Chromium: everybody their own place in one project, whoever comes or goes."""
 
 import math
 import socket
@@ -22,80 +22,82 @@ EVERYWHERE = ".".join("0000")
 WINDOW = (1100, 720)
 
 
-def _agree(tabs: list[Tab]) -> None:
-    """Wait until every tab shows the present state: frame, joint, opacity, review, history and the picture itself."""
-    app = tabs[0].app
-    state = app.wait_until_shown()
-    joint = app.joints.slider("PSM1", 0)
-    for tab in tabs:
-        for handle, value in (
-            (app.page.find("Frame"), state.index + 1),
-            (joint, joint.value),
-            (app.page.find("Opacity %"), round(100 * state.opacity)),
-        ):
-            field = tab.page.locator(f"[id='{app.page.element_id(handle)}'] + * input")
-            expect(field).to_have_value(f"{value:g}", timeout=20_000)
-        expect(tab.page.get_by_text(f"({state.index + 1} of {len(app.sequence)})")).to_be_visible(timeout=20_000)
-        tab.page.get_by_text("Review", exact=True).first.click()
-        expect(tab.page.locator(".mantine-TextInput-input:visible")).to_have_value(state.review.note)
-        history = tab.page.locator(f"[id='{app.page.element_id(app.page.find('Go to'))}']")
-        expect(history).to_have_value(app.page.find("Go to").value)
-        assert tab.canvas.eventually_registered() <= 1.5
-        tab.page.get_by_text("Optimize", exact=True).first.click()
+def _shows_its_own(tab: Tab) -> None:
+    """Wait until a tab shows what the viewer has of it: frame, joint, opacity, note, history and the picture itself."""
+    app = tab.app
+    app.wait_until_shown()
+    state, joint = tab.state, tab.slider("PSM1", 0)
+    for handle, value in (
+        (tab.find("Frame"), state.index + 1),
+        (joint, joint.value),
+        (tab.find("Opacity %"), round(100 * state.opacity)),
+    ):
+        field = tab.page.locator(f"[id='{app.page.element_id(handle)}'] + * input")
+        expect(field).to_have_value(f"{value:g}", timeout=20_000)
+    expect(tab.page.get_by_text(f"({state.index + 1} of {len(app.sequence)})")).to_be_visible(timeout=20_000)
+    tab.page.get_by_text("Review", exact=True).first.click()
+    expect(tab.page.locator(".mantine-TextInput-input:visible").first).to_have_value(state.review.note)
+    history = tab.page.locator(f"[id='{app.page.element_id(tab.find('Go to'))}']")
+    expect(history).to_have_value(tab.find("Go to").value)
+    assert tab.canvas.eventually_registered() <= 1.5
+    tab.page.get_by_text("Optimize", exact=True).first.click()
 
 
-def _joint(app: ViewerApp) -> float:
-    return math.degrees(float(app.state.pose.scene.joint_positions[0][0]))
+def _joint(tab: Tab) -> float:
+    return math.degrees(float(tab.state.pose.scene.joint_positions[0][0]))
 
 
-def test_three_tabs_show_one_state_and_so_does_one_that_reloads_or_joins(
+def test_three_tabs_are_at_three_places_and_one_that_reloads_is_where_it_was(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_marked()
-    tabs = [open_tab(app, WINDOW) for _ in range(3)]
-    first, second, third = tabs
-    first.type_value(app.page.find("Frame"), 2)
-    eventually(lambda: app.state.index, lambda index: index == 1)
-    value = round(app.joints.slider("PSM1", 0).value - 3.0, 2)
-    second.type_value(app.joints.slider("PSM1", 0), value)
-    eventually(lambda: _joint(app), lambda at: abs(at - value) < 1e-3)
-    third.type_value(app.page.find("Opacity %"), 95)
-    eventually(lambda: app.state.opacity, lambda opacity: opacity == 0.95)
-    app.queue.put(intents.SetNote("seen by all"))
-    app.queue.put(intents.Released())
-    _agree(tabs)
-    second.page.reload()
-    second.wait_until_ready()
-    _agree([*tabs, open_tab(app, WINDOW)])
+    first, second, third = (open_tab(app, WINDOW) for _ in range(3))
+    for tab in (second, third):
+        tab.place_in_viewer.put(intents.SetOpacity(1.0))
+    first.type_value(first.find("Frame"), 2)
+    eventually(lambda: first.state.index, lambda index: index == 1)
+    value = round(second.slider("PSM1", 0).value - 3.0, 2)
+    second.type_value(second.slider("PSM1", 0), value)
+    eventually(lambda: _joint(second), lambda at: abs(at - value) < 1e-3)
+    third.type_value(third.find("Opacity %"), 95)
+    eventually(lambda: third.state.opacity, lambda opacity: opacity == 0.95)
+    # The frame is everybody's own, the project is not.
+    assert [tab.state.index for tab in (first, second, third)] == [1, 0, 0]
+    assert abs(_joint(third) - value) < 1e-3 and [len(t.state.project.steps) for t in (first, second, third)] == [1] * 3
+    for tab in (first, second, third):
+        _shows_its_own(tab)
+    first.page.reload()
+    first.wait_until_ready()
+    assert first.state.index == 1 and "frame=2" in first.page.url
+    _shows_its_own(first)
 
 
-def test_a_tab_that_is_closed_in_mid_drag_leaves_a_saved_edit_and_no_stale_picture(
+def test_a_tab_that_is_closed_in_mid_drag_leaves_a_saved_edit_and_does_not_hold_up_the_others(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_marked()
-    dragged, second, third = tabs = [open_tab(app, WINDOW) for _ in range(3)]
-    start = _joint(app)
-    box = dragged.page.locator(
-        f"[id='{app.page.element_id(app.joints.slider('PSM1', 0))}'] [role=slider]"
-    ).bounding_box()
+    dragged, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
+    second.place_in_viewer.put(intents.SetOpacity(1.0))
+    place = dragged.place_in_viewer
+    start = _joint(dragged)
+    box = dragged.page.locator(f"[id='{app.page.element_id(dragged.slider('PSM1', 0))}'] [role=slider]").bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     dragged.page.mouse.move(x, y)
     dragged.page.mouse.down()
     for step in range(15):
         dragged.page.mouse.move(x + step, y)
-    eventually(lambda: abs(_joint(app) - start), lambda moved: moved > 1.0)
-    assert app.state.unsaved
+    eventually(lambda: abs(_joint(dragged) - start), lambda moved: moved > 1.0)
+    assert place.controller.state.unsaved
     dragged.page.close()
     # Nobody has let go of the slider, so the edit is saved when its time is over.
-    eventually(lambda: app.state.unsaved, lambda unsaved: not unsaved)
-    assert app.state.undoable == 1
-    _agree(tabs[1:])
-    # The others are not held up by a tab that will never say that it has drawn anything.
-    value = round(app.joints.slider("PSM1", 0).value - 4.0, 2)
-    second.type_value(app.joints.slider("PSM1", 0), value)
-    eventually(lambda: app.state.undoable, lambda steps: steps == 2)
-    _agree([second, third])
+    eventually(lambda: place.controller.state.unsaved, lambda unsaved: not unsaved)
+    eventually(lambda: second.state.undoable, lambda steps: steps == 1)
+    _shows_its_own(second)
+    value = round(second.slider("PSM1", 0).value - 4.0, 2)
+    second.type_value(second.slider("PSM1", 0), value)
+    eventually(lambda: second.state.undoable, lambda steps: steps == 2)
+    _shows_its_own(second)
 
 
 def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
@@ -103,30 +105,89 @@ def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
 ) -> None:
     app = open_viewer(frames=12)
     tabs = [open_tab(app, WINDOW) for _ in range(3)]
-    for _ in range(3):
-        for tab in tabs:
+    for count, tab in enumerate(tabs, start=1):
+        for _ in range(count):
             tab.page.keyboard.press("n")
-    eventually(lambda: app.state.index, lambda index: index == 9)
+    eventually(lambda: [tab.state.index for tab in tabs], lambda places: places == [1, 2, 3])
     for tab in tabs:
         tab.page.keyboard.press("o")
     eventually(lambda: app.state.undoable, lambda steps: steps == 3)
-    for tab in tabs:
-        expect(tab.page.get_by_text("(10 of 12)")).to_be_visible(timeout=20_000)
+    for count, tab in enumerate(tabs, start=2):
+        expect(tab.page.get_by_text(f"({count} of 12)")).to_be_visible(timeout=20_000)
 
 
-def test_a_run_that_one_tab_starts_is_seen_and_paused_by_the_others(
+def test_a_run_goes_on_while_its_tab_reloads_and_others_work(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_viewer()
     run_without_end(app)
-    first, second, third = (open_tab(app, WINDOW) for _ in range(3))
+    first, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
     first.button("Run")
-    for tab in (second, third):
-        expect(tab.page.locator(".carts-status")).to_contain_text("running", timeout=30_000)
-    second.button("Pause")
-    eventually(lambda: app.state.run.phase, lambda phase: phase is Phase.PAUSED)
-    for tab in (first, third):
-        expect(tab.page.get_by_role("button", name="Continue", exact=True)).to_be_enabled(timeout=20_000)
+    expect(first.page.locator(".carts-status")).to_contain_text("running", timeout=30_000)
+    assert second.state.run.phase is Phase.IDLE
+    second.page.keyboard.press("n")
+    eventually(lambda: second.state.index, lambda index: index == 1)
+    second.page.keyboard.press("o")
+    eventually(lambda: second.state.undoable, lambda steps: steps >= 1)
+    before = len(first.state.run.curves.loss)
+    first.page.reload()
+    first.wait_until_ready()
+    assert first.state.index == 0 and first.state.run.phase is Phase.RUNNING
+    eventually(lambda: len(first.state.run.curves.loss), lambda count: count > before)
+    first.button("Pause")
+    eventually(lambda: first.state.run.phase, lambda phase: phase is Phase.PAUSED)
+
+
+def test_a_link_opens_its_frame_camera_and_domain_and_takes_nobody_along(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], browser: Browser
+) -> None:
+    app = open_viewer(cameras=("left", "right"), domains=("regular", "smoke"))
+    first = open_tab(app, WINDOW)
+    place = first.place_in_viewer
+    for intent in (intents.ShowFrame(2), intents.ShowCamera("right"), intents.ShowDomain("smoke")):
+        place.put(intent)
+    app.wait_until_shown()
+    first.page.wait_for_function("location.search.includes('domain=smoke') && location.search.includes('frame=3')")
+    link = first.page.url
+    first.type_value(first.find("Frame"), 1)
+    with closing(browser.new_context()) as context:
+        page = context.new_page()
+        page.goto(link)
+        other = Tab(app, page, Canvas(app, page))
+        other.wait_until_ready()
+        state = other.state
+        assert (state.index, state.camera, state.domain) == (2, "right", "smoke") and page.url == link
+        assert first.state.index == 0
+        page.goto(link.replace("project=tiny", "project=elsewhere"))
+        expect(page.get_by_text("This link is for elsewhere")).to_be_visible(timeout=20_000)
+
+
+def test_the_history_says_who_did_what_and_undo_takes_back_ones_own(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    ann, bob = open_tab(app, WINDOW), open_tab(app, WINDOW)
+    for tab, name in ((ann, "Ann"), (bob, "Bob")):
+        tab.page.get_by_text("Review", exact=True).first.click()
+        field = tab.page.locator(".mantine-TextInput-input:visible").last
+        field.fill(name)
+        field.press("Enter")
+        eventually(lambda tab=tab: tab.state.name, lambda known, name=name: known == name)
+        field.blur()
+    bob.page.keyboard.press("n")
+    eventually(lambda: bob.state.index, lambda index: index == 1)
+    ann.page.keyboard.press("o")
+    eventually(lambda: app.state.undoable, lambda steps: steps == 1)
+    bob.page.keyboard.press("o")
+    eventually(lambda: app.state.undoable, lambda steps: steps == 2)
+    names = [step.name for step in app.project.state.steps]
+    assert names[0].startswith("Ann: Nudge") and names[1].startswith("Bob: Nudge")
+    expect(ann.page.get_by_text("on frame 002")).to_be_visible(timeout=20_000)
+    ann.button("Undo")
+    eventually(lambda: app.state.undoable, lambda steps: steps == 3)
+    assert app.project.state.steps[2].name.startswith("Ann: Undo: Nudge")
+    assert not app.project.state.joints(0) and app.project.state.joints(1)
+    assert (ann.state.index, bob.state.index) == (0, 1)
 
 
 def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
@@ -140,7 +201,11 @@ def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
             page.goto(plain + "?" + app.url.partition("?")[2])
             tab = Tab(app, page, Canvas(app, page))
             tab.wait_until_ready()
-            assert page.url == plain and "carts-" not in page.evaluate("document.cookie")
+            assert (
+                page.url.startswith(plain)
+                and "token" not in page.url
+                and "carts-" not in page.evaluate("document.cookie")
+            )
             page.reload()
             tab.wait_until_ready()
             tab.page.keyboard.press("n")

@@ -12,6 +12,7 @@ from playwright.sync_api import Page
 from carts_viewer.app import ViewerApp
 from carts_viewer.layers import ARM_COLORS
 from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.state import ViewState
 
 T = TypeVar("T")
 MARKERS = ((0.30, 0.30), (0.70, 0.30), (0.30, 0.70), (0.70, 0.70))
@@ -50,6 +51,12 @@ class Canvas:
         self._page = page
         self._renderer = OverlayRenderer(app.sequence)
 
+    @property
+    def _state(self) -> ViewState:
+        """What this tab shows, as the viewer has it."""
+        key = self._page.evaluate("carts.key")
+        return next(place for place in self._app.tabs if place.key == key).controller.state
+
     def screenshot(self) -> np.ndarray:
         """RGB [height, width, 3] of the canvas as a person sees it, the tool bar blanked."""
         box = self._page.locator("canvas").first.bounding_box()
@@ -79,7 +86,7 @@ class Canvas:
         if len(order) < 4:
             return None
         found = centroids[order] + 0.5
-        camera = self._app.scene.camera(self._app.state.camera)
+        camera = self._app.scene.camera(self._state.camera)
         wanted = np.array(MARKERS) * (camera.width, camera.height)
         by_row = sorted(found.tolist(), key=lambda point: point[1])
         found = np.array([*sorted(by_row[:2]), *sorted(by_row[2:])])
@@ -94,7 +101,7 @@ class Canvas:
         if map_ is None:
             return float("inf")
         shown = np.linalg.norm(image.astype(float) - ARM_COLORS[0], axis=-1) < 60
-        arm_ids = self._renderer.arm_ids(self._app.state.pose.scene, self._app.state.camera)
+        arm_ids = self._renderer.arm_ids(self._state.pose.scene, self._state.camera)
         wanted = _warped(arm_ids >= 0, map_, image.shape[:2])
         wanted[: self._bar_height()] = False
         wanted[wanted.shape[0] - self._strip_height() :] = False

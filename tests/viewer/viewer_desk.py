@@ -1,14 +1,18 @@
 """A controller at work without threads or a page, with the real optimizer."""
 
+from typing import Any
+
 from carts_core.optimization import DescentSolver, FreeParameters
 from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
 from carts_core.settings import SolverName
 from carts_core.settings.stages import FirstOrder
 from carts_viewer import intents
+from carts_viewer.background import Background
 from carts_viewer.controller import Controller
 from carts_viewer.layers import Layer
 from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.people import People, Person
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -18,7 +22,8 @@ class Desk:
     """A controller and what it delivered."""
 
     def __init__(self, sequence: Sequence, project: Project, factory: OptimizerFactory) -> None:
-        self.session, self.renderer = Session(sequence, project), OverlayRenderer(sequence)
+        people = People(project)
+        self.session, self.renderer = Session(sequence, people), OverlayRenderer(sequence)
         self.delivered: list[tuple[int, str, bytes]] = []
         self._factory = factory
         domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
@@ -38,9 +43,13 @@ class Desk:
             free=FreeParameters(),
             project=self.session.editor.view,
         )
-        self.controller = Controller(
-            state, self.session, self.renderer, factory, lambda *file: self.delivered.append(file)
-        )
+        own = Session(sequence, people, Person(0, present=False))
+
+        def deliver(*file: Any) -> None:
+            self.delivered.append(file)
+
+        self.background = Background(state, own, self.renderer, factory, deliver)
+        self.controller = Controller(state, self.session, self.renderer, factory, self.background, deliver)
 
     def reopened(self, *, read_only: bool = False) -> "Desk":
         """Another desk for the same project, after this one is closed."""
@@ -63,9 +72,33 @@ class Desk:
 
     def finish(self) -> ViewState:
         """Advance until nothing is going on."""
-        while self.controller.wait_time() == 0.0:
-            self.controller.advance()
+        while self.wait_time() == 0.0:
+            self.advance()
         return self.state
+
+    def wait_time(self) -> float | None:
+        """How long nothing needs to be done, here and in the background."""
+        waits = (self.controller.wait_time(), self.background.wait_time())
+        return min((wait for wait in waits if wait is not None), default=None)
+
+    def advance(self) -> None:
+        """Do one bit of what goes on here, and one in the background."""
+        try:
+            self.controller.advance()
+            self.background.advance()
+        finally:
+            self.controller.follow()
+
+    def fail(self, error: Exception) -> None:
+        """An error of what goes on, as the worker hands it on."""
+        self.controller.fail(error, stop=True)
+        self.background.fail(str(error))
+        self.controller.follow()
+
+    def close(self) -> None:
+        """Save everything that is under way."""
+        self.background.close()
+        self.controller.close()
 
     @property
     def saved(self) -> ProjectState:

@@ -1,11 +1,14 @@
 """One tab of the viewer in a real browser."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from playwright.sync_api import Page
 from viewer_canvas import Canvas
 
 from carts_viewer.app import ViewerApp
+from carts_viewer.state import ViewState
+from carts_viewer.tab import Tab as Place
 
 
 @dataclass
@@ -16,6 +19,29 @@ class Tab:
     page: Page
     canvas: Canvas
 
+    @property
+    def place_in_viewer(self) -> Place:
+        """What the viewer keeps of this tab."""
+        key = self.page.evaluate("carts.key")
+        return next(place for place in self.app.tabs if place.key == key)
+
+    @property
+    def state(self) -> ViewState:
+        """What this tab shows, as the viewer has it."""
+        return self.place_in_viewer.controller.state
+
+    def find(self, label: str) -> Any:
+        """This tab's widget with this label."""
+        view = self.place_in_viewer.view
+        assert view is not None
+        return view.page.find(label)
+
+    def slider(self, arm: str, joint: int) -> Any:
+        """This tab's slider of a joint."""
+        view = self.place_in_viewer.view
+        assert view is not None
+        return view.layout.joints.slider(arm, joint)
+
     def button(self, name: str) -> None:
         # Controls of one panel share a sender that keeps the newest message of 50 ms, so a hasty click could be lost.
         self.page.wait_for_timeout(80)
@@ -24,7 +50,7 @@ class Tab:
     def choose(self, label: str, option: str) -> None:
         """Choose from a list, as a person does."""
         self.page.wait_for_timeout(80)
-        self.page.locator(f"[id='{self.app.page.element_id(self.app.page.find(label))}']").click()
+        self.page.locator(f"[id='{self.app.page.element_id(self.find(label))}']").click()
         self.page.get_by_role("option", name=option, exact=True).click()
 
     def type_value(self, handle: object, value: float) -> None:
@@ -37,7 +63,7 @@ class Tab:
 
     def place(self, u: float, v: float) -> tuple[float, float]:
         """Where a place of the image [px] is in the window, as the page's own script says."""
-        shown, camera = self.page.evaluate("carts.imageOnScreen()"), self.app.scene.camera(self.app.state.camera)
+        shown, camera = self.page.evaluate("carts.imageOnScreen()"), self.app.scene.camera(self.state.camera)
         box = self.page.locator("canvas").first.bounding_box()
         assert shown is not None and box is not None
         x = box["x"] + shown["left"] + u / camera.width * shown["width"]

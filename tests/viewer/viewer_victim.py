@@ -9,6 +9,7 @@ from typing import NamedTuple
 import cv2
 import torch
 from viewer_run import run_without_end
+from waiting import wait_for
 
 from carts_core.files import MARKER
 from carts_viewer.app import ViewerApp
@@ -52,17 +53,20 @@ def open_and_tell(sequence: Path, weights: Path, tell: Connection) -> ViewerApp:
     assert app.project.writable, app.notice
     # A run that ends by itself would leave nothing to be killed in the middle of.
     run_without_end(app)
-    (saved,) = (panel for panel in app.display._panels if isinstance(panel, SavedPanel))
-    (exports,) = (panel for panel in app.display._panels if isinstance(panel, ExportPanel))
+    # The widgets are those of the tab that comes now.
+    tell.send(app.url)
+    wait_for(lambda: app.tabs.first.view is not None, 60)
+    (saved,) = (panel for panel in app.view.display._panels if isinstance(panel, SavedPanel))
+    (exports,) = (panel for panel in app.view.display._panels if isinstance(panel, ExportPanel))
     labels = "Note", "Accept", "Reject", "Run", "Format", "Export", "Go to"
     found = [
         app.page._fields["released"],
         app.page._fields["painted"],
         saved._text,
         exports._result,
-        app.page.find("Frame"),
-        app.joints.slider("PSM1", 0),
-        *map(app.page.find, labels),
+        app.view.page.find("Frame"),
+        app.view.layout.joints.slider("PSM1", 0),
+        *map(app.view.page.find, labels),
     ]
     tell.send(Widgets(app.url, *map(app.page.element_id, found)))
     return app

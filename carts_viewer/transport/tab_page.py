@@ -1,0 +1,103 @@
+"""One tab's own part of the page: its widgets and its scene, which no other tab sees, and calls into its script."""
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
+
+import viser
+
+from carts_viewer.transport.viser_private import command_id, element_id, run_script, widgets
+
+
+class TabPage:
+    """What one tab shows.
+
+    Attributes:
+        client: the tab's connection.
+        gui: where widgets are added.
+        scene: where nodes are added.
+    """
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self.client = client
+        self.gui = client.gui
+        self.scene = client.scene
+        self._pressed: list[Callable[[str], None]] = []
+
+    def call(self, name: str, *arguments: Any) -> None:
+        """Call `window.carts[name](*arguments)` in the tab; unknown names are ignored there."""
+        call(self.client, name, *arguments)
+
+    def on_pressed(self, callback: Callable[[str], None]) -> None:
+        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; any text, if it is none of ours."""
+        self._pressed.append(callback)
+
+    def press(self, key: str) -> None:
+        """A key of `OWN_KEYS` was pressed in this tab."""
+        for callback in self._pressed:
+            callback(key)
+
+    def atomic(self) -> AbstractContextManager[None]:
+        """What is sent inside is shown at once."""
+        return self.client.atomic()
+
+    def flush(self) -> None:
+        """Send what waits."""
+        self.client.flush()
+
+    def find(self, label: str) -> Any:
+        """The widget with this label (for tests and scripts)."""
+        return next(handle for handle in widgets(self.gui) if getattr(handle, "label", None) == label)
+
+    def command_id(self, label: str) -> str:
+        """The id by which the tab triggers the command with this label (for tests and scripts)."""
+        return command_id(self.gui, label)
+
+    def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
+        """Lay out consecutive buttons of the current container side by side.
+
+        Args:
+            handles: The buttons, in order.
+            weights: Relative widths; equal when left out.
+        """
+        shares = [1.0] * len(handles) if weights is None else list(weights)
+        self._side_by_side([element_id(handle) for handle in handles], shares, "div:has(> [id='{}'])")
+
+    def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:
+        """Lay out consecutive checkboxes or number fields of the current container in columns, in reading order.
+
+        Args:
+            handles: The widgets, in order.
+            count: How many to a line.
+            narrow_labels: Give labels no more room than they need, and the fields the rest.
+        """
+        for first in range(0, len(handles), count):
+            group = [element_id(handle) for handle in handles[first : first + count]]
+            # A short last line keeps the width of the others.
+            box = "div:has(> .mantine-Flex-root > div [id='{}'])"
+            self._side_by_side(group, [1.0] * len(group), box, total=float(count))
+            if narrow_labels:
+                labels = ", ".join(f"{box.format(name)} > .mantine-Flex-root > div:first-child" for name in group)
+                self.gui.add_html(f"<style>{labels} {{ width: auto !important; white-space: nowrap }}</style>")
+
+    def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
+        """Turn the boxes around these elements into parts of a line, by a style sheet that names their ids."""
+        total = sum(shares) if total is None else total
+        boxes = [box.format(name) for name in ids]
+        rules = [
+            f"{', '.join(boxes)} {{ display: inline-block; box-sizing: border-box; vertical-align: top; "
+            "margin-inline: 0 !important; padding-inline: 4px !important }"
+        ]
+        for one, share in zip(boxes, shares, strict=True):
+            # The line is as wide as single elements, which keep 10 px from either side of the panel.
+            rules.append(f"{one} {{ width: calc((100% - 12px) * {share / total:.4f}) }}")
+        rules.append(f"{boxes[0]} {{ margin-left: 6px !important }}")
+        self.gui.add_html(f"<style>{' '.join(rules)}</style>")
+
+
+def call(client: viser.ClientHandle, name: str, *arguments: Any) -> None:
+    """Call `window.carts[name](*arguments)` in one tab; unknown names are ignored there."""
+    values = ", ".join(json.dumps(argument) for argument in arguments)
+    source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({values});"
+    run_script(client, source)
