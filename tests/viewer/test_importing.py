@@ -19,8 +19,8 @@ from carts_viewer.app import ViewerApp
 from carts_viewer.imported import with_imported
 from carts_viewer.layers import Layer, imported, label_color
 from carts_viewer.panels.overlay import offered_layers
-from carts_viewer.running import OptimizerFactory
 from carts_viewer.people import People
+from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 
 
