@@ -108,6 +108,7 @@ def test_a_stroke_is_in_the_project_and_in_every_tab_and_undo_takes_it_out(
     # Another tab has its own tool in hand, and sees what was painted.
     other = open_tab(app, (1000, 900))
     expect(other.page.locator("canvas.carts-paint")).to_have_css("pointer-events", "none")
+    other.place_in_viewer.put(intents.SetOpacity(1.0))
     hand = Hand(tab)
     hand.holds(tool="brush", target="Ignore region")
     points = [(30.0, 120.0), (120.0, 140.0), (200.0, 40.0), (290.0, 60.0)]
