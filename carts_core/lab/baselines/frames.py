@@ -23,8 +23,8 @@ from ..randomization import SURFACE_UNIT, SurfaceGenerator
 
 SIZE = (256, 192)
 """Width and height of a training frame [px]: a whole image, not a crop."""
-IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0)
-"""Regular images: neither smoke, blood nor low light, and nothing that hides the arms."""
+IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
+"""Regular images: no smoke, blood or low light, nothing that hides the arms or looks like one, and no arm missing."""
 CHUNK = 250
 """Frames of a file."""
 

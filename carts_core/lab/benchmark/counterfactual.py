@@ -40,21 +40,28 @@ class Counterfactual:
         camera: the camera that takes part.
         backdrop: the other background, of the camera's size.
         seed: of blood, smoke and noise.
+        strengths: of the conditions; those of the synthetic domains by default.
     """
 
-    def __init__(self, sequence: Sequence, camera: str, backdrop: UInt8[np.ndarray, "h w 3"], seed: int) -> None:
+    def __init__(
+        self,
+        sequence: Sequence,
+        camera: str,
+        backdrop: UInt8[np.ndarray, "h w 3"],
+        seed: int,
+        strengths: DomainConfig | None = None,
+    ) -> None:
         self.scene, self.timestamps = sequence.scene, sequence.timestamps
         self.measured_joints = sequence.measured_joints
         self._sequence, self._camera, self._backdrop = sequence, camera, backdrop
-        self._config = SynthesisConfig(seed=seed)
+        self._config = SynthesisConfig(seed=seed, domain=strengths or DomainConfig())
         self._surface = RealSurface(
             sequence.scene.with_cameras([camera]),
             [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))],
         )
-        strengths: DomainConfig = self._config.domain
-        self._bleeding = Bleeding(_relief(seed), strengths, self._config.rng("bleeding"))
-        self._smoke = Smoke(strengths, self._config.rng("smoke"))
-        self._overlay = SmokeOverlay(strengths.overlay_opacity, self._config.rng("overlay"))
+        self._bleeding = Bleeding(_relief(seed), self._config.domain, self._config.rng("bleeding"))
+        self._smoke = Smoke(self._config.domain, self._config.rng("smoke"))
+        self._overlay = SmokeOverlay(self._config.domain.overlay_opacity, self._config.rng("overlay"))
         self._clean = sequence.background(camera)
         brightness = float(np.median(linear(self._clean)))
         self._lamp = np.pi * DISTANCE**2 * brightness / _REFLECTANCE
