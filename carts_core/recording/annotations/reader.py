@@ -58,9 +58,11 @@ def read_annotations(
     """
     if camera is not None:
         sequence.recorded_camera(camera)
+    if not source.exists():
+        raise SequenceError(f"{source} is missing. Give the file or folder of the masks or keypoints.")
     place = next((source / name for name in sorted(_INSIDE) if (source / name).is_file()), source)
     chosen = next((format for format in _FORMATS if format.fits(place)), None)
-    if chosen is None or not place.exists():
+    if chosen is None:
         raise SequenceError(
             f"{source} holds no masks or keypoints that are known. Give a COCO file (.json), a CVAT file (.xml), "
             "keypoints of SurgPose (.yaml), or a folder of PNG masks."
