@@ -410,12 +410,16 @@
 
   // ---- Keys go to the page again after a list, a box or a button was used with the pointer ------------------------------
 
+  let presses = 0;
+  window.addEventListener("pointerdown", () => { presses += 1; }, { capture: true });
   window.addEventListener("click", (event) => {
     const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
     if (!used || event.detail === 0 || used.closest("[role=dialog]")) return;
     const list = used.matches("[role=option]"); // its field has the focus then, and is no longer about typing
     const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it has closed, which may be late
+    const press = presses;
     const leave = () => {
+      if (press !== presses) return; // something else is in use by now
       const focused = document.activeElement;
       if (focused?.matches(list ? "input[aria-haspopup=listbox]" : "button, input[type=checkbox]")) focused.blur();
       if (performance.now() < end) setTimeout(leave, 60);

@@ -108,3 +108,9 @@ def test_a_long_module_and_a_long_function_are_found() -> None:
     assert list(too_long("m.py", "x = 1\n" * 301)) == ["m.py"]
     assert list(too_long("m.py", "def f():\n" + "    x = 1\n" * 60)) == ["f"]
     assert not list(too_long("m.py", "def f():\n" + "    x = 1\n" * 59))
+
+
+def test_every_test_module_has_a_name_of_its_own() -> None:
+    paths = [path for path in (ROOT / "tests").rglob("*.py") if not (path.parent / "__init__.py").exists()]
+    names = [path.name for path in paths if path.name != "conftest.py"]
+    assert [name for name in set(names) if names.count(name) > 1] == []  # pytest would stop at the second one

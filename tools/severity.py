@@ -17,7 +17,7 @@ from carts_core.lab.baselines.weights import read_baseline
 from carts_core.lab.benchmark import TEST_SEED, Run
 from carts_core.lab.benchmark.counterfactual import Counterfactual
 from carts_core.lab.benchmark.methods import METHODS
-from carts_core.lab.benchmark.runner import _Bench
+from carts_core.lab.benchmark.runner import SourceBench
 from carts_core.lab.benchmark.scope import FULL
 from carts_core.lab.benchmark.sources import Source
 from carts_core.networks.extractor import FeatureExtractor
@@ -53,8 +53,8 @@ def run(results: Path, path: Path, baselines: list[Path]) -> None:
         for domain, strengths in SEVERITIES.items():
             altered = Counterfactual(sequence, camera.name, nothing, TEST_SEED, strengths[level])
             source = Source("real", "", camera.name, frames, "", lambda progress, found=altered: found)
-            bench = _Bench(source, None, networks)  # pyright: ignore[reportArgumentType]
-            bench._opened = altered, _renderer(sequence, camera.name)
+            bench = SourceBench(source, None, networks)  # pyright: ignore[reportArgumentType]
+            bench.opened = altered, _renderer(sequence, camera.name)
             for frame in frames:
                 for method in (*METHODS_DRAWN, *networks):
                     if (domain, level, frame, method) in done:

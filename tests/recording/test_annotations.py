@@ -253,6 +253,9 @@ def test_a_damaged_mask_and_a_folder_without_masks_are_refused(sequence: Sequenc
     file.write_bytes(file.read_bytes()[:-20])
     with pytest.raises(SequenceError, match=r"001\.png is damaged"):
         all_of(tmp_path / "left", sequence)
+    with pytest.raises(SequenceError, match=r"nothing\.txt is missing"):
+        all_of(tmp_path / "nothing.txt", sequence)
+    (tmp_path / "nothing.txt").write_text("no masks")
     with pytest.raises(SequenceError, match="holds no masks or keypoints that are known"):
         all_of(tmp_path / "nothing.txt", sequence)
 

@@ -9,7 +9,7 @@ from carts_core.settings import DomainConfig, EndoscopeConfig, MotionConfig, Sen
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: EndoscopeConfig(distance=2.0), "EndoscopeConfig.distance is 2.0; it must lie between 0.05 and 0.3"),
+        (lambda: EndoscopeConfig(distance=20.0), "EndoscopeConfig.distance is 20.0; it must lie between 0.05 and 10"),
         (lambda: MotionConfig(frames=0), "MotionConfig.frames is 0"),
         (lambda: SensorConfig(jpeg_quality=101), "between 1 and 100"),
         (lambda: DomainConfig(blood_coverage=1.5), "DomainConfig.blood_coverage is 1.5"),

@@ -78,7 +78,7 @@ class Benchmark:
             TimeRemainingColumn(),
         )
         with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
-            bench = {name: _Bench(source, bar, self.baselines) for name, source in self.sources.items()}
+            bench = {name: SourceBench(source, bar, self.baselines) for name, source in self.sources.items()}
             task = bar.add_task("measuring", total=len(self.runs), completed=len(self.runs) - len(todo))
             while todo:
                 run = next(iter(todo))
@@ -111,12 +111,13 @@ def _log(console: Console, line: str) -> None:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-class _Bench:
+class SourceBench:
     """One source, opened when its first run comes."""
 
     def __init__(self, source: Source, bar: Bar, baselines: Mapping[str, TrainedBaseline] | None = None) -> None:
         self._source, self._bar, self._baselines = source, bar, baselines or {}
-        self._opened: tuple[Recording, Renderer] | None = None
+        self.opened: tuple[Recording, Renderer] | None = None
+        """What is measured on, once it is open."""
         self._calibrated: Scene | None = None
 
     def measure(self, runs: list[Run], scope: Scope, extractor: FeatureExtractor) -> list[Measurement]:
@@ -181,7 +182,7 @@ class _Bench:
         return self._calibrated
 
     def _open(self) -> tuple[Recording, Renderer]:
-        if self._opened is None:
+        if self.opened is None:
             task = self._bar.add_task("opening", total=None)
 
             def report(what: str, done: int, total: int) -> None:
@@ -190,5 +191,5 @@ class _Bench:
 
             recording = self._source.open(report)
             self._bar.remove_task(task)
-            self._opened = recording, Renderer(recording.scene, cameras=[self._source.camera])
-        return self._opened
+            self.opened = recording, Renderer(recording.scene, cameras=[self._source.camera])
+        return self.opened
