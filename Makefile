@@ -1,10 +1,11 @@
 # Everything starts here; `make` alone lists it. Settings:
 #   PYTHON       the interpreter that .venv is created with (3.11 or newer)
 #   TORCH_INDEX  where torch comes from: an index URL, or `pypi`; see .ci/setup.py for the default
-#   SEQUENCE     what `make view` opens; the start page without it
+#   SEQUENCE     what `make view` opens, the shipped sample by default; `make view SEQUENCE=` shows the start page
 #   ARGS         further arguments of `carts view` or pytest
 
 PYTHON ?= python3
+SEQUENCE ?= sample_data/sequence/sequence.toml
 BIN := .venv/bin
 # pyright asks the network for a newer version of itself, unless told not to.
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
@@ -15,7 +16,7 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-view: setup ## Open the start page in the browser (or SEQUENCE=path/to/sequence.toml)
+view: setup ## Open the shipped sample in the viewer (or SEQUENCE=path/to/sequence.toml)
 	@$(BIN)/carts view $(SEQUENCE) $(ARGS)
 
 test: lint docs ## Check style and types, build the documentation, and run the tests, browser included

@@ -84,7 +84,7 @@ def _bench(work: Path) -> None:
         return [Measurement(run, score, (score,), (0,), "converged", "a machine") for run in runs]
 
     with (
-        mock.patch.object(runner._Bench, "measure", measured),
+        mock.patch.object(runner.SourceBench, "measure", measured),
         mock.patch.object(stages, "render_figures", lambda *_: {"a": 1.0}),
         mock.patch.object(stages, "network_figures", lambda *_: {"b": 1.0}),
         mock.patch.object(stages, "optimizer_figures", lambda *_: {"c": 1.0}),

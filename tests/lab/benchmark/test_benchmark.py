@@ -26,7 +26,7 @@ from carts_core.lab.benchmark import (
     synthetic_room_source,
     write_report,
 )
-from carts_core.lab.benchmark.runner import _Bench
+from carts_core.lab.benchmark.runner import SourceBench
 from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
 
 QUIET = Console(quiet=True)
@@ -39,14 +39,14 @@ occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode."
 def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
     """Fills with what is really measured."""
     measured: list[Measurement] = []
-    measure = _Bench.measure
+    measure = SourceBench.measure
 
-    def counting(self: _Bench, *arguments) -> list[Measurement]:
+    def counting(self: SourceBench, *arguments) -> list[Measurement]:
         found = measure(self, *arguments)
         measured.extend(found)
         return found
 
-    monkeypatch.setattr(runner._Bench, "measure", counting)
+    monkeypatch.setattr(runner.SourceBench, "measure", counting)
     return measured
 
 
@@ -98,19 +98,19 @@ def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdi
 def test_a_stopped_benchmark_goes_on_where_it_was(
     tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measure = _Bench.measure
+    measure = SourceBench.measure
 
-    def stop_at_five(self: _Bench, *arguments) -> list[Measurement]:
+    def stop_at_five(self: SourceBench, *arguments) -> list[Measurement]:
         if len(count_runs) == 5:
             raise KeyboardInterrupt
         return measure(self, *arguments)
 
-    monkeypatch.setattr(runner._Bench, "measure", stop_at_five)
+    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_five)
     with pytest.raises(KeyboardInterrupt):
         tiny_benchmark().run(QUIET)
     kept = tiny_benchmark().measurements()
     assert [entry.run for entry in kept] == [entry.run for entry in count_runs] and len(kept) == 5
-    monkeypatch.setattr(runner._Bench, "measure", measure)
+    monkeypatch.setattr(runner.SourceBench, "measure", measure)
     resumed = tiny_benchmark()
     resumed.run(QUIET)
     assert len(count_runs) == RUNS and resumed.measurements()[:5] == kept
@@ -119,16 +119,16 @@ def test_a_stopped_benchmark_goes_on_where_it_was(
 def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
     tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    log, measure = tmp_path / "log.txt", _Bench.measure
+    log, measure = tmp_path / "log.txt", SourceBench.measure
     seen: list[str] = []
 
-    def stop_at_three(self: _Bench, *arguments) -> list[Measurement]:
+    def stop_at_three(self: SourceBench, *arguments) -> list[Measurement]:
         seen.append(log.read_text())
         if len(seen) == 3:
             raise KeyboardInterrupt
         return measure(self, *arguments)
 
-    monkeypatch.setattr(runner._Bench, "measure", stop_at_three)
+    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_three)
     with log.open("w") as file, pytest.raises(KeyboardInterrupt):
         tiny_benchmark().run(Console(file=file))
     assert [text.count("\n") for text in seen] == [0, 1, 2]
@@ -139,14 +139,14 @@ def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
 def test_a_terminal_gets_a_bar_and_no_lines(
     tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measure = _Bench.measure
+    measure = SourceBench.measure
 
-    def stop_at_two(self: _Bench, *arguments) -> list[Measurement]:
+    def stop_at_two(self: SourceBench, *arguments) -> list[Measurement]:
         if len(count_runs) == 2:
             raise KeyboardInterrupt
         return measure(self, *arguments)
 
-    monkeypatch.setattr(runner._Bench, "measure", stop_at_two)
+    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_two)
     screen = io.StringIO()
     with pytest.raises(KeyboardInterrupt):
         tiny_benchmark().run(Console(file=screen, force_terminal=True, width=120))
@@ -204,7 +204,7 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
 
 def _one(benchmark: Benchmark) -> Measurement:
     run = next(iter(benchmark.runs))
-    bench = _Bench(benchmark.sources[run.source], runner.Bar(console=QUIET))
+    bench = SourceBench(benchmark.sources[run.source], runner.Bar(console=QUIET))
     return bench.measure([run], benchmark.scope, benchmark.extractor)[0]
 
 
