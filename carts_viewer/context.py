@@ -162,6 +162,9 @@ class Context:
         state = self.state
         if state.scores is not None:
             return
+        if state.streaming:
+            self.change(scores=self.renderer.scores(state.pose.scene, state.frame, state.camera))
+            return
         frame = with_imported(state.frame, self.session.scene, self._editor.view)
         scores = self.renderer.scores(state.pose.scene, frame, state.camera, state.mask_correction)
         self.change(scores=scores)

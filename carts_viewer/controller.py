@@ -18,6 +18,7 @@ from carts_viewer.handlers.browsing import BrowsingHandler
 from carts_viewer.handlers.exporting import Deliver, shown_mask
 from carts_viewer.handlers.finding import FindingHandler
 from carts_viewer.handlers.importing import ImportingHandler
+from carts_viewer.handlers.live import LiveHandler
 from carts_viewer.handlers.marking import MarkingHandler
 from carts_viewer.handlers.optimizing import OptimizingHandler
 from carts_viewer.handlers.painting import PaintingHandler
@@ -69,6 +70,7 @@ class Controller:
         self._incident: str | None = None
         self._optimizing = run = OptimizingHandler(context, optimizers)
         self._browsing = BrowsingHandler(context, run)
+        self._live = LiveHandler(context, run, optimizers, self._browsing.show)
         self._annotating = AnnotatingHandler(context, run, self._browsing.show)
         self._handlers: dict[type[intents.Intent], Callable[[Any], None]] = {
             intents.Browsing: self._browsing.handle,
@@ -79,6 +81,7 @@ class Controller:
             intents.ExportMask: lambda intent: deliver(intent.client_id, *shown_mask(context)),
             intents.Painting: PaintingHandler(context, run).handle,
             intents.ImportMasks: ImportingHandler(context, run).handle,
+            intents.Live: self._live.handle,
             intents.Finding: FindingHandler(context, run, self._browsing.show).handle,
             intents.Refresh: lambda _: context.change(),
             # Nothing to do: it has woken the worker, which now may send the next overlay.
@@ -99,6 +102,8 @@ class Controller:
         Raises:
             CartsError: with a text for people; the state is still a valid one.
         """
+        if self._live.takes(intent):
+            return
         if self._background.takes(intent):
             self._hand_on(intent)
             return
@@ -128,7 +133,7 @@ class Controller:
         if others != state.others:
             self._context.change(others=others)
         person.index = state.index
-        if self._editor.view is not state.project:
+        if self._editor.view is not state.project and not self._live.active:
             self._context.refresh()
 
     def _name(self, name: str) -> None:
@@ -138,7 +143,7 @@ class Controller:
 
     def wait_time(self) -> float | None:
         """How long nothing needs to be done unless somebody asks [s]; None for ever."""
-        handlers = (self._optimizing, self._browsing)
+        handlers = (self._optimizing, self._browsing, self._live)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
@@ -156,6 +161,7 @@ class Controller:
         """Do one bit of what is going on: an iteration, the next frame of playing."""
         self._optimizing.advance()
         self._browsing.advance()
+        self._live.advance()
         if self._editor.overdue_in() == 0.0:
             self._context.save()
         self._watch()
@@ -190,6 +196,7 @@ class Controller:
         Raises:
             CartsError: it could not be saved.
         """
+        self._live.stop("Stopped.")
         self._context.save()
 
     def say(self, text: str | None) -> None:
@@ -202,7 +209,8 @@ class Controller:
 
     def map(self) -> None:
         """Compute what the chosen layer shows beyond the pose; errors as `handle`."""
-        self._optimizing.map()
+        if not self._live.active:
+            self._optimizing.map()
 
     def _released(self) -> None:
         self._annotating.released()

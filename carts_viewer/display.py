@@ -75,12 +75,12 @@ class PageDisplay:
         return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
 
     def _overlay(self, state: ViewState, camera: str) -> Rgba:
-        correction = state.project.get(Key.mask_correction(state.index, camera))
-        truth = state.layer is Layer.TRUTH
+        correction = state.mask_correction_of(camera)
+        truth = state.layer is Layer.TRUTH and not state.streaming
         frame = with_imported(state.frame, self._scene, state.project) if truth else state.frame
 
         def at(scene: SceneState, maps: Maps | None) -> Rgba:
-            if state.layer is Layer.IMPORTED:
+            if state.layer is Layer.IMPORTED and not state.streaming:
                 return self._imported(state, camera)
             return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
 
@@ -88,7 +88,7 @@ class PageDisplay:
         if share > 0.0:
             other = other_pose(state.compare, self._session.measured(state.frame), state.run.start)
             overlay = composed(overlay, at(other, None), share)
-        _draw_paint(overlay, state, correction, state.project.get(Key.ignore_region(state.index, camera)))
+        _draw_paint(overlay, state, correction, state.ignore_region_of(camera))
         return overlay
 
     def _imported(self, state: ViewState, camera: str) -> Rgba:

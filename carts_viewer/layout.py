@@ -15,6 +15,7 @@ from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel
 from carts_viewer.panels.keyframes import KeyframesPanel
 from carts_viewer.panels.keypoints import KeypointsPanel
+from carts_viewer.panels.live import LivePanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
 from carts_viewer.panels.overlay import OverlayPanel, offered_layers
@@ -98,6 +99,8 @@ class Layout:
             panels.append(ValuesPanel(gui, session))
         with right.add_tab("Jobs"):
             panels.append(JobsPanel(page, emit))
+        with right.add_tab("Live"):
+            panels.append(LivePanel(page, emit))
         with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, storage, emit))
         with right.add_tab("Help"):

@@ -142,6 +142,23 @@ class ExportState:
 
 
 @dataclass(frozen=True)
+class LiveState:
+    """A live stream that is shown in the place of the recording, or how the last one went."""
+
+    source: str
+    """For people."""
+    text: str = ""
+    """How it goes, for people."""
+    on: bool = True
+    busy: bool = False
+    """Whether no frame has come yet."""
+    verdict: str = "lost"
+    """Of the shown frame: good, doubtful or lost."""
+    age: float = 0.0
+    """Of the shown result when it was there [s]."""
+
+
+@dataclass(frozen=True)
 class KeypointState:
     """Keypoints, and where a person has found some of them in the shown frame."""
 
@@ -216,6 +233,7 @@ class ViewState:
     busy: str | None = None
     """What the worker is preparing, for people."""
     export: ExportState | None = None
+    live: LiveState | None = None
     error: str | None = None
     imported: str = ""
     """What masks of others were imported last, for people."""
@@ -228,7 +246,12 @@ class ViewState:
     @property
     def verdict(self) -> FitVerdict | None:
         """What the image says of the shown pose; None where it was not asked."""
-        return self.project.verdict(self.index)
+        return None if self.streaming else self.project.verdict(self.index)
+
+    @property
+    def streaming(self) -> bool:
+        """Whether frame and pose are those of a live stream, which the project knows nothing of."""
+        return self.live is not None and self.live.on
 
     @property
     def undoable(self) -> int:
@@ -248,9 +271,17 @@ class ViewState:
     @property
     def mask_correction(self) -> MaskCorrection | None:
         """What was painted on the mask of the shown frame and camera."""
-        return self.project.get(Key.mask_correction(self.index, self.camera))
+        return self.mask_correction_of(self.camera)
 
     @property
     def ignore_region(self) -> IgnoreRegion | None:
         """The pixels of the shown frame and camera that the optimizer leaves out."""
-        return self.project.get(Key.ignore_region(self.index, self.camera))
+        return self.ignore_region_of(self.camera)
+
+    def mask_correction_of(self, camera: str) -> MaskCorrection | None:
+        """What was painted on the mask of the shown frame in a camera."""
+        return None if self.streaming else self.project.get(Key.mask_correction(self.index, camera))
+
+    def ignore_region_of(self, camera: str) -> IgnoreRegion | None:
+        """The pixels of the shown frame that the optimizer leaves out in a camera."""
+        return None if self.streaming else self.project.get(Key.ignore_region(self.index, camera))

@@ -146,6 +146,8 @@ class Tabs:
 
     def _go(self, tab: Tab, hello: Hello) -> None:
         """Go where the page wants to be, as far as there is such a place."""
+        if tab.controller.state.streaming:
+            return
         sequence = self._sequence
         wishes: list[intents.Intent] = []
         if hello.domain in sequence.domains:

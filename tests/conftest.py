@@ -1,6 +1,7 @@
 """What several tests need: reference data where it is present, and small sequences made on the spot."""
 
 import csv
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -20,6 +21,10 @@ from carts_core.resources import sample_sequence, shipped_robot
 pytest_plugins = ["small_network"]
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# A shell that runs the tests in the background or under nohup has them ignore these, and so do the commands they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,14 +10,12 @@ import tyro
 
 from ..console import Terminal
 from ..errors import SettingsError
+from ..settings.streams import StreamAddress
 from .selection import Network, Selection, SequencePath, check_writable
 from .solver_options import FreeInFrames
 
 if TYPE_CHECKING:
-    from ..live import Source, Tracked
-    from ..recording import Sequence
-
-_SOURCES = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
+    from ..live import Tracked
 
 
 @dataclass(frozen=True)
@@ -52,15 +50,7 @@ class Live:
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def __post_init__(self) -> None:
-        kind, _, rest = self.source.partition(":")
-        needs = {"replay": not rest, "camera": rest.isdecimal(), "video": bool(rest), "folder": bool(rest)}
-        needs["socket"] = rest.isdecimal() and int(rest) < 2**16
-        if not needs.get(kind, False):
-            raise SettingsError(f"--source {self.source!r} is not known. Give {_SOURCES}.")
-        if kind in ("camera", "video") and self.joints_port is None:
-            raise SettingsError(
-                f"--source {self.source} has no joints. Say with --joints-port on which port they come."
-            )
+        StreamAddress.parse(self.source, self.joints_port)
         if self.rate is not None and not 0 < self.rate <= 1000:
             raise SettingsError(f"--rate is {self.rate:g}; allowed is above 0, at most 1000.")
         if self.loops < 1:
@@ -70,7 +60,7 @@ class Live:
 
     def run(self) -> None:
         """Follow until the stream ends or somebody ends it."""
-        from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow
+        from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
         from ..networks.extractor import FeatureExtractor
         from ..optimization import Backgrounds
         from ..project import Provenance
@@ -83,11 +73,15 @@ class Live:
         extractor = FeatureExtractor.load(
             *self.network.weights, device=self.network.device, inference=self.network.inference
         )
+        address = StreamAddress.parse(self.source, self.joints_port)
         known = Backgrounds.of(sequence, cameras, domain) if self.source == "replay" else None
         tracker = LiveTracker(sequence.scene, extractor, free=self.free, backgrounds=known, cameras=cameras)
         results = Results(sequence.scene.with_cameras(cameras), masks=self.masks)
         with ExitStack() as held:
-            source, clients = self._source(sequence, cameras, domain, held, console)
+            stream = open_stream(address, sequence, cameras, domain, rate=self.rate, loops=self.loops)
+            held.callback(stream.close)
+            if stream.server is not None:
+                console.print(f"listening on 127.0.0.1:{stream.server.port}")
             lines = self._lines(held)
             recorder = None
             if self.record is not None:
@@ -96,7 +90,7 @@ class Live:
 
             def show(tracked: "Tracked") -> None:
                 message = results.message(tracked)
-                for send in (*lines, *clients):
+                for send in (*lines, *stream.clients):
                     send(message)
 
             sinks = [show, *([recorder] if recorder is not None else [])]
@@ -104,35 +98,11 @@ class Live:
             try:
                 # A stream may have no end but this.
                 with suppress(KeyboardInterrupt):
-                    follow(source, tracker, sinks, statistics)
+                    follow(stream.source, tracker, sinks, statistics)
             finally:
                 console.print(str(statistics))
                 if recorder is not None and (path := recorder.close()) is not None:
                     console.print(f"wrote {path}. Look at it: carts view {path}")
-
-    def _source(
-        self, sequence: "Sequence", cameras: tuple[str, ...], domain: str, held: ExitStack, console: Terminal
-    ) -> "tuple[Source, list[Callable]]":
-        """Where frames come from, and further places where results go."""
-        from ..live import Assembler, Camera, Folder, Replay, StreamServer
-
-        kind, _, rest = self.source.partition(":")
-        assembler = Assembler(sequence, cameras)
-        clients = []
-        port = int(rest) if kind == "socket" else self.joints_port
-        if port is not None and kind != "replay":
-            server = StreamServer(assembler, port)
-            held.callback(server.close)
-            console.print(f"listening on 127.0.0.1:{server.port}")
-            clients.append(server.send)
-            if kind == "socket":
-                return server, clients
-        match kind:
-            case "replay":
-                return Replay(sequence, cameras, domain, rate=self.rate, loops=self.loops), clients
-            case "folder":
-                return Folder(assembler, cameras, Path(rest)), clients
-        return Camera(assembler, cameras[0], int(rest) if kind == "camera" else rest), clients
 
     def _lines(self, held: ExitStack) -> "list[Callable]":
         """Where results go as lines of JSON."""

@@ -12,6 +12,8 @@ from .messages import packed as packed
 from .moments import Assembler as Assembler
 from .moments import Moment as Moment
 from .moments import Source as Source
+from .opening import OpenStream as OpenStream
+from .opening import open_stream as open_stream
 from .recorder import Recorder as Recorder
 from .server import StreamServer as StreamServer
 from .sources import Camera as Camera

@@ -62,7 +62,7 @@ class LiveStatistics:
         if not self.ages:
             return text + verdicts
         middle, late = (1000.0 * float(np.percentile(self.ages, share)) for share in (50, 95))
-        return f"{text}. Age of results: median {middle:.0f} ms, 95 % within {late:.0f} ms"
+        return f"{text}{verdicts}. Age of results: median {middle:.0f} ms, 95 % within {late:.0f} ms"
 
 
 def follow(
@@ -86,6 +86,7 @@ def follow(
             estimate = tracker.track(moment.frame, moment.camera_poses)
             tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
             statistics.add(tracked)
+            statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
             for sink in sinks:
                 sink(tracked)
     finally:

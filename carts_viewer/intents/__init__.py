@@ -56,6 +56,9 @@ from .jobs import ForgetJobs as ForgetJobs
 from .jobs import Jobs as Jobs
 from .jobs import OptimizeFrames as OptimizeFrames
 from .jobs import RepeatJob as RepeatJob
+from .live import Live as Live
+from .live import StartLive as StartLive
+from .live import StopLive as StopLive
 from .optimizing import Assess as Assess
 from .optimizing import Optimizing as Optimizing
 from .optimizing import Pause as Pause

@@ -84,8 +84,9 @@ class BrowsePanel:
 
     def _describe(self, state: ViewState) -> str:
         """The frame in words: its name, where its joints come from, and how well they fit the truth."""
+        shown = f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})"
         parts = [
-            f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})",
+            f"Live frame <b>{escaped(state.frame.frame_id)}</b>" if state.streaming else shown,
             _SOURCES[state.pose.source],
         ]
         if state.frame.timestamp is not None:

@@ -5,6 +5,7 @@ import viser
 from carts_core.project import FitVerdict
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
+from carts_viewer.panels.live import live_text
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -30,6 +31,10 @@ class FitPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the verdict up to date."""
+        if state.live is not None and state.live.on:
+            self._check.visible = False
+            self._text.content = live_text(state.live)
+            return
         running = state.run.phase is Phase.RUNNING or state.solving
         self._check.disabled = running
         self._check.visible = state.verdict is None

@@ -1,0 +1,100 @@
+"""A live stream in the page: followed, not edited, recorded, and the recording comes back afterwards."""
+
+import shutil
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+from viewer_canvas import eventually
+from viewer_tab import Tab
+
+from carts_core.live import FrameMessage, ImageMessage, packed
+from carts_core.recording import Sequence
+from carts_core.resources import sample_sequence
+from carts_viewer import intents
+from carts_viewer.app import ViewerApp
+
+SECONDS = 120.0
+"""For the networks to be there, on a busy machine."""
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> Iterator[ViewerApp]:
+    folder = tmp_path / "recording"
+    shutil.copytree(sample_sequence().parent, folder)
+    with ViewerApp.open(folder / "sequence.toml", port=0) as app:
+        app.wait_until_shown(SECONDS)
+        yield app
+
+
+@pytest.mark.browser
+def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open_tab: Callable[..., Tab]) -> None:
+    tab = open_tab(app)
+    tab.page.get_by_role("tab", name="Live").click()
+    tab.page.get_by_label("Record").check()
+    tab.page.get_by_label("Repeat").check()
+    tab.button("Start")
+    expect(tab.page.get_by_text("Live: good")).to_be_visible(timeout=1000 * SECONDS)
+    assert tab.state.streaming
+    joints = tab.state.pose.scene.joint_positions
+    tab.place_in_viewer.put(intents.Perturb(3.0, seed=0))
+    expect(tab.page.get_by_text("A live stream is shown, which cannot be edited").first).to_be_visible()
+    eventually(lambda: tab.state.pose.scene.joint_positions, lambda now: now is not joints)
+    assert not tab.state.project.position
+    dice = eventually(lambda: tab.state.scores and tab.state.scores.dice, bool)
+    assert dice is not None and dice > 0.9
+    tab.page.screenshot(path="/tmp/live_on.png")
+    tab.button("Stop")
+    expect(tab.page.get_by_text("Recorded: carts view")).to_be_visible(timeout=30_000)
+    tab.page.screenshot(path="/tmp/live_off.png")
+    assert not tab.state.streaming and tab.state.frame.frame_id == app.tabs.first.controller.state.frame.frame_id
+    (recorded,) = app.project.path.parent.glob("*_live_*/sequence.toml")
+    assert len(Sequence.open(recorded)) > 2
+
+
+def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
+    sequence = Sequence.open(app.project.path.with_name("sequence.toml"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        free = taken.getsockname()[1]
+    app.queue.put(intents.StartLive(f"socket:{free}"))
+    eventually(lambda: app.state.live, lambda live: live is not None and live.on, SECONDS)
+    frame = sequence.frame(0)
+    images = {name: _png(image) for name, image in frame.images.items()}
+    joints = {
+        arm.name: dict(zip(arm.robot.joint_names, map(float, frame.measured[arm.name]), strict=True))
+        for arm in sequence.scene.arms
+    }
+    with socket.create_connection(("127.0.0.1", free)) as connection:
+        for number in range(3):
+            connection.sendall(packed(FrameMessage(float(number), joints=joints, images=images, id=f"sent {number}")))
+            time.sleep(0.2)
+        live = eventually(lambda: app.state.live, lambda live: live is not None and not live.busy, SECONDS)
+        assert live is not None and app.state.frame.frame_id.startswith("sent") and app.state.verdict is None
+        assert len(connection.recv(4)) == 4  # the result of a frame, for who sent it
+    app.queue.put(intents.StopLive())
+    eventually(lambda: app.state.streaming, lambda on: not on)
+    assert app.state.frame.frame_id == sequence.frame_ids[0]
+
+
+def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app: ViewerApp) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        for source, words in (
+            (f"socket:{taken.getsockname()[1]}", "cannot be used"),
+            ("folder:/etc", "carts live"),
+            ("camera:0", "--joints-port"),
+            ("carrier pigeon", "is not known"),
+        ):
+            app.queue.put(intents.StartLive(source))
+            eventually(lambda: app.state.error or "", lambda error, words=words: words in error, SECONDS)
+            assert not app.state.streaming
+            app.queue.put(intents.DismissError())
+            eventually(lambda: app.state.error, lambda error: error is None)
+
+
+def _png(image: np.ndarray) -> ImageMessage:
+    return ImageMessage(cv2.imencode(".png", image[..., ::-1])[1].tobytes(), "png")
