@@ -15,6 +15,7 @@ from carts_viewer.checks import unknown
 from carts_viewer.context import Context
 from carts_viewer.handlers.annotating import AnnotatingHandler
 from carts_viewer.handlers.browsing import BrowsingHandler
+from carts_viewer.handlers.dragging import DraggingHandler
 from carts_viewer.handlers.exporting import Deliver, shown_mask
 from carts_viewer.handlers.finding import FindingHandler
 from carts_viewer.handlers.importing import ImportingHandler
@@ -74,6 +75,7 @@ class Controller:
         self._annotating = AnnotatingHandler(context, run, self._browsing.show)
         self._handlers: dict[type[intents.Intent], Callable[[Any], None]] = {
             intents.Browsing: self._browsing.handle,
+            intents.DragLink: DraggingHandler(context, run).handle,
             intents.Posing: PosingHandler(context, run).handle,
             intents.Optimizing: self._optimizing.handle,
             intents.Annotation: self._annotating.handle,

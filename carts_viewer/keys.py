@@ -110,6 +110,8 @@ def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]
     for shortcut in shortcuts(layers):
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
+    groups["Optimize"].append(("Ctrl+drag", "Drag a link of an arm; its joints follow"))
+    groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold it, or press it to keep it"))
     groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
     groups["View"].append(("?", "This sheet"))
     groups["View"].append(("Ctrl+K", "Find anything by name"))
@@ -120,6 +122,8 @@ def key_table(layers: Iterable[Layer]) -> str:
     """The shortcuts as a Markdown table."""
     rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
     rows += [
+        "| **Ctrl+drag** | Drag a link of an arm; its joints follow |",
+        "| **,** | Loupe: pixels, coordinates, colour; hold it, or press it to keep it |",
         "| **.** (held) | The measured pose, or the one compared with |",
         "| **?** | All keys on one sheet |",
     ]

@@ -38,6 +38,7 @@ class Listening:
         page.on_drawn(self._drawn)
         page.on_released(lambda client_id: self._put(client_id, intents.Released()))
         page.on_pointed(self._pointed)
+        page.on_dragged(self._dragged)
         page.on_activated(self._activated)
         page.on_painted(self._painted)
         page.on_pressed(self._pressed)
@@ -77,6 +78,14 @@ class Listening:
         camera = self._camera(index)
         if camera is not None:
             self._put(client_id, intents.PointAt(u * camera.width, v * camera.height, camera.name))
+
+    def _dragged(self, client_id: int, gesture: float, *places: float) -> None:
+        *shares, index = places
+        camera = self._camera(index)
+        if camera is not None:
+            size = camera.width, camera.height
+            start, end = ((u * size[0], v * size[1]) for u, v in (shares[:2], shares[2:]))
+            self._put(client_id, intents.DragLink(gesture, camera.name, start, end))
 
     def _activated(self, client_id: int, index: float) -> None:
         camera = self._camera(index)

@@ -5,10 +5,11 @@ import torch
 from jaxtyping import Bool
 
 from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.model.keypoints import Keypoint
 from carts_core.model.scene import SceneState
 from carts_core.project import MaskCorrection
 from carts_core.recording import Frame, Sequence
-from carts_core.rendering import Renderer
+from carts_core.rendering import Renderer, pick_point
 from carts_viewer import layers
 from carts_viewer.layers import Layer
 from carts_viewer.state import Maps, Scores
@@ -75,6 +76,10 @@ class OverlayRenderer:
             values = maps.iterate.attention if layer is Layer.ATTENTION else maps.iterate.similarity
             return layers.heat(values[maps.cameras.index(camera)], 0.0, 1.0, size, opacity)
         return layers.nothing(*size)
+
+    def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
+        """The point of the arm that is seen at a pixel, or the nearest within `radius` [px]; None without one."""
+        return pick_point(self._scene, self._renderer(camera), state.to(self._device), pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
         """How close the pose and its corrected mask are to the frame's truth, as far as there is one."""

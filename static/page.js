@@ -248,11 +248,12 @@
         <button data-do="in" title="Zoom in (wheel over the picture)" aria-label="Zoom in">+</button>
         <button data-do="fit" title="Show the whole picture (double click)">Fit</button>
       </span>
+      <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe">⌕</button>
       <button data-do="theme" title="Light or dark" aria-label="Light or dark">◐</button>
       <button data-do="help" title="Keys (?)" aria-label="Keys">?</button>`;
     const actions = {
       endoscope: showEndoscope, scene: showScene, fit: showEndoscope,
-      theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
+      loupe: () => window.carts.toggleLoupe(), theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
@@ -325,6 +326,7 @@
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
       if (!inPicture(event) || (painting(event) && event.button === 0)) return;
+      if (event.button === 0 && (event.ctrlKey || event.metaKey)) return; // drag.js takes hold of a link
       const at = imageAt(event);
       pointing = event.shiftKey && event.button === 0 ? (at?.[0] ?? shown.active) : null;
       pressed = pointing === null && event.button === 0 && at ? [at[0], event.clientX, event.clientY] : null;

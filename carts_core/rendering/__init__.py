@@ -3,6 +3,7 @@
 from .jacobian import JacobianBlock as JacobianBlock
 from .jacobian import Tangents as Tangents
 from .outline import Outline as Outline
+from .picking import pick_point as pick_point
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
 from .surface import SurfaceRendering as SurfaceRendering
@@ -16,6 +17,7 @@ __all__ = [
     "Rendering",
     "SurfaceRendering",
     "Tangents",
+    "pick_point",
     "visibility",
     "visibility_torch",
 ]

@@ -81,6 +81,7 @@ from .painting import SetTool as SetTool
 from .painting import ToggleTool as ToggleTool
 from .posing import BackToMeasured as BackToMeasured
 from .posing import ChooseJoint as ChooseJoint
+from .posing import DragLink as DragLink
 from .posing import Nudge as Nudge
 from .posing import Perturb as Perturb
 from .posing import Posing as Posing

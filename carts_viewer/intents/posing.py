@@ -49,6 +49,24 @@ class Nudge(Posing):
 
 
 @dataclass(frozen=True)
+class DragLink(Posing):
+    """Drag the link that was under the pointer when the gesture began."""
+
+    gesture: float
+    """The same as long as the pointer is down."""
+    camera: str
+    start: tuple[float, float]
+    """Where the pointer took hold of the link [px]."""
+    end: tuple[float, float]
+    """Where the pointer is now [px]."""
+
+    @property
+    def key(self) -> Hashable:
+        """Of one gesture only the newest place matters."""
+        return (DragLink, self.gesture)
+
+
+@dataclass(frozen=True)
 class ChooseJoint(Posing):
     """Choose the joint that `Nudge` moves; None for the next one."""
 

@@ -41,6 +41,7 @@ _FIELDS = {
     "painted": "strokes over the picture",
     "pressed": "keys that viser's shortcuts do not know",
     "pointed": "where somebody points in the picture",
+    "dragged": "where a link of an arm was taken and is dragged to",
     "activated": "which camera's image somebody has chosen",
     "asked": "what is asked for in words",
     "chosen": "what somebody has chosen in a document over the page",
@@ -157,6 +158,13 @@ class Page:
         """
         on_numbers(self._fields["pointed"], 3, callback)
 
+    def on_dragged(self, callback: Callable[..., None]) -> None:
+        """Call `callback(client_id, gesture, u, v, to_u, to_v, camera)` on the event loop when a link is dragged.
+
+        A gesture keeps its number while the pointer is down; places and camera are as in `on_pointed`.
+        """
+        on_numbers(self._fields["dragged"], 6, callback)
+
     def on_activated(self, callback: Callable[[int, float], None]) -> None:
         """Call `callback(client_id, camera)` on the event loop when somebody chooses a camera's image; any number."""
         on_numbers(self._fields["activated"], 1, callback)
@@ -243,6 +251,8 @@ class Page:
                 '<script src="/static/page.js" defer></script>'
                 '<script src="/static/paint.js" defer></script>'
                 '<script src="/static/marks.js" defer></script>'
+                '<script src="/static/loupe.js" defer></script>'
+                '<script src="/static/drag.js" defer></script>'
                 '<script src="/static/timeline.js" defer></script>'
                 '<script src="/static/shell.js" defer></script>'
                 '<link rel="stylesheet" href="/static/document.css" />'

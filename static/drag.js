@@ -1,0 +1,52 @@
+// Ctrl (or Cmd) and the pointer drag a link of an arm: every message says where the link was taken and where the pointer
+// is now, so that one that is overtaken is no loss. Needs page.js.
+(() => {
+  "use strict";
+
+  const PAUSE = 33; // between two messages [ms]
+  const HELD_BACK = 150; // as in page.js: the word that the link was let go of comes after all that moves it [ms]
+  const isPicture = (event) => window.carts?.view.endoscope && event.target === window.__viserMutable?.canvas;
+  let held = null;
+
+  function send() {
+    if (!held) return;
+    held.waiting = false;
+    window.carts.report("dragged", [held.gesture, ...held.from, ...held.to, held.camera].join(" "));
+  }
+
+  function cursor(name) {
+    const canvas = window.__viserMutable?.canvas;
+    if (canvas) canvas.style.cursor = name;
+  }
+
+  window.addEventListener("pointerdown", (event) => {
+    if (event.button !== 0 || !(event.ctrlKey || event.metaKey) || !isPicture(event)) return;
+    const at = window.carts.imageAt(event);
+    if (!at) return;
+    held = { gesture: Date.now(), camera: at[0], from: [at[1], at[2]], to: [at[1], at[2]], waiting: false };
+    cursor("grabbing");
+    send();
+  }, { capture: true });
+  window.addEventListener("pointermove", (event) => {
+    const at = held && window.carts.imageAt(event, held.camera);
+    if (!at) return;
+    held.to = [at[1], at[2]];
+    if (!held.waiting) {
+      held.waiting = true;
+      setTimeout(send, PAUSE);
+    }
+  }, { capture: true });
+  window.addEventListener("pointerup", () => {
+    if (!held) return;
+    send();
+    held = null;
+    cursor("");
+    setTimeout(() => window.carts.report("released"), HELD_BACK);
+  }, { capture: true });
+  for (const kind of ["keydown", "keyup"]) {
+    window.addEventListener(kind, (event) => {
+      if (!held && ["Control", "Meta"].includes(event.key)) cursor(kind === "keydown" ? "grab" : "");
+    }, { capture: true });
+  }
+  window.addEventListener("blur", () => { if (!held) cursor(""); });
+})();

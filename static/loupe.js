@@ -1,0 +1,115 @@
+// The loupe: pixels around the pointer, large, with coordinates and colour. It reads the picture that the page has, so
+// nothing is asked of the server. Needs page.js.
+(() => {
+  "use strict";
+
+  const SIDE = 15; // pixels across, an odd number: the one in the middle is under the pointer
+  const SCALE = 10; // of a pixel [CSS px]
+  const AWAY = 26; // from the pointer [CSS px]
+  const HELD = 350; // a key that is down for longer is held: the loupe goes when it is let go of [ms]
+  const sources = new Map(); // name of a node -> { uuid, context } of what it shows
+  let box = null;
+  let pinned = false; // stays until the key or the button is pressed again
+  let pressedAt = null;
+  let pointer = null;
+
+  const isOn = () => pinned || pressedAt !== null;
+
+  function textureOf(name) {
+    let texture = null;
+    window.__viserMutable?.nodeRefFromName[name]?.traverse((child) => { texture ??= child.material?.map ?? null; });
+    return texture?.image?.width ? texture : null;
+  }
+
+  /** A drawing context that holds the pixels of a node's picture; null where there is none. */
+  function pixelsOf(name) {
+    const texture = textureOf(name);
+    if (!texture) return null;
+    const known = sources.get(name);
+    if (known?.uuid === texture.uuid) return known.context;
+    const { width, height } = texture.image;
+    const context = Object.assign(document.createElement("canvas"), { width, height })
+      .getContext("2d", { willReadFrequently: true });
+    context.drawImage(texture.image, 0, 0);
+    sources.set(name, { uuid: texture.uuid, context });
+    return context;
+  }
+
+  function build() {
+    box = document.createElement("div");
+    box.className = "carts-loupe";
+    box.innerHTML = `<canvas width="${SIDE * SCALE}" height="${SIDE * SCALE}"></canvas><div></div><div></div>`;
+    document.body.append(box);
+  }
+
+  function magnify(context, sources_, column, row) {
+    context.imageSmoothingEnabled = false;
+    context.fillStyle = "#202426";
+    context.fillRect(0, 0, SIDE * SCALE, SIDE * SCALE);
+    const [left, top] = [column - (SIDE - 1) / 2, row - (SIDE - 1) / 2];
+    for (const source of sources_) {
+      if (source) context.drawImage(source.canvas, left, top, SIDE, SIDE, 0, 0, SIDE * SCALE, SIDE * SCALE);
+    }
+    const middle = ((SIDE - 1) / 2) * SCALE;
+    for (const [color, wider] of [["rgba(0, 0, 0, 0.8)", 1], ["#fff", 0]]) {
+      context.strokeStyle = color;
+      context.strokeRect(middle - wider - 0.5, middle - wider - 0.5, SCALE + 2 * wider + 1, SCALE + 2 * wider + 1);
+    }
+  }
+
+  /** Show what is under the pointer, or nothing outside of the pictures. */
+  function draw() {
+    const at = isOn() && pointer && window.carts.view.endoscope ? window.carts.imageAt(pointer) : null;
+    if (!box && !at) return;
+    if (!box) build();
+    const shown = window.carts.shown();
+    const root = at && at[0] !== shown.active ? `/others/${at[0]}` : "";
+    const picture = at && pixelsOf(`${root}/frame`);
+    box.hidden = !picture;
+    if (!picture) return;
+    const { width, height } = picture.canvas;
+    const [u, v] = [at[1] * width, at[2] * height];
+    const [column, row] = [Math.floor(u), Math.floor(v)];
+    const [red, green, blue] = picture.getImageData(column, row, 1, 1).data;
+    magnify(box.firstChild.getContext("2d"), [picture, pixelsOf(`${root}/overlay`)], column, row);
+    const [place, color] = box.querySelectorAll("div");
+    place.textContent = `u ${u.toFixed(1)}  v ${v.toFixed(1)}`;
+    color.textContent = `RGB ${red} ${green} ${blue}`;
+    color.style.setProperty("--color", `rgb(${red}, ${green}, ${blue})`);
+    Object.assign(box.dataset, { u, v, camera: shown.names[at[0]], rgb: `${red} ${green} ${blue}` });
+    const [wide, high] = [box.offsetWidth, box.offsetHeight];
+    const x = pointer.clientX + AWAY + wide > innerWidth ? pointer.clientX - AWAY - wide : pointer.clientX + AWAY;
+    const y = pointer.clientY + AWAY + high > innerHeight ? pointer.clientY - AWAY - high : pointer.clientY + AWAY;
+    box.style.transform = `translate(${Math.round(x)}px, ${Math.round(y)}px)`;
+  }
+
+  function toggle(on = !pinned) {
+    pinned = on;
+    document.querySelector(".carts-bar [data-do=loupe]")?.setAttribute("aria-pressed", String(pinned));
+    draw();
+  }
+
+  window.addEventListener("pointermove", (event) => {
+    // Over a panel or a bar nothing of the picture is pointed at.
+    const over = event.target instanceof Element && event.target.matches("canvas");
+    pointer = over ? { clientX: event.clientX, clientY: event.clientY } : null;
+  }, { capture: true });
+  window.addEventListener("keydown", (event) => {
+    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
+    if (event.key !== "," || typing || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    if (!event.repeat) pressedAt = performance.now();
+  }, { capture: true });
+  window.addEventListener("keyup", (event) => {
+    if (event.key !== "," || pressedAt === null) return;
+    const held = performance.now() - pressedAt > HELD;
+    pressedAt = null;
+    toggle(held ? false : !pinned);
+  }, { capture: true });
+  window.addEventListener("blur", () => { pressedAt = null; });
+  Object.assign(window.carts, { toggleLoupe: () => toggle() });
+  (function everyFrame() {
+    requestAnimationFrame(everyFrame);
+    if (window.carts) draw();
+  })();
+})();
