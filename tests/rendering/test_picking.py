@@ -16,7 +16,7 @@ def test_the_point_under_a_pixel_is_of_the_visible_link_and_projects_onto_that_p
     links = renderer.segment_links(state)[0]
     rows, columns = np.nonzero(links >= 0)
     for index in np.linspace(0, len(rows) - 1, 25).astype(int):
-        pixel = columns[index] + 0.5, rows[index] + 0.5
+        pixel = float(columns[index]) + 0.5, float(rows[index]) + 0.5
         point = pick_point(scene, renderer, state, pixel)
         assert point is not None
         assert point.link == links[rows[index], columns[index]]

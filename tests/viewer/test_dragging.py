@@ -70,9 +70,7 @@ def test_joints_stay_within_their_limits_however_far_a_link_is_dragged(desk: Des
 def test_where_no_arm_is_that_is_said_once_and_nothing_moves(desk: Desk) -> None:
     ids = desk.renderer.arm_ids(desk.state.pose.scene, "left")
     corners = [(0, 0), (0, ids.shape[1] - 1), (ids.shape[0] - 1, 0), (ids.shape[0] - 1, ids.shape[1] - 1)]
-    row, column = next(
-        (r, c) for r, c in corners if (ids[max(r - 20, 0) : r + 20, max(c - 20, 0) : c + 20] < 0).all()
-    )
+    row, column = next((r, c) for r, c in corners if (ids[max(r - 20, 0) : r + 20, max(c - 20, 0) : c + 20] < 0).all())
     with pytest.raises(CartsError, match="no arm under the pointer"):
         desk.do(intents.DragLink(1.0, "left", (column + 0.5, row + 0.5), (column + 9.0, row + 9.0)))
     desk.do(intents.DragLink(1.0, "left", (column + 0.5, row + 0.5), (column + 30.0, row + 9.0)))

@@ -29,7 +29,7 @@ REPLACED = {
     "transport/gate.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
-SCRIPTS = ("page.js", "paint.js", "marks.js", "timeline.js", "shell.js", "document.js")
+SCRIPTS = ("page.js", "paint.js", "marks.js", "loupe.js", "drag.js", "timeline.js", "shell.js", "document.js")
 IN_THE_PAGE = {name: {"__viserMutable"} for name in SCRIPTS}
 """What our scripts use of viser's page that it does not document."""
 
