@@ -124,6 +124,7 @@ class ViewerApp:
                 weights=weights,
                 report=report,
                 page=page,
+                folders=folders,
             )
         except BaseException:
             storage.close()

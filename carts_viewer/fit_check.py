@@ -1,11 +1,11 @@
 """What the images of a frame say of a pose: in every camera alone, and of the frame."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from carts_core.optimization import Assessment, SolverSettings
 from carts_core.project import FitVerdict
 from carts_core.project.fit_verdict import VERDICTS
+from carts_viewer.observing import Target
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
@@ -47,19 +47,17 @@ class FitCheck:
         self._session = session
         self._optimizers = optimizers
 
-    def fit(
-        self, index: int, domain: str, pose: Pose, settings: SolverSettings, cameras: Sequence[str] | None = None
-    ) -> Fit:
-        """The fit of a pose in these cameras, by default all.
+    def fit(self, index: int, domain: str, pose: Pose, settings: SolverSettings, target: Target) -> Fit:
+        """The fit of a pose in all cameras that can be compared with the target.
 
         Raises:
-            CartsError: an image or the weights are not usable.
+            CartsError: an image, a mask or the weights are not usable.
         """
-        names = [camera.name for camera in self._session.scene.cameras] if cameras is None else list(cameras)
+        sequence, cameras = self._session.sequence, [camera.name for camera in self._session.scene.cameras]
         found: dict[str, tuple[Assessment, float]] = {}
-        for name in names:
-            ignore = self._session.ignored(index, [name])
-            found[name] = self._optimizers.assess(self._session.sequence, index, domain, [name], pose, settings, ignore)
+        for name in target.seen(sequence, index, domain, cameras) or cameras:
+            ignore = self._session.ignored(index, [name], target)
+            found[name] = self._optimizers.assess(sequence, index, domain, [name], pose, settings, target, ignore)
         # A camera that sees no arm says nothing, unless none sees any.
         seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
         loss = sum(loss for _, loss in seeing.values()) / len(seeing)

@@ -32,6 +32,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
     Every frame is a step of undo of its own, and is saved before the next one begins.
     """
     taken = worse = 0
+    cameras = [camera.name for camera in context.session.scene.cameras]
     for place, index in enumerate(frames):
         if place < first:
             continue
@@ -41,6 +42,10 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
             yield Progress(place + 1, len(frames), f"{name} is kept as it is", f"{name}: kept, not touched")
             continue
         yield Progress(place, len(frames), f"Frame {name}")
+        target = session.target(context.state.observed)
+        if not target.seen(session.sequence, index, context.state.domain, cameras):
+            yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not touched")
+            continue
         steps = comparison.own_run(index, context.state)
         while (outcome := next(steps)) is None:
             yield Progress(place, len(frames), f"Frame {name}")
@@ -71,11 +76,12 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Ite
     )
     yield Progress(0, 0, f"Reading {len(indices)} frames")
     frames = [sequence.frame(index, state.domain, cameras) for index in indices]
-    ignored = [session.ignored(index, cameras) for index in indices]
+    target = session.target(state.observed)
+    ignored = [session.ignored(index, cameras, target) for index in indices]
     before = session.editor.view
     scene = scene_at(session.scene, session.measured(state.frame))
     optimizer = CalibrationOptimizer(
-        scene, frames, optimizers.prepare(), free=replace(free, joints=False), ignore=ignored
+        scene, frames, optimizers.predictor(target), free=replace(free, joints=False), ignore=ignored
     )
     most = CALIBRATION_SETTINGS.iterations
     while (iterate := optimizer.step()) is not None:
@@ -87,7 +93,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Ite
         yield Progress(most, most, "Comparing", line)
     found = result.assessment
     verdict = "" if found is None else f"{found.verdict.value}: {found.reason} {found.remedy}"
-    provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free)
+    provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free, target)
     edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
     if not edits:
         yield Progress(most, most, f"Nothing was changed. {verdict}")

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene, SceneState
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import (
@@ -15,6 +16,8 @@ from carts_core.optimization import (
     Backgrounds,
     FrameOptimizer,
     FreeParameters,
+    MaskPredictor,
+    NetworkPredictor,
     SequenceOptimizer,
     SequenceSettings,
     SolverSettings,
@@ -27,6 +30,7 @@ from carts_core.settings import Direction, presets
 from carts_core.settings.inference import Inference
 from carts_core.settings.serialization import to_plain
 from carts_viewer.active_run import Optimizer
+from carts_viewer.observing import NETWORK, Target
 from carts_viewer.sequence_run import SequenceRun
 from carts_viewer.state import Pose
 
@@ -66,14 +70,36 @@ class OptimizerFactory:
             self._extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
         return self._extractor
 
-    def provenance(self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters) -> Provenance:
+    def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
+        """What says what images show; with masks alone no network is loaded.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        if target.observed.what == "network":
+            return self.prepare()
+        network = None if target.observed.what == "masks" else NetworkPredictor(self.prepare())
+        masks, name = (None, "mask") if target.given is None else (target.given.masks, target.given.origin)
+        return MaskPredictor(network, masks, self._device, name)
+
+    def provenance(
+        self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters, target: Target = NETWORK
+    ) -> Provenance:
         """What a project keeps about a run with these settings.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
-        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras)}
-        return Provenance.made_by_optimizer(used, self.prepare().sha256)
+        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **self._observed(target)}
+        return Provenance.made_by_optimizer(used, self._weights_hash(target))
+
+    def _weights_hash(self, target: Target) -> str | None:
+        return None if target.observed.what == "masks" else self.prepare().sha256
+
+    @staticmethod
+    def _observed(target: Target) -> dict[str, str]:
+        observed = target.observed
+        return {} if observed.what == "network" else {"observe": observed.what, "masks": observed.masks}
 
     def make(
         self,
@@ -84,16 +110,23 @@ class OptimizerFactory:
         pose: Pose,
         settings: SolverSettings,
         free: FreeParameters,
+        target: Target,
         ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> Optimizer:
-        """An optimizer that starts at the pose; `ignore` says which pixels of which camera show an occluder.
+        """An optimizer that starts at the pose and fits the target; `ignore` says which pixels of which camera show an
+        occluder.
 
         Raises:
-            CartsError: weights, an image or a setting is not usable.
+            CartsError: weights, an image, a mask or a setting is not usable.
         """
-        extractor = self.prepare()
+        predictor = self.predictor(target)
         self._report("Preparing the frame")
-        return self._frame_optimizer(sequence, index, domain, cameras, pose, settings, free, ignore, extractor)
+        if target.observed.what != "network" and not isinstance(settings, SurfaceSolver):
+            raise SettingsError(
+                "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "
+                "maps, or fit what the network sees."
+            )
+        return self._frame_optimizer(sequence, index, domain, cameras, pose, settings, free, ignore, predictor)
 
     def assess(
         self,
@@ -103,6 +136,7 @@ class OptimizerFactory:
         cameras: Sequence[str],
         pose: Pose,
         settings: SolverSettings,
+        target: Target,
         ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> tuple[Assessment, float]:
         """What the images say of a pose, and its loss; nothing moves. Arguments and errors as in `make`."""
@@ -116,7 +150,7 @@ class OptimizerFactory:
             replace(surface, stages=presets.NONE),
             FreeParameters(),
             ignore,
-            self.prepare(),
+            self.predictor(target),
         )
         for _ in optimizer:
             pass
@@ -133,7 +167,7 @@ class OptimizerFactory:
         settings: SolverSettings,
         free: FreeParameters,
         ignore: Mapping[str, Bool[np.ndarray, "height width"]],
-        extractor: FeatureExtractor,
+        predictor: FeatureExtractor | MaskPredictor,
     ) -> FrameOptimizer:
         frame = sequence.frame(index, domain, list(cameras))
         backgrounds = Backgrounds.of(sequence, cameras, domain, required=settings.needs_background)
@@ -143,7 +177,7 @@ class OptimizerFactory:
             scene,
             frame,
             backgrounds,
-            extractor,
+            predictor,
             ignore=ignore,
             start=start,
             settings=settings,
@@ -162,6 +196,7 @@ class OptimizerFactory:
         direction: Direction,
         free: FreeParameters,
         keyframes: Mapping[int, Mapping[str, np.ndarray]],
+        target: Target,
         ignore: Ignore,
     ) -> SequenceRun:
         """A run on frames together; joints are free as in a run on one frame, calibration is not.
@@ -176,12 +211,12 @@ class OptimizerFactory:
             direction: Where to begin.
             free: Which joints may move.
             keyframes: Frame -> arm -> joint positions [rad, m] that stay.
+            target: What is fitted.
             ignore: Frame -> camera -> pixels that show something else.
 
         Raises:
-            CartsError: weights, an image or a setting is not usable.
+            CartsError: weights, an image, a mask or a setting is not usable.
         """
-        extractor = self.prepare()
         model = SequenceSettings(direction=direction)
         free = replace(free, base_frames=False, extrinsics=False, intrinsics=False)
         stamps = sequence.timestamps
@@ -189,7 +224,7 @@ class OptimizerFactory:
             scene_at(sequence.scene, calibration),
             lambda index: sequence.frame(index, domain, list(cameras)),
             {index: None if stamps is None else float(stamps[index]) for index in frames},
-            extractor,
+            self.predictor(target),
             settings=settings,
             model=model,
             free=free,
@@ -205,8 +240,10 @@ class OptimizerFactory:
             "cameras": list(cameras),
             "frames": [frames[0], frames[-1]],
             "keyframes": sorted(keyframes),
+            **self._observed(target),
         }
-        return SequenceRun(optimizer, Provenance.made_by_optimizer(used, extractor.sha256, Source.PROPAGATED))
+        made = Provenance.made_by_optimizer(used, self._weights_hash(target), Source.PROPAGATED)
+        return SequenceRun(optimizer, made)
 
 
 def scene_at(scene: Scene, state: SceneState) -> Scene:

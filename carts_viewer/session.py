@@ -23,9 +23,11 @@ from carts_core.project import (
     Provenance,
     Source,
 )
+from carts_core.project.calibrated import calibrated, corrected_state
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.editing import Editor
 from carts_viewer.joint_range import JointRange, joint_range
+from carts_viewer.observing import NETWORK, Observed, Target
 from carts_viewer.people import People, Person
 from carts_viewer.start.roots import Roots
 from carts_viewer.state import Pose
@@ -110,21 +112,30 @@ class Session:
     def pose(self, frame: Frame, project: ProjectState | None = None) -> Pose:
         """The frame's pose as a state of the project says, by default the present one with its draft."""
         project = self.editor.view if project is None else project
-        corrections = project.joints(frame.index)
-        measured = {name: frame.measured[name] for name in project.identity.arms}
-        joints = {**measured, **{name: c.joint_positions for name, c in corrections.items()}}
-        state = _calibrated(self.scene, self.scene.state(joints, mounts=frame.mounts), project)
-        sources = {correction.provenance.source for correction in corrections.values()}
+        state = corrected_state(self.scene, frame, project)
+        sources = {correction.provenance.source for correction in project.joints(frame.index).values()}
         return Pose(state, next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED))
 
-    def ignored(self, index: int, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Camera -> pixels of the frame that the optimizer leaves out, for the cameras that have some."""
+    def ignored(
+        self, index: int, cameras: Iterable[str], target: Target = NETWORK
+    ) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of the frame that are left out where it is fitted, for the cameras that have some."""
+        cameras = list(cameras)
         regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
-        return {camera: region.region() for camera, region in regions.items() if region is not None}
+        ignored = {camera: region.region() for camera, region in regions.items() if region is not None}
+        of_masks = {} if target.given is None else target.given.ignored(index)
+        return {
+            **ignored,
+            **{name: mask | ignored.get(name, False) for name, mask in of_masks.items() if name in cameras},
+        }
+
+    def target(self, observed: Observed, project: ProjectState | None = None) -> Target:
+        """What is chosen to be fitted, with the masks of a state of the project, by default the present one."""
+        return Target.of(observed, self.editor.view if project is None else project, self.sequence)
 
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
-        return _calibrated(self.scene, self.scene.state(frame.measured, mounts=frame.mounts), self.editor.view)
+        return calibrated(self.scene, self.scene.state(frame.measured, mounts=frame.mounts), self.editor.view)
 
     def edits(
         self,
@@ -255,26 +266,6 @@ def joint_correction(
 
 _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
 """Of a frame whose arms come from different sources, the first one of these is shown."""
-
-
-def _calibrated(scene: Scene, state: SceneState, project: ProjectState) -> SceneState:
-    """The state with base frames, extrinsics and intrinsics as the project corrects them."""
-
-    def corrected(stack: Tensor, values: list[Any]) -> Tensor:
-        rows = [
-            old if new is None else torch.tensor(new, dtype=old.dtype) for old, new in zip(stack, values, strict=True)
-        ]
-        return torch.stack(rows)
-
-    bases = [project.get(Key.base_frame(arm.name)) for arm in scene.arms]
-    extrinsics = [project.get(Key.extrinsics(camera.name)) for camera in scene.cameras]
-    intrinsics = [project.get(Key.intrinsics(camera.name)) for camera in scene.cameras]
-    return replace(
-        state,
-        T_world_base=corrected(state.T_world_base, [value and value.transform for value in bases]),
-        T_camera_world=corrected(state.T_camera_world, [value and value.transform for value in extrinsics]),
-        intrinsics=corrected(state.intrinsics, [value and value.intrinsics for value in intrinsics]),
-    )
 
 
 def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> CorrectedTransform:

@@ -12,6 +12,7 @@ from carts_core.project import Edits, Figures, Key, ProjectState, Provenance, Re
 from carts_core.recording import Frame
 from carts_viewer.active_run import ActiveRun
 from carts_viewer.fit_check import Fit, FitCheck
+from carts_viewer.observing import Target
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.sequence_run import SequenceRun
@@ -49,13 +50,13 @@ class Comparison:
             CartsError: an image or the weights are not usable.
         """
         frame = self._frame(estimate.index, state)
-        was = self._session.pose(frame, before)
+        was, target = self._session.pose(frame, before), self._session.target(state.observed, before)
         pose = Pose(self._session.with_joints(was.scene, estimate.joint_positions), Source.PROPAGATED)
-        earlier, solved = self._fit(frame, was, state), self._fit(frame, pose, state)
+        earlier, solved = self._fit(frame, was, state, target), self._fit(frame, pose, state, target)
         found = Outcome(solved_edits(estimate, run), Figures(estimate.loss, solved.dice))
         worse = solved.worse_than(earlier)
         if worse is not None or solved.verdict.verdict != "good":
-            alone, edits = self._alone(frame, was, state, run.provenance)
+            alone, edits = self._alone(frame, was, state, target, run.provenance)
             if alone.worse_than(earlier) is None and alone.worse_than(solved) is None and solved.worse_than(alone):
                 found, solved, worse = Outcome(edits, Figures(alone.loss, alone.dice)), alone, None
         remark = worse
@@ -69,8 +70,8 @@ class Comparison:
         cameras = [camera.name for camera in self._session.scene.cameras if sequence.has_masks(camera.name, domain)]
         return sequence.frame(index, domain, cameras)
 
-    def _fit(self, frame: Frame, pose: Pose, state: ViewState) -> Fit:
-        fit = self._check.fit(frame.index, state.domain, pose, state.settings)
+    def _fit(self, frame: Frame, pose: Pose, state: ViewState, target: Target) -> Fit:
+        fit = self._check.fit(frame.index, state.domain, pose, state.settings, target)
         view, dice = self._session.editor.view, []
         for camera in frame.masks or {}:
             correction = view.get(Key.mask_correction(frame.index, camera))
@@ -85,34 +86,37 @@ class Comparison:
             CartsError: an image, the weights or a setting is not usable.
         """
         frame = self._frame(index, state)
-        was = self._session.pose(frame)
-        earlier = self._fit(frame, was, state)
+        was, target = self._session.pose(frame), self._session.target(state.observed)
+        earlier = self._fit(frame, was, state, target)
         cameras = [camera.name for camera in self._session.scene.cameras]
-        provenance = self._optimizers.provenance(cameras, state.settings, _joints_alone(state))
-        for outcome in self._steps(frame, was, state, provenance):
+        provenance = self._optimizers.provenance(cameras, state.settings, _joints_alone(state), target)
+        for outcome in self._steps(frame, was, state, target, provenance):
             yield None if outcome is None else (*outcome, outcome[0].worse_than(earlier))
 
-    def _alone(self, frame: Frame, start: Pose, state: ViewState, of_many: Provenance) -> tuple[Fit, Edits]:
+    def _alone(
+        self, frame: Frame, start: Pose, state: ViewState, target: Target, of_many: Provenance
+    ) -> tuple[Fit, Edits]:
         """The fit of a run on this frame alone, and the edits that take it."""
         settings = json.dumps({**json.loads(of_many.settings or "{}"), "alone": True})
-        steps = self._steps(frame, start, state, replace(of_many, settings=settings))
+        steps = self._steps(frame, start, state, target, replace(of_many, settings=settings))
         return next(outcome for outcome in steps if outcome is not None)
 
     def _steps(
-        self, frame: Frame, start: Pose, state: ViewState, provenance: Provenance
+        self, frame: Frame, start: Pose, state: ViewState, target: Target, provenance: Provenance
     ) -> Iterator[tuple[Fit, Edits] | None]:
         session, cameras = self._session, [camera.name for camera in self._session.scene.cameras]
-        ignore = session.ignored(frame.index, cameras)
+        cameras = target.seen(session.sequence, frame.index, state.domain, cameras) or cameras
+        free, ignore = _joints_alone(state), session.ignored(frame.index, cameras, target)
         optimizer = self._optimizers.make(
-            session.sequence, frame.index, state.domain, cameras, start, state.settings, _joints_alone(state), ignore
+            session.sequence, frame.index, state.domain, cameras, start, state.settings, free, target, ignore
         )
-        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance, _joints_alone(state))
+        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance, free)
         while run.step() is not None:
             yield None
         best = run.best()
         assert best is not None
         pose = run.pose(best)
-        yield self._fit(frame, pose, state), session.edits(frame, pose.scene, provenance, best.joint_std())
+        yield self._fit(frame, pose, state, target), session.edits(frame, pose.scene, provenance, best.joint_std())
 
 
 def _joints_alone(state: ViewState) -> FreeParameters:

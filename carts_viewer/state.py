@@ -17,6 +17,7 @@ from carts_viewer.compare import Compare
 from carts_viewer.finding import FrameFilter
 from carts_viewer.jobs import Job
 from carts_viewer.layers import Layer
+from carts_viewer.observing import Observed
 from carts_viewer.strokes import Brush
 
 
@@ -197,6 +198,8 @@ class ViewState:
     """Which setting that was."""
     time_error: str | None = None
     """Why the time offset that is being typed cannot be used."""
+    observed: Observed = field(default_factory=Observed)
+    """What runs fit."""
     every_camera: bool = True
     """Whether a run uses all cameras or only the shown one."""
     compare: Compare = field(default_factory=Compare)

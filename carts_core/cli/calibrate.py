@@ -61,9 +61,10 @@ class Calibrate:
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
         indices = frame_indices(self.frames, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
-        observer = self.network.observer(self.solving.chosen)
+        observer = self.network.observer(self.solving.chosen, sequence)
+        observer.check(sequence, indices, cameras)
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
-            frames = [sequence.frame(index, self.domain, cameras) for index in indices]
+            frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
             known = observer.warnings(sequence, indices[0], self.domain, tuple(cameras), background=False)
             print_hints(console, *known)
             optimizer = CalibrationOptimizer(
@@ -73,6 +74,7 @@ class Calibrate:
                 settings=self.solving.chosen,
                 free=self.free,
                 joint_prior_deg=self.joint_prior_deg,
+                ignore=[observer.ignore(index) for index in indices],
                 cameras=cameras,
             )
             result = _optimized(optimizer, console)
@@ -92,7 +94,7 @@ class Calibrate:
             "format": "calibration",
             "sequence": str(self.sequence),
             "weights": weights,
-            "observed": self.network.observe,
+            **self.network.observed,
             "frames": indices,
             "cameras": cameras,
             "domain": self.domain,

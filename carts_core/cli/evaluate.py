@@ -62,7 +62,8 @@ class Evaluate:
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
-        observer = self.network.observer(self.solving.chosen)
+        observer = self.network.observer(self.solving.chosen, sequence)
+        observer.check(sequence, frames, cameras)
         run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
         found = run(
             sequence,
@@ -75,6 +76,7 @@ class Evaluate:
             perturb_deg=self.start.perturb_deg,
             seed=self.start.seed,
             together=self.together,
+            given=observer.given,
         )
         total = len(frames) * len(cameras) * len(domains)
         with when_stopped("nothing was written"):
@@ -94,5 +96,5 @@ class Evaluate:
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:
-            write_text(self.json, json.dumps({"observed": self.network.observe, **to_json(scores)}, indent=1))
+            write_text(self.json, json.dumps({**self.network.observed, **to_json(scores)}, indent=1))
             console.print(f"wrote {self.json}")

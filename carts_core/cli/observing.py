@@ -1,16 +1,23 @@
 """What is fitted: predictions of the network, given masks, or both."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..errors import SettingsError
 from ..settings import SolverSettings, SurfaceSolver
+from ..wording import counted
 from .selection import Network
 
 if TYPE_CHECKING:
     from ..networks.extractor import FeatureExtractor
-    from ..optimization import MaskPredictor
-    from ..recording import Sequence
+    from ..optimization import GivenMasks, MaskPredictor
+    from ..optimization.measurement import Ignore
+    from ..recording import Frame, Sequence
+
+RECORDING, LAYERS = "recording", ("imported", "painted")
+"""Masks of the sequence file, and those of its project."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +28,44 @@ class Observer:
     weights: str
     """Fingerprint of the networks and of who runs them; empty without any."""
     masked: bool
-    """Whether masks of the sequence are fitted."""
+    """Whether masks are fitted."""
+    given: "GivenMasks | None" = None
+    """The masks that are fitted, where they are not those of the sequence file."""
+    every: bool = False
+    """Whether each frame needs a mask."""
+
+    @property
+    def ignore(self) -> "Ignore":
+        """Position of a frame -> camera name -> pixels that are not compared."""
+        return (lambda _: {}) if self.given is None else self.given.ignored
+
+    def completed(self, frame: "Frame") -> "Frame":
+        """A frame with the masks that are fitted, for cameras that the recording has no mask of."""
+        return frame if self.given is None else self.given.filled(frame)
+
+    def inputs(self, frame: "Frame") -> list[object]:
+        """What of a frame's masks its result depends on, for a fingerprint."""
+        if self.given is None:
+            return sorted((frame.masks or {}).items())
+        return [sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored)]
+
+    def check(self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str]) -> None:
+        """See that all frames have what is to be fitted, before any of them is solved.
+
+        Raises:
+            SettingsError: they have not.
+        """
+        if self.given is None:
+            return
+        frames, cameras = list(frames), list(cameras)
+        for camera in cameras:
+            without = [index for index in frames if not self.given.there(index, camera)]
+            if without and (self.every or len(without) == len(frames)):
+                raise SettingsError(
+                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self.given.origin} of camera "
+                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}, position {without[0]}. Choose "
+                    "others with --frames and --camera, or give both with --observe both."
+                )
 
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
@@ -48,13 +92,31 @@ class Observing(Network):
     observe: Literal["network", "masks", "both"] = "network"
     """What is fitted: predictions of the network, the sequence's masks (no network is loaded), or both: the masks, with
     parts and normals from the network, which serves frames without a mask alone."""
+    masks: str = RECORDING
+    """Which masks are fitted: `recording` for those of the sequence file, `imported` or `painted` for those of its
+    project (`carts import-masks`, `carts view`), or a file or folder of masks (docs: masks)."""
+    project: Path | None = None
+    """Project file of imported and painted masks; by default that beside the sequence."""
 
-    def observer(self, settings: SolverSettings) -> Observer:
-        """Who says what the images show, for a solver.
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.masks != RECORDING and self.observe == "network":
+            raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave both out.")
+        if self.project is not None and self.masks not in LAYERS:
+            needed = " or ".join(LAYERS)
+            raise SettingsError(f"--project {self.project} needs --masks {needed}. Add it, or leave it out.")
+        if self.masks not in (RECORDING, *LAYERS) and not Path(self.masks).exists():
+            raise SettingsError(
+                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, or a file or folder of masks."
+            )
+
+    def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
+        """Who says what the images of a sequence show, for a solver.
 
         Raises:
             SettingsError: the solver compares features of images.
             WeightsError: weights cannot be used.
+            ProjectError, SequenceError: masks cannot be read.
         """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
@@ -66,16 +128,40 @@ class Observing(Network):
         from ..networks.extractor import FeatureExtractor
         from ..optimization import MaskPredictor, NetworkPredictor
 
+        given = self._given(sequence)
+        masks, origin = (None, "mask") if given is None else (given.masks, given.origin)
         if self.observe == "masks":
-            return Observer(MaskPredictor(device=self.device), "", masked=True)
+            only = MaskPredictor(None, masks, self.device, origin)
+            return Observer(only, "", masked=True, given=given, every=True)
         extractor = FeatureExtractor.load(*self.weights, device=self.device, inference=self.inference)
         if self.observe == "both":
-            return Observer(MaskPredictor(NetworkPredictor(extractor)), extractor.fingerprint, masked=True)
+            both = MaskPredictor(NetworkPredictor(extractor), masks, origin=origin)
+            return Observer(both, extractor.fingerprint, masked=True, given=given)
         return Observer(extractor, extractor.fingerprint, masked=False)
+
+    def _given(self, sequence: "Sequence") -> "GivenMasks | None":
+        """The masks to be fitted, where they are not those of the sequence file."""
+        if self.masks == RECORDING:
+            return None
+        from ..project import Project
+        from ..project.target_masks import file_masks, project_masks
+
+        if self.masks not in ("imported", "painted"):
+            return file_masks(Path(self.masks), sequence)
+        with Project.open(sequence, self.project, read_only=True) as project:
+            state = project.state
+        return project_masks(self.masks, state, sequence)
+
+    @property
+    def observed(self) -> dict[str, str]:
+        """What is fitted, for a file of results."""
+        elsewhere = {} if self.masks == RECORDING else {"masks": self.masks}
+        return {"observed": self.observe, **elsewhere}
 
     @property
     def caution(self) -> str | None:
         """What to know of Dice scores: whether they are against what was fitted."""
         if self.observe == "network":
             return None
-        return "Dice is against the masks that were fitted, so it says how well they fit and not how right they are."
+        against = "the masks that were fitted" if self.masks == RECORDING else "them where the recording has no masks"
+        return f"Dice is against {against}, so it says how well they fit and not how right they are."

@@ -24,6 +24,7 @@ from ..stopping import when_stopped
 from ..wording import counted
 from .frame_folder import FrameFolder, FrameResult
 from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints
+from .observing import RECORDING
 from .optimize_options import OptimizeOptions
 from .origins import Origin as MadeFrom
 from .origins import Origins
@@ -58,7 +59,8 @@ class Optimizing:
         self._frames = asked.select.frame_indices(self._sequence)
         self._keyframes = self._read_keyframes()
         self._looking: SequenceOptimizer | None = None
-        self._observer = asked.network.observer(self._solver)
+        self._observer = asked.network.observer(self._solver, self._sequence)
+        self._observer.check(self._sequence, self._frames, asked.select.camera_names(self._sequence.scene))
 
     def run(self) -> None:
         """Optimize what is not there yet.
@@ -176,6 +178,7 @@ class Optimizing:
                 frame,
                 backgrounds,
                 self._observer.predictor,
+                ignore=self._observer.ignore(index),
                 start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
                 settings=self._solver,
                 free=self._free,
@@ -217,6 +220,7 @@ class Optimizing:
             model=asked.solving.sequence,
             free=self._free,
             keyframes=self._keyframes,
+            ignore=self._observer.ignore,
             backgrounds=backgrounds,
             cameras=cameras,
             checkpoint=checkpoint,
@@ -266,6 +270,8 @@ class Optimizing:
         }
         if asked.network.observe != "network":
             settings["observe"] = asked.network.observe
+        if asked.network.masks != RECORDING:
+            settings["masks"] = asked.network.masks
         if asked.mode == "sequence":
             from ..files.reading import TABLE, read_bytes
 

@@ -61,7 +61,7 @@ class Origins:
         backgrounds: Mapping[str, np.ndarray],
         settings: str,
     ) -> None:
-        self._sequence, self._load, self._masked = sequence, load, observer.masked
+        self._sequence, self._load, self._observer = sequence, load, observer
         recorded = [sequence.recorded_camera(name) for name in cameras]
         self._common = {
             "code": code_fingerprint(_CODE),
@@ -89,14 +89,14 @@ class Origins:
         joints += sorted(frame.mounts.items())
         images = [(name, frame.images[name]) for name in sorted(frame.images)]
         origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
-        return origin | ({"masks": fingerprint(sorted((frame.masks or {}).items()))} if self._masked else {})
+        return origin | ({"masks": fingerprint(self._observer.inputs(frame))} if self._observer.masked else {})
 
     def of_all(self, indices: Indices[int]) -> Origin:
         """Of frames that are corrected together: each depends on what all are made from."""
         each = [self.of(index) for index in indices]
         stamps = self._sequence.timestamps
         times = [None if stamps is None else float(stamps[index]) for index in indices]
-        masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._masked else {}
+        masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._observer.masked else {}
         return {
             **self._common,
             **masks,

@@ -11,7 +11,15 @@ import numpy as np
 from ..model.perturbation import perturb
 from ..model.scene import SceneState
 from ..networks.extractor import FeatureExtractor
-from ..optimization import Assessment, Backgrounds, FrameOptimizer, FreeParameters, SolverSettings, SurfacePredictor
+from ..optimization import (
+    Assessment,
+    Backgrounds,
+    FrameOptimizer,
+    FreeParameters,
+    GivenMasks,
+    SolverSettings,
+    SurfacePredictor,
+)
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
 from .metrics import dice, joint_mae_deg, joint_std_deg
@@ -54,6 +62,7 @@ def evaluate(
     perturb_deg: float = 0.0,
     seed: int = 0,
     together: bool = False,
+    given: GivenMasks | None = None,
 ) -> Iterator[FrameScore]:
     """Optimize every frame in every domain and camera, each on its own, and yield its score.
 
@@ -68,6 +77,8 @@ def evaluate(
             measured ones where there is no truth) with every measured joint moved by this much; see `perturb`.
         seed: of the perturbation; the same frame gets the same one in every camera and domain.
         together: one optimization for all cameras; a frame has a score for each, which share its time.
+        given: masks from elsewhere that `networks` fits: their ignored pixels are not compared, and they are the truth
+            of cameras that the sequence has no masks of.
     """
     for domain in domains:
         for group in camera_groups(cameras, together):
@@ -76,10 +87,19 @@ def evaluate(
             backgrounds = Backgrounds.of(sequence, group, domain, required=settings.needs_background)
             for index in frames:
                 frame = sequence.frame(index, domain, list(group))
+                frame = frame if given is None else given.filled(frame)
                 start = start_positions(sequence, frame, perturb_deg, seed)
                 began = time.perf_counter()
                 optimizer = FrameOptimizer(
-                    scene, frame, backgrounds, networks, start=start, settings=settings, free=free, live=False
+                    scene,
+                    frame,
+                    backgrounds,
+                    networks,
+                    ignore=None if given is None else given.ignored(index),
+                    start=start,
+                    settings=settings,
+                    free=free,
+                    live=False,
                 )
                 for _ in optimizer:
                     pass

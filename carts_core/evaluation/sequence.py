@@ -8,6 +8,7 @@ from ..networks.extractor import FeatureExtractor
 from ..optimization import (
     Backgrounds,
     FreeParameters,
+    GivenMasks,
     SequenceOptimizer,
     SequenceSettings,
     SolverSettings,
@@ -31,6 +32,7 @@ def evaluate_sequence(
     perturb_deg: float = 0.0,
     seed: int = 0,
     together: bool = False,
+    given: GivenMasks | None = None,
 ) -> Iterator[FrameScore]:
     """As `evaluate`, but the frames of a camera (or all) and domain inform each other; see `SequenceOptimizer`.
 
@@ -50,12 +52,14 @@ def evaluate_sequence(
                 settings=settings,
                 model=model,
                 free=free,
+                ignore=None if given is None else given.ignored,
                 backgrounds=Backgrounds.of(sequence, group, domain),
             )
             for _ in optimizer:
                 pass
             for index, estimate in sorted(optimizer.estimates.items()):
                 frame = starts.frame(index)
+                frame = frame if given is None else given.filled(frame)
                 for camera, renderer in renderers.items():
                     yield frame_score(
                         sequence,

@@ -22,6 +22,7 @@ from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
+from .masks import GivenMasks as GivenMasks
 from .masks import MaskPredictor as MaskPredictor
 from .predictor import FramePredictor as FramePredictor
 from .predictor import ImagePredictor as ImagePredictor
@@ -53,6 +54,7 @@ __all__ = [
     "FrameOptimizer",
     "FramePredictor",
     "FreeParameters",
+    "GivenMasks",
     "ImagePredictor",
     "Iterate",
     "Linearization",

@@ -1,7 +1,7 @@
 """Given masks as the target: what a person painted or another program found stands in the place of the network."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,6 +22,26 @@ _STRIDE = 8
 """Windows are multiples of this without a network [px]."""
 
 
+@dataclass(frozen=True, eq=False)
+class GivenMasks:
+    """Masks from elsewhere than the recording, by frame."""
+
+    origin: str
+    """What they are called in "frame 7 has no ... of camera left", say "imported mask"."""
+    masks: Callable[[int], Mapping[str, GivenMask]]
+    """Position of a frame -> camera name -> mask in the camera's size, for the cameras that have one."""
+    there: Callable[[int, str], bool]
+    """Whether a frame, by position, has a mask of a camera."""
+    ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
+    """As `masks`: pixels of which it is not known whether they show an arm. Nothing is compared there."""
+
+    def filled(self, frame: Frame) -> Frame:
+        """The frame with these masks, for cameras that the recording has none of."""
+        masks = {**self.masks(frame.index), **(frame.masks or {})}
+        whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
+        return replace(frame, masks=whole or None)
+
+
 class MaskPredictor:
     """Has each frame's given masks in the place of a network; a `SurfacePredictor`.
 
@@ -29,6 +49,7 @@ class MaskPredictor:
         network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
         masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
         device: where it computes, without a network.
+        origin: what errors call a mask.
     """
 
     def __init__(
@@ -36,8 +57,9 @@ class MaskPredictor:
         network: SurfacePredictor | None = None,
         masks: Callable[[int], Mapping[str, GivenMask]] | None = None,
         device: torch.device | str = "cpu",
+        origin: str = "mask",
     ) -> None:
-        self._network, self._masks = network, masks
+        self._network, self._masks, self._origin = network, masks, origin
         self.device = torch.device(device) if network is None else network.device
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
@@ -53,8 +75,8 @@ class MaskPredictor:
             return network
         if missing:
             raise SettingsError(
-                f"frame {frame.frame_id} has no mask of camera {missing[0]!r} to be fitted. Give one, leave the frame "
-                "out, or observe both, masks and the network."
+                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to be fitted. Give one, leave "
+                "the frame or camera out, or observe both, masks and the network."
             )
         for name in cameras:
             if given[name].shape != frame.images[name].shape[:2]:

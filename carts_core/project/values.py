@@ -42,26 +42,31 @@ class Provenance:
     settings: str | None = None
     """JSON text of the settings; required for the optimizer."""
     weights_sha256: str | None = None
-    """Hash of the network's weights; required for the optimizer."""
+    """Hash of the network's weights; required for the optimizer, unless it fitted masks without a network."""
 
     def __post_init__(self) -> None:
         _set(self, "source", _choice(Source, self.source, "provenance"))
-        if self.source is Source.OPTIMIZER and (self.settings is None or self.weights_sha256 is None):
-            raise ProjectError("an optimizer's value needs its settings and the hash of its weights. Give both.")
         if self.settings is not None:
             _check_json(self.settings)
+        if self.source is Source.OPTIMIZER and (self.settings is None or not self._network_known(self.settings)):
+            raise ProjectError("an optimizer's value needs its settings and the hash of its weights. Give both.")
         if self.weights_sha256 is not None and not re.fullmatch("[0-9a-f]{64}", self.weights_sha256):
             raise ProjectError(f"{self.weights_sha256!r} is not a SHA-256 hash. Give 64 hexadecimal digits.")
 
+    def _network_known(self, settings: str) -> bool:
+        """Whether it is said which network was run, if one was."""
+        used = json.loads(settings)
+        return self.weights_sha256 is not None or (isinstance(used, dict) and used.get("observe") == "masks")
+
     @staticmethod
     def made_by_optimizer(
-        settings: Mapping[str, Any], weights_sha256: str, source: Source = Source.OPTIMIZER
+        settings: Mapping[str, Any], weights_sha256: str | None, source: Source = Source.OPTIMIZER
     ) -> "Provenance":
         """Provenance of an optimizer's result.
 
         Args:
             settings: what JSON can hold, say what `carts_core.settings.serialization.to_plain` makes of a solver's.
-            weights_sha256: of the weights file.
+            weights_sha256: of the weights file; None where masks alone were fitted, which settings say as `observe`.
             source: OPTIMIZER, or PROPAGATED for a frame that was solved between keyframes.
         """
         return Provenance(source, json.dumps(settings, sort_keys=True, allow_nan=False), weights_sha256)

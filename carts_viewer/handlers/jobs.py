@@ -25,7 +25,7 @@ from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
 """How often it is written down how far a job is [s]."""
-_CHOICES = "index frame domain camera pose settings free solver every_camera direction filter".split()
+_CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
 """What of a tab's state a job depends on."""
 
 

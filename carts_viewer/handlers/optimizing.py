@@ -16,6 +16,7 @@ from carts_viewer.checks import unknown
 from carts_viewer.context import Context
 from carts_viewer.fit_check import FitCheck
 from carts_viewer.layers import Layer
+from carts_viewer.observing import NETWORK, Observed
 from carts_viewer.presets import PRESETS
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
@@ -39,6 +40,8 @@ class OptimizingHandler:
         self._optimizers = optimizers
         self._check = FitCheck(context.session, optimizers)
         self._run: ActiveRun | None = None
+        self._target = NETWORK
+        """What the last run fits."""
         self._before: Edits | None = None
         """What brings the frame back to where the last run began."""
 
@@ -183,15 +186,22 @@ class OptimizingHandler:
         self.end("Cameras changed; Run starts anew from here")
         self._context.change(every_camera=intent.every)
 
+    @handle.register
+    def _(self, intent: intents.SetObserved) -> None:
+        observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
+        self.end("What is fitted was changed; Run starts anew from here")
+        self._context.change(observed=observed, maps=None)
+
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
         state = self._context.state
-        sequence, ignore = self._session.sequence, self._session.ignored(state.index, cameras)
+        sequence, self._target = self._session.sequence, self._session.target(state.observed)
+        ignore = self._session.ignored(state.index, cameras, self._target)
         optimizer = self._optimizers.make(
-            sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, ignore
+            sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, self._target, ignore
         )
-        provenance = self._optimizers.provenance(cameras, state.settings, state.free)
+        provenance = self._optimizers.provenance(cameras, state.settings, state.free, self._target)
         return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance, state.free)
 
     def _start(self) -> None:
@@ -240,7 +250,7 @@ class OptimizingHandler:
             return own
         state = self._context.state
         try:
-            found = self._check.fit(state.index, state.domain, run.pose(end), state.settings).verdict
+            found = self._check.fit(state.index, state.domain, run.pose(end), state.settings, self._target).verdict
         except CartsError:
             # A solver that needs no surface network has run without one.
             return own
@@ -250,7 +260,8 @@ class OptimizingHandler:
     def _(self, intent: intents.Assess) -> None:
         self.end("Stopped: the fit was checked")
         state = self._context.state
-        found = self._check.fit(state.index, state.domain, state.pose, state.settings)
+        target = self._session.target(state.observed)
+        found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
         self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
         self._context.change(busy=None)
 

@@ -107,6 +107,7 @@ class PropagatingHandler:
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
         state, sequence, cameras = self._context.state, self._session.sequence, self._context.cameras
+        target = self._session.target(state.observed, self._before)
         poses = {index: self._session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
         return self._optimizers.make_sequence(
             sequence,
@@ -118,7 +119,8 @@ class PropagatingHandler:
             state.direction,
             state.free,
             keyframes={index: self._session.joints(pose.scene) for index, pose in poses.items()},
-            ignore=lambda index: self._session.ignored(index, cameras),
+            target=target,
+            ignore=lambda index: self._session.ignored(index, cameras, target),
         )
 
     def _bits(self, run: SequenceRun) -> Iterator[None]:

@@ -69,6 +69,7 @@ from .optimizing import RunOrPause as RunOrPause
 from .optimizing import SetCameras as SetCameras
 from .optimizing import SetFreeGroup as SetFreeGroup
 from .optimizing import SetFreeJoint as SetFreeJoint
+from .optimizing import SetObserved as SetObserved
 from .optimizing import SetSetting as SetSetting
 from .optimizing import Step as Step
 from .painting import ClearLayer as ClearLayer

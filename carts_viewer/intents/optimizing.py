@@ -95,3 +95,13 @@ class SetCameras(Optimizing, Latest):
     """Optimize in all cameras, or in the shown one."""
 
     every: bool
+
+
+@dataclass(frozen=True)
+class SetObserved(Optimizing, Latest):
+    """Have runs fit predictions of the network, masks or both."""
+
+    what: str
+    """One of `observing.Observe`."""
+    masks: str
+    """One of `observing.Masks`."""

@@ -22,6 +22,10 @@ SOLVER_LABELS = {
     SolverName.NONE: "None: compare only",
 }
 """What people read for the solvers."""
+OBSERVED = {"What the network sees": "network", "Masks": "masks", "Masks, and parts by the network": "both"}
+"""What people read for what is fitted."""
+MASKS = {"Of the recording": "recording", "Imported": "imported", "Painted": "painted"}
+"""The same for whose masks."""
 UNDETERMINED = "Not determined by this image"
 """What people read for unknowns that an image says nothing of."""
 
@@ -41,6 +45,13 @@ class OptimizePanel:
         self._status = gui.add_html("")
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
+        self._observed = gui.add_dropdown("Fit to", list(OBSERVED))
+        self._masks = gui.add_dropdown(
+            "Whose masks",
+            list(MASKS),
+            visible=False,
+            hint="Imported: by Review, Masks of others. Painted: rendered masks that somebody corrected with a brush.",
+        )
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
         on_click(self._run, lambda _: intents.Run(), emit)
@@ -48,6 +59,8 @@ class OptimizePanel:
         on_click(self._step, lambda _: intents.Step(), emit)
         on_click(self._reset, lambda _: intents.Reset(), emit)
         on_input(self._solver, lambda label: intents.SetSetting("solver", self._solvers[label]), emit)
+        on_input(self._observed, lambda what: intents.SetObserved(OBSERVED[what], MASKS[self._masks.value]), emit)
+        on_input(self._masks, lambda masks: intents.SetObserved(OBSERVED[self._observed.value], MASKS[masks]), emit)
         on_input(self._cameras, lambda label: intents.SetCameras(label == "All cameras"), emit)
 
     def show(self, state: ViewState) -> None:
@@ -59,6 +72,9 @@ class OptimizePanel:
         self._step.disabled = running
         self._reset.disabled = not state.run.curves.loss
         write(self._solver, SOLVER_LABELS[state.solver])
+        write(self._observed, next(label for label, what in OBSERVED.items() if what == state.observed.what))
+        write(self._masks, next(label for label, masks in MASKS.items() if masks == state.observed.masks))
+        self._masks.visible = state.observed.what != "network"
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
         lines = f"{undetermined_lines(state, self._session)}{calibration_line(state)}"
         self._status.content = f'<p class="carts-status">{status_line(state)}</p>{lines}'
