@@ -22,6 +22,7 @@ def serve(
     sequence_path: Path,
     *,
     project: Path | None = None,
+    folders: Sequence[Path] = (),
     host: str = "127.0.0.1",
     port: int = 8080,
     device: str = "cpu",
@@ -34,6 +35,7 @@ def serve(
     Args:
         sequence_path: The sequence file.
         project: The project file, begun if it is not there; None for the default place.
+        folders: From where masks may be imported, besides the sequence's own folder.
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
         device: Where to render and optimize, say `cpu` or `cuda`.
@@ -58,6 +60,7 @@ def serve(
                 inference=inference,
                 weights=weights,
                 report=_say_doing,
+                folders=tuple(folders),
             )
         except CartsError as error:
             print(f"error: {visible(str(error))}", file=sys.stderr)

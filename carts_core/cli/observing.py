@@ -43,11 +43,11 @@ class Observer:
         """A frame with the masks that are fitted, for cameras that the recording has no mask of."""
         return frame if self.given is None else self.given.filled(frame)
 
-    def inputs(self, frame: "Frame") -> list[object]:
+    def inputs(self, frame: "Frame") -> tuple[object, ...]:
         """What of a frame's masks its result depends on, for a fingerprint."""
         if self.given is None:
-            return sorted((frame.masks or {}).items())
-        return [sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored)]
+            return tuple(sorted((frame.masks or {}).items()))
+        return tuple(sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored))
 
     def check(self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str]) -> None:
         """See that all frames have what is to be fitted, before any of them is solved.

@@ -17,7 +17,8 @@ class View:
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file."""
     root: tuple[Path, ...] = ()
-    """Folders that the page to choose a recording may look into, and nothing outside; by default the working folder."""
+    """Folders that the page to choose a recording may look into, and nothing outside; by default the working folder.
+    With a sequence, folders that masks of others may be imported from, besides its own."""
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
@@ -48,6 +49,7 @@ class View:
         serve(
             self.sequence,
             project=self.project,
+            folders=self.root,
             host=self.host,
             port=self.port,
             device=self.network.device,

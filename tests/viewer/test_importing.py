@@ -151,3 +151,16 @@ def test_somebody_types_where_the_masks_are_and_sees_them(
     assert app.state.layer is Layer.IMPORTED
     tab.button("Undo")
     tab.page.get_by_text("Nothing was imported yet.").wait_for(timeout=30_000)
+
+
+def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    path = tiny_sequence(masks=False)
+    folder = path.parent.rename(tmp_path.parent / f"{tmp_path.name}_recording")
+    elsewhere = tmp_path.parent / f"{tmp_path.name}_elsewhere"
+    elsewhere.mkdir()
+    assert cv2.imwrite(str(elsewhere / "001.png"), np.full((72, 96), 255, np.uint8))
+    for allowed, said in ((), "outside of the allowed folders"), ((elsewhere,), "Imported 1 mask"):
+        with ViewerApp.open(folder / path.name, port=0, folders=allowed) as app:
+            app.queue.put(intents.ImportMasks(str(elsewhere)))
+            state = app.wait_until_shown(60)
+            assert said in (state.error or state.imported)
