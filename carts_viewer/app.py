@@ -16,6 +16,7 @@ from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage, open_storage
 from carts_viewer.tab import Tab, View
 from carts_viewer.tabs import Tabs
+from carts_viewer.thumbnails import Thumbnails
 from carts_viewer.transport.guard import check_address
 from carts_viewer.transport.page import Page
 from carts_viewer.worker import Worker
@@ -69,6 +70,8 @@ class ViewerApp:
         self.url = self.page.url
         self.page.key_groups = key_groups(Layer)
         self.page.project = sequence.name
+        self._thumbnails = Thumbnails(sequence)
+        self.page.thumbnail = self._thumbnails.answer
         self._worker = Worker(queue, self.tabs)
         Listening(self.page, self.tabs, self._worker, sequence)
         self._worker.start(self._prepare)
@@ -174,6 +177,7 @@ class ViewerApp:
         self._worker.stop()
         if self._own_page:
             self.page.close()
+        self._thumbnails.close()
         with ExitStack() as stack:
             # From the last to the first, whatever fails.
             stack.callback(self._storage.close)

@@ -2,8 +2,22 @@
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 from carts_core.model.scene import Arm
+
+
+class Reach(StrEnum):
+    """How far sliders reach from the measured values, as people read it."""
+
+    NEAR = "± 5"
+    FAR = "± 20"
+    FULL = "Full range"
+
+    @property
+    def width(self) -> float:
+        """To either side [deg] or [mm]."""
+        return {Reach.NEAR: 5.0, Reach.FAR: 20.0, Reach.FULL: math.inf}[self]
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,8 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("space", "Play or stop", intents.Play()),
         Shortcut("N", "Next frame", intents.MoveFrame(1)),
         Shortcut("B", "Previous frame (back)", intents.MoveFrame(-1)),
+        Shortcut("(", "Begin the range at this frame", intents.MarkRange()),
+        Shortcut(")", "End the range at this frame", intents.MarkRange(end=True)),
         Shortcut("R", "Run or pause the optimizer", intents.RunOrPause()),
         Shortcut("T", "One step of the optimizer", intents.Step()),
         Shortcut("X", "Reset to the start of the run", intents.Reset()),

@@ -9,6 +9,7 @@ from carts_viewer.panels.export import ExportPanel
 from carts_viewer.panels.find import FindPanel
 from carts_viewer.panels.fit import FitPanel
 from carts_viewer.panels.help import HelpPanel
+from carts_viewer.panels.hints import explain
 from carts_viewer.panels.importing import ImportPanel
 from carts_viewer.panels.inputs import Emit, Panel, Waits
 from carts_viewer.panels.jobs import JobsPanel
@@ -47,6 +48,7 @@ class Layout:
     Attributes:
         panels: in the order in which they are brought up to date.
         joints: the one with the joints' sliders.
+        timeline: what the strip below the picture shows.
     """
 
     def __init__(
@@ -105,6 +107,8 @@ class Layout:
             panels.append(ExportPanel(page, session, storage, emit))
         with right.add_tab("Help"):
             HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
+        explain(page)
         right.dock_right()
         right.set_width(_WIDTH)
-        self.panels = [*panels, self.joints, PageState(page, session), TimelineData(page, session)]
+        self.timeline = TimelineData(page, session)
+        self.panels = [*panels, self.joints, PageState(page, session), self.timeline]

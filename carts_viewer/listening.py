@@ -58,6 +58,10 @@ class Listening:
                 self._worker.call(lambda: self._come(client_id, hello))
         elif kind == "theme" and client is not None:
             choose_theme(client.gui, light=rest == "light")
+        elif kind == "trace" and (tab := self._tabs.of_client(client_id)) is not None and tab.view is not None:
+            tab.view.layout.timeline.answer(rest)
+        elif kind == "range":
+            self._put(client_id, intents.SetRange(_range(rest)))
         elif kind == "do" and rest in _DO:
             self._put(client_id, _DO[rest])
 
@@ -115,3 +119,9 @@ class Listening:
             _log.info("Refused: %s", error)
         else:
             self._put(client_id, intents.Paint(client_id, stroke))
+
+
+def _range(text: str) -> tuple[int, int] | None:
+    """First and last frame, from what a tab says; None where these are no two numbers."""
+    numbers = [int(part) for part in text.split() if part.isdecimal() and len(part) < 10]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None

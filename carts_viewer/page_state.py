@@ -1,8 +1,13 @@
 """What the page's own scripts draw over the picture: cameras with their fit, keypoints, clicks, the frame."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 from carts_core.project import by_hand
+from carts_viewer import intents
+from carts_viewer.joint_range import Reach
+from carts_viewer.layers import Layer
 from carts_viewer.marks import keypoints_in_image, labelled_keypoints
 from carts_viewer.panels.fit import quality
 from carts_viewer.panels.review import BY_HAND
@@ -65,4 +70,36 @@ class PageState:
             "label": state.frame.frame_id,
             "review": BY_HAND if by_hand(state.project, state.index) else str(state.review.state),
             "fit": None if state.verdict is None else state.verdict.verdict,
+            "range": state.range,
+            "playing": state.playing,
+            "settings": remembered(state),
         }
+
+
+def remembered(state: ViewState) -> dict[str, Any]:
+    """What a browser keeps of the choices made in it, for the next time."""
+    return {
+        "layer": str(state.layer),
+        "opacity": state.opacity,
+        "reach": str(state.reach),
+        "beside": state.beside,
+        "fps": state.fps,
+    }
+
+
+def chosen(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent]:
+    """What brings back what `remembered` has kept, as far as it makes sense; no page of ours sends anything else."""
+    found: list[intents.Intent] = []
+    layer, reach, beside = (settings.get(name) for name in ("layer", "reach", "beside"))
+    # What an imported mask, or a truth, shows is not there in every recording.
+    if isinstance(layer, str) and layer in {Layer.SHADED, Layer.MASK, Layer.CONTOUR, Layer.NONE} - {state.layer}:
+        found.append(intents.ShowLayer(Layer(layer)))
+    if isinstance(reach, str) and reach in set(Reach) - {state.reach}:
+        found.append(intents.SetReach(Reach(reach)))
+    if isinstance(beside, bool) and beside is not state.beside:
+        found.append(intents.ShowBeside(beside))
+    for name, make in (("opacity", intents.SetOpacity), ("fps", intents.SetSpeed)):
+        value = settings.get(name)
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            found.append(make(float(value)))
+    return found

@@ -16,6 +16,7 @@ from carts_core.settings import Direction, SolverName
 from carts_viewer.compare import Compare
 from carts_viewer.finding import FrameFilter
 from carts_viewer.jobs import Job
+from carts_viewer.joint_range import Reach
 from carts_viewer.layers import Layer
 from carts_viewer.observing import Observed
 from carts_viewer.strokes import Brush
@@ -206,6 +207,10 @@ class ViewState:
     """The other pose that the picture shows, if any."""
     filter: FrameFilter = field(default_factory=FrameFilter)
     """What frames somebody looks for."""
+    reach: Reach = Reach.NEAR
+    """How far the joints' sliders reach."""
+    range: tuple[int, int] | None = None
+    """First and last frame of the part that is played, solved and optimized; None: the whole sequence."""
     beside: bool = True
     """Whether the images of the other cameras are shown beside that of the active one."""
     playing: bool = False

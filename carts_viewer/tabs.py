@@ -2,8 +2,8 @@
 
 import json
 import logging
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from carts_viewer.handlers.exporting import Deliver
 from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.layers import Layer
 from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.page_state import chosen
 from carts_viewer.people import LONGEST_NAME, People, Person
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
@@ -44,6 +45,8 @@ class Hello:
     """From 0."""
     camera: str | None = None
     domain: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """What was chosen there earlier, see `page_state.remembered`; anything, if the page is none of ours."""
 
 
 def read_hello(text: str) -> Hello | None:
@@ -56,7 +59,10 @@ def read_hello(text: str) -> Hello | None:
         _log.info("Refused: a tab does not say who it is: %.100s", text)
         return None
     camera, domain = (None if said.get(what) is None else str(said[what]) for what in ("camera", "domain"))
-    return Hello(key, name, said.get("theme") == "light", frame, camera, domain)
+    settings = said.get("settings")
+    return Hello(
+        key, name, said.get("theme") == "light", frame, camera, domain, settings if isinstance(settings, dict) else {}
+    )
 
 
 class Tabs:
@@ -116,6 +122,8 @@ class Tabs:
         tab.key = hello.key
         if hello.name:
             tab.controller.handle(intents.SetName(hello.name))
+        if known is None:
+            self._do(tab, chosen(hello.settings, tab.controller.state))
         self._go(tab, hello)
         tab.attach(client, self._renderer, self._storage, light=hello.light)
         self._forget_oldest()
@@ -156,6 +164,10 @@ class Tabs:
             wishes.append(intents.ShowCamera(hello.camera))
         if hello.frame is not None and hello.frame != tab.controller.state.index:
             wishes.append(intents.ShowFrame(hello.frame))
+        self._do(tab, wishes)
+
+    @staticmethod
+    def _do(tab: Tab, wishes: Iterable[intents.Intent]) -> None:
         for wish in wishes:
             try:
                 tab.controller.handle(wish)

@@ -1,5 +1,6 @@
-"""What the page's timeline draws of every frame, as one number; only what has changed is sent."""
+"""What the page's timeline draws of every frame; only what has changed is sent, and of curves only what is in view."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,6 +9,7 @@ from carts_core.project.fit_verdict import VERDICTS
 from carts_core.project.state import Record
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.traces import Traces
 from carts_viewer.transport.tab_page import TabPage
 
 _REVIEWS = (
@@ -30,6 +32,7 @@ class TimelineData:
 
     def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page
+        self._session = session
         self._ids = session.sequence.frame_ids
         stamps = session.sequence.timestamps
         span = 0.0 if stamps is None or len(stamps) < 2 else float(stamps[-1] - stamps[0])
@@ -37,6 +40,7 @@ class TimelineData:
         self._records: Mapping[int, Record] = {}
         self._codes: dict[int, int] = {}
         self._solving: list[int] | None = None
+        self._traces = Traces(session)
         page.call("setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:
@@ -45,14 +49,27 @@ class TimelineData:
         if state.solve is not None and state.solving:
             solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]
         changed = [] if state.unsaved else self._changed(state.project)
-        if changed or solving != self._solving:
+        measured = self._traces.measure(self._session.sequence)
+        if changed or measured or solving != self._solving:
             self._solving = solving
-            message = {"whole": False, "codes": changed, "solving": solving}
+            message = {"whole": False, "codes": changed, "solving": solving, "traced": bool(changed) or measured}
             self._page.call("setTimeline", message)
+
+    def answer(self, text: str) -> None:
+        """Send a curve that the tab asks for, `{"name", "first", "last", "columns"}`; nonsense is not answered."""
+        try:
+            asked = json.loads(text)
+            name, numbers = str(asked["name"]), [int(asked[key]) for key in ("first", "last", "columns")]
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+            return
+        found = self._traces.between(name, *numbers)
+        if found is not None:
+            self._page.call("setTrace", {"name": name, **found})
 
     def _whole(self) -> dict[str, Any]:
         codes = [number for pair in list(self._codes.items()) for number in pair]
         ids = list(self._ids) if len(self._ids) <= _MOST_IDS else None
+        sequence = self._session.sequence
         return {
             "whole": True,
             "frames": len(self._ids),
@@ -60,6 +77,10 @@ class TimelineData:
             "ids": ids,
             "codes": codes,
             "solving": self._solving,
+            "traces": self._traces.names,
+            "domains": list(sequence.domains),
+            "cameras": [camera.name for camera in sequence.scene.cameras],
+            "aspects": [camera.width / camera.height for camera in sequence.scene.cameras],
         }
 
     def _changed(self, project: ProjectState) -> list[int]:
@@ -71,8 +92,10 @@ class TimelineData:
         whole = before.get(-1) is not project.records.get(-1)
         # What the calibration changes makes figures and verdicts of all frames void.
         indices = {i for i in project.records if i >= 0} if whole else set(touched)
+        indices |= {i for i in before if i >= 0 and i not in project.records}
+        self._traces.follow(project, indices)
         changed: list[int] = []
-        for index in sorted(indices | {i for i in before if i >= 0 and i not in project.records}):
+        for index in sorted(indices):
             number = code(project, index)
             if self._codes.get(index, 0) != number:
                 self._codes[index] = number

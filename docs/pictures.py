@@ -148,7 +148,9 @@ def main() -> None:
         sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        take(Photographer(app, browser.new_page(viewport=WINDOW)))
+        page = browser.new_page(viewport=WINDOW)
+        page.add_init_script("localStorage.setItem('carts-tour', 'seen')")
+        take(Photographer(app, page))
         browser.close()
     for path in sorted(IMAGES.glob("*.jpg")):
         print(f"{path.name}: {path.stat().st_size // 1024} KiB")

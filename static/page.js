@@ -11,8 +11,11 @@
   const OVERLAY = "/overlay";
   const OTHERS = "/others"; // the other cameras' frames and overlays, beside the shown one's
   const SCENE_ONLY = ["/world", "/lens", "/grid"]; // what the frame covers, or what would only clutter it
+  const GHOST = "/world/measured "; // the arms as measured, see-through, in the 3D view
   const SCENE_LAYER = 7;
   const ENDOSCOPE_LAYER = 8;
+  const SWITCHED = { grid: 9, ghost: 10 }; // layers of the 3D view that can be switched off
+  const switchedOn = { grid: true, ghost: true };
   const MARGIN = 1.02;
   const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: what is in the middle, as a share of the image
   const viser = () => window.__viserMutable;
@@ -246,13 +249,18 @@
       <span class="carts-zoom">
         <button data-do="out" title="Zoom out" aria-label="Zoom out">−</button><output></output>
         <button data-do="in" title="Zoom in (wheel over the picture)" aria-label="Zoom in">+</button>
-        <button data-do="fit" title="Show the whole picture (double click)">Fit</button>
       </span>
       <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe">⌕</button>
+      <span class="carts-layers">
+        <button data-do="ghost" title="Show the arms as measured, see-through">Measured</button>
+        <button data-do="grid" title="Show the grid: 1 cm, and 5 cm between strong lines">Grid</button>
+      </span>
+      <button data-do="fit" title="Show all of it (double click on the picture)">Fit</button>
       <button data-do="theme" title="Light or dark" aria-label="Light or dark">◐</button>
       <button data-do="help" title="Keys (?)" aria-label="Keys">?</button>`;
     const actions = {
-      endoscope: showEndoscope, scene: showScene, fit: showEndoscope,
+      endoscope: showEndoscope, scene: showScene, fit: () => (view.endoscope ? showEndoscope() : showScene()),
+      grid: () => toggle("grid"), ghost: () => toggle("ghost"),
       loupe: () => window.carts.toggleLoupe(), theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
@@ -265,11 +273,16 @@
     }
     hint = document.createElement("div");
     hint.className = "carts-hint";
-    hint.textContent = "Drag to orbit · right-drag to move · wheel to come closer";
+    hint.textContent = "Drag to orbit · right-drag to move · wheel to come closer · grid of 1 cm";
     const parent = canvas.parentElement;
     if (getComputedStyle(parent).position === "static") parent.style.position = "relative";
     parent.append(bar, hint);
     drawBar();
+  }
+
+  function toggle(name) {
+    switchedOn[name] = !switchedOn[name];
+    refresh();
   }
 
   function drawBar() {
@@ -278,6 +291,8 @@
     press("endoscope", view.endoscope);
     press("scene", !view.endoscope);
     bar.querySelector(".carts-zoom").style.display = view.endoscope ? "" : "none";
+    bar.querySelector(".carts-layers").style.display = view.endoscope ? "none" : "";
+    for (const name of Object.keys(SWITCHED)) press(name, switchedOn[name]);
     bar.querySelector("output").textContent = `${Math.round(view.zoom * 100)} %`;
     hint.style.display = view.endoscope ? "none" : "";
   }
@@ -452,11 +467,15 @@
     if (view.endoscope && mutable.cameraControl.enabled) mutable.cameraControl.enabled = false;
     // viser sets `visible` itself in every frame, so what belongs to the 3D view alone is kept on a layer of its own.
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
-    if (view.endoscope) mutable.camera.layers.disable(SCENE_LAYER);
-    else mutable.camera.layers.enable(SCENE_LAYER);
+    mutable.nodeRefFromName["/grid"]?.traverse((child) => child.layers.set(SWITCHED.grid));
+    for (const [name, node] of Object.entries(mutable.nodeRefFromName)) {
+      if (name.startsWith(GHOST)) node?.traverse((child) => child.layers.set(SWITCHED.ghost));
+    }
+    const seen = (layer, on) => (on ? mutable.camera.layers.enable(layer) : mutable.camera.layers.disable(layer));
+    seen(SCENE_LAYER, !view.endoscope);
+    for (const [name, layer] of Object.entries(SWITCHED)) seen(layer, !view.endoscope && switchedOn[name]);
     mutable.nodeRefFromName[OTHERS]?.traverse((child) => child.layers.set(ENDOSCOPE_LAYER));
-    if (view.endoscope) mutable.camera.layers.enable(ENDOSCOPE_LAYER);
-    else mutable.camera.layers.disable(ENDOSCOPE_LAYER);
+    seen(ENDOSCOPE_LAYER, view.endoscope);
     arrange();
     // A new camera or image size changes the plane, which three.js does not report.
     const now = JSON.stringify([view.endoscope, imageRectangle(), covered()]);
@@ -481,7 +500,7 @@
     },
     showEndoscope, showScene,
     toggleView: () => (view.endoscope ? showScene() : showEndoscope()),
-    zoomAt, imageOnScreen, report,
+    zoomAt, imageOnScreen, report, switchedOn,
     drawnOverlay: () => drawnTexture,
   };
 })();

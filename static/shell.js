@@ -56,7 +56,8 @@
     if (asked > 20 && asked % 10) return;
     const { problem, ...place } = linked();
     const name = localStorage.getItem("carts-name") ?? "";
-    ask(`hello ${JSON.stringify({ tab: key, name, theme: wanted(), ...place })}`);
+    const settings = JSON.parse(localStorage.getItem("carts-settings") ?? "{}");
+    ask(`hello ${JSON.stringify({ tab: key, name, theme: wanted(), settings, ...place })}`);
     if (problem && asked === 1) tell(problem);
   }
   setInterval(sayHello, 150);
@@ -97,6 +98,7 @@
     const before = remembered("carts-tab");
     if (first && before) setTimeout(() => chooseTabs(before.tabs), 400);
     localStorage.setItem("carts-name", detail.name);
+    localStorage.setItem("carts-settings", JSON.stringify(detail.settings));
     remember(detail);
     const address = link(detail);
     if (address !== location.href) history.replaceState(null, "", address);
@@ -137,9 +139,11 @@
       const row = ([key, text]) => `<tr><td><kbd>${key}</kbd></td><td>${text}</td></tr>`;
       const table = ([name, rows]) => `<section><h3>${name}</h3><table>${rows.map(row).join("")}</table></section>`;
       sheet.innerHTML =
-        `<header><b>Keys</b> Press ? again, or Escape, to go on.<button aria-label="Close">×</button></header>` +
+        `<header><b>Keys</b> Press ? again, or Escape, to go on.<button data-do="tour">Take the tour</button>` +
+        `<button aria-label="Close">×</button></header>` +
         `<div class="carts-columns">${groups.map(table).join("")}</div>`;
-      sheet.querySelector("button").addEventListener("click", () => showSheet(false));
+      sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
+      sheet.querySelector("[data-do=tour]").addEventListener("click", () => { showSheet(false); window.carts.startTour(); });
       sheet.addEventListener("click", (event) => { if (event.target === sheet) showSheet(false); });
       document.body.append(sheet);
     }
@@ -154,6 +158,25 @@
     event.preventDefault();
     event.stopPropagation();
   }, { capture: true });
+
+  // ---- What a control is about, when the pointer rests on it or on its label; over fields viser does that -----------------
+
+  let hints = {};
+  let explained = 0;
+
+  function explain() {
+    for (const [id, hint] of Object.entries(hints)) {
+      const control = document.getElementById(id);
+      const named = control?.closest("button") ?? document.querySelector(`label[for="${id}"]`);
+      if (named && named.title !== hint) named.title = hint;
+    }
+  }
+
+  document.addEventListener("pointerover", () => {
+    if (performance.now() - explained < 300) return;
+    explained = performance.now();
+    explain();
+  });
 
   // ---- The other pose, as long as a key is held --------------------------------------------------------------------------
 
@@ -204,6 +227,7 @@
 
   Object.assign(window.carts, {
     copyLink, key,
+    setHints(message) { hints = message; explain(); },
     /** A server that was started since this page was loaded knows nothing of our widgets. */
     meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
     showSheet: () => showSheet(true),

@@ -1,37 +1,54 @@
 // The strip below the picture: all frames with what was said and found about them, to be zoomed, dragged and clicked.
-// A line of the whole sequence lies below it. Needs page.js.
+// A line of the whole sequence lies below it. Needs page.js and lanes.js.
 (() => {
   "use strict";
 
   const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15"]; // the last one: moved by hand
   const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
-  const [TOP, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
+  const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
+  const [PICTURES, CURVE] = [38, 36]; // heights of what is left out in low windows [px]
+  const TALL = 560; // a window's height from which they are shown [px]
   const LEAST = 8; // frames that are shown when zoomed in as far as it goes
+  const GRIP = 7; // how near to an end of the range it is taken hold of [px]
 
   let strip = null;
   let canvas = null;
   let readout = null;
+  let picker = null;
   let frames = 0;
   let ids = null;
   let codes = new Uint32Array(0); // per frame: review + 8 fit + 32 source + 128 kept + 256 badness
   let here = 0;
   let solving = null;
   let fps = 0;
+  let known = { domains: [], cameras: [], aspects: [] };
+  let shown = { names: [], active: 0, domain: "", range: null };
+  let range = null; // first and last frame of what is played, solved and optimized
   let view = [0, 1]; // first and last frame that is shown
-  let dragging = null; // "scrub" or "whole"
+  let dragging = null; // "scrub", "whole" or "range"
+  let anchor = 0; // where a range was begun
   let hover = null;
   let dirty = true;
   let wanted = null;
+  let open = localStorage.getItem("carts-lanes") !== "closed";
 
   function build() {
     const below = window.__viserMutable?.canvas;
     if (!below || strip?.isConnected) return;
     strip = document.createElement("div");
     strip.className = "carts-strip";
-    strip.innerHTML = `<canvas role="slider" aria-label="Timeline: drag to scrub, wheel to zoom" tabindex="-1"></canvas>
-      <output></output>`;
-    [canvas, readout] = [strip.querySelector("canvas"), strip.querySelector("output")];
+    strip.innerHTML = `<div class="carts-strip-head">
+        <button data-do="first" title="Begin the range at this frame: what is played, solved and optimized. Key: (">[&nbsp;In</button>
+        <button data-do="last" title="End the range at this frame. Key: )">Out&nbsp;]</button>
+        <button data-do="whole" title="No range: the whole sequence">×</button>
+        <span class="carts-range"></span>
+        <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, or the fit"></select>
+        <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve">▾</button>
+        <output></output>
+      </div>
+      <canvas role="slider" tabindex="-1" aria-label="Timeline: drag to scrub, wheel to zoom, Shift and drag for a range"></canvas>`;
+    [canvas, readout, picker] = ["canvas", "output", "select"].map((name) => strip.querySelector(name));
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
       strip.addEventListener(kind, (event) => event.stopPropagation());
     }
@@ -41,9 +58,33 @@
     canvas.addEventListener("pointerleave", () => { hover = null; dirty = true; });
     canvas.addEventListener("wheel", zoom, { passive: false });
     canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
+    const actions = {
+      first: () => window.carts.report("pressed", "("), last: () => window.carts.report("pressed", ")"),
+      whole: () => window.carts.report("asked", "range none"),
+      lanes: () => { open = !open; localStorage.setItem("carts-lanes", open ? "open" : "closed"); dirty = true; },
+    };
+    strip.addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
+    picker.addEventListener("change", () => { window.carts.lanes.choose(picker.value); picker.blur(); });
+    window.carts.lanes.onChange(() => { dirty = true; });
+    fillPicker();
     below.parentElement.append(strip);
     dirty = true;
   }
+
+  function fillPicker() {
+    if (!picker) return;
+    picker.replaceChildren(...["", ...(known.traces ?? [])].map((name) => new Option(name || "No curve", name)));
+    picker.value = window.carts.lanes.chosen();
+    if (known.traces && picker.selectedIndex < 0) { picker.value = ""; window.carts.lanes.choose(""); }
+  }
+
+  const tall = () => open && innerHeight >= TALL && !document.body.classList.contains("carts-small");
+  const picturesHigh = () => (tall() ? PICTURES : 0);
+  const curveHigh = () => (tall() && window.carts.lanes.chosen() ? CURVE : 0);
+  const barsAt = () => TICKS + picturesHigh();
+  const curveAt = () => barsAt() + BARS + FITS + SOURCES + 2;
+  const wholeAt = () => curveAt() + curveHigh();
+  const high = () => wholeAt() + 6 + WHOLE;
 
   const width = () => canvas.clientWidth;
   const frameAt = (x) => view[0] + (x / width()) * (view[1] - view[0]);
@@ -64,17 +105,35 @@
     wanted = frame;
   }
 
+  /** The other end of the range, when the pointer is at one of its ends. */
+  function gripped(x) {
+    if (!range) return null;
+    if (Math.abs(x - xOf(range[0])) <= GRIP) return range[1];
+    return Math.abs(x - xOf(range[1] + 1)) <= GRIP ? range[0] : null;
+  }
+
   function press(event) {
     canvas.setPointerCapture(event.pointerId);
-    dragging = event.offsetY >= TOP + BARS + FITS + SOURCES + 2 ? "whole" : "scrub";
+    const other = event.offsetY < barsAt() ? gripped(event.offsetX) : null;
+    dragging = event.offsetY >= wholeAt() ? "whole" : event.shiftKey || other !== null ? "range" : "scrub";
+    anchor = other ?? clamped(frameAt(event.offsetX));
     move(event);
   }
 
+  let rangeTimer = null;
+  function mark(first, last) {
+    range = [Math.min(first, last), Math.max(first, last)];
+    clearTimeout(rangeTimer);
+    rangeTimer = setTimeout(() => window.carts.report("asked", `range ${range[0]} ${range[1]}`), 40);
+  }
+
   function move(event) {
-    const inWhole = event.offsetY >= TOP + BARS + FITS + SOURCES + 2;
+    const inWhole = event.offsetY >= wholeAt();
     hover = clamped(inWhole && dragging !== "scrub" ? (event.offsetX / width()) * frames : frameAt(event.offsetX));
     dirty = true;
+    canvas.style.cursor = event.offsetY < barsAt() && gripped(event.offsetX) !== null ? "ew-resize" : "";
     if (dragging === "scrub") go(clamped(frameAt(event.offsetX)));
+    else if (dragging === "range") mark(anchor, clamped(frameAt(event.offsetX)));
     else if (dragging === "whole" && view[1] - view[0] < frames) {
       const count = view[1] - view[0];
       show((event.offsetX / width()) * frames - count / 2, count);
@@ -111,14 +170,16 @@
   function bar(context, x, wide, code, top, height) {
     if (!code) return;
     const bad = (code >> 8) / 255;
-    const high = Math.max(3, bad * height);
+    const tallness = Math.max(3, bad * height);
     context.fillStyle = REVIEW[code & 7];
-    context.fillRect(x, top + height - high, wide, high);
+    context.fillRect(x, top + height - tallness, wide, tallness);
   }
 
   function draw() {
     const ratio = window.devicePixelRatio || 1;
-    const [w, h] = [width(), canvas.clientHeight];
+    canvas.style.height = `${high()}px`;
+    document.documentElement.style.setProperty("--carts-strip", `${strip.offsetHeight}px`);
+    const [w, h] = [width(), high()];
     if (!w) return;
     [canvas.width, canvas.height] = [Math.round(w * ratio), Math.round(h * ratio)];
     const context = canvas.getContext("2d");
@@ -126,33 +187,72 @@
     const light = document.documentElement.dataset.mantineColorScheme === "light";
     const ink = light ? "#374151" : "#aab4b4";
     drawTicks(context, ink, w);
-    const count = view[1] - view[0];
-    const cells = Math.min(Math.ceil(count), Math.floor(w));
+    const lane = { view, frames, xOf, light, ink, w };
+    if (picturesHigh()) {
+      const domain = Math.max(known.domains.indexOf(shown.domain), 0);
+      const camera = shown.active ?? 0;
+      window.carts.lanes.drawThumbnails(
+        context, { ...lane, top: TICKS, height: PICTURES - 2 }, { camera, domain, aspect: known.aspects[camera] ?? 4 / 3 });
+    }
+    drawBars(context, light, w);
+    if (curveHigh()) window.carts.lanes.drawCurve(context, { ...lane, top: curveAt() + 1, height: CURVE - 3 });
+    if (solving) {
+      context.fillStyle = "rgba(232, 121, 249, 0.2)";
+      context.fillRect(xOf(solving[0]), barsAt(), xOf(solving[0] + solving[1]) - xOf(solving[0]), BARS);
+    }
+    drawRange(context, light, w);
+    drawWhole(context, w, h, light);
+    drawHere(context, light);
+    say();
+  }
+
+  function drawBars(context, light, w) {
+    const top = barsAt();
+    const cells = Math.min(Math.ceil(view[1] - view[0]), Math.floor(w));
     const wide = w / cells;
     columns(view[0], view[1], cells).forEach(([code, kept], number) => {
       const x = number * wide;
       const thick = Math.max(wide - (wide > 3 ? 1 : 0), 1);
-      bar(context, x, thick, code, TOP, BARS);
-      if (FIT[(code >> 3) & 3]) { context.fillStyle = FIT[(code >> 3) & 3]; context.fillRect(x, TOP + BARS + 1, thick, FITS - 1); }
-      if (SOURCE[(code >> 5) & 3]) { context.fillStyle = SOURCE[(code >> 5) & 3]; context.fillRect(x, TOP + BARS + FITS + 1, thick, SOURCES - 1); }
-      if (kept) { context.fillStyle = light ? "#111827" : "#f8fafc"; context.fillRect(x + wide / 2 - 1, TOP, 2, 6); }
+      bar(context, x, thick, code, top, BARS);
+      if (FIT[(code >> 3) & 3]) { context.fillStyle = FIT[(code >> 3) & 3]; context.fillRect(x, top + BARS + 1, thick, FITS - 1); }
+      if (SOURCE[(code >> 5) & 3]) { context.fillStyle = SOURCE[(code >> 5) & 3]; context.fillRect(x, top + BARS + FITS + 1, thick, SOURCES - 1); }
+      if (kept) { context.fillStyle = light ? "#111827" : "#f8fafc"; context.fillRect(x + wide / 2 - 1, top, 2, 6); }
     });
-    if (solving) {
-      context.fillStyle = "rgba(232, 121, 249, 0.2)";
-      context.fillRect(xOf(solving[0]), TOP, xOf(solving[0] + solving[1]) - xOf(solving[0]), BARS);
-    }
-    drawWhole(context, w, h, light);
+  }
+
+  /** What is outside of the range is dimmed; its ends can be dragged in the upper part. */
+  function drawRange(context, light, w) {
+    if (!range) return;
+    const [left, right] = [xOf(range[0]), xOf(range[1] + 1)];
+    context.fillStyle = light ? "rgba(248, 250, 252, 0.72)" : "rgba(10, 12, 13, 0.66)";
+    context.fillRect(0, 0, Math.max(left, 0), wholeAt());
+    context.fillRect(right, 0, Math.max(w - right, 0), wholeAt());
+    context.fillStyle = "#f59e0b";
+    context.fillRect(left, 0, 2, wholeAt());
+    context.fillRect(right - 2, 0, 2, wholeAt());
+    context.fillRect(left, 0, 6, 2);
+    context.fillRect(right - 6, 0, 6, 2);
+  }
+
+  function drawHere(context, light) {
     const x = xOf(here);
     context.fillStyle = light ? "#0f766e" : "#2dd4a7";
-    context.fillRect(x, TOP - 3, Math.max(xOf(here + 1) - x, 2), 3);
+    context.fillRect(x, TICKS - 3, Math.max(xOf(here + 1) - x, 2), 3);
     context.globalAlpha = 0.3;
-    context.fillRect(x, TOP, Math.max(xOf(here + 1) - x, 2), BARS + FITS + SOURCES);
+    context.fillRect(x, TICKS, Math.max(xOf(here + 1) - x, 2), wholeAt() - TICKS - 1);
     context.globalAlpha = 1;
+  }
+
+  function say() {
     const frame = hover ?? here;
     const code = codes[frame] ?? 0;
     const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand"][code & 7];
     const fit = ["", " · good", " · doubtful", " · failed"][(code >> 3) & 3];
-    readout.textContent = `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}`;
+    const value = curveHigh() ? window.carts.lanes.valueAt(frame) : "";
+    readout.textContent = `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;
+    strip.querySelector(".carts-range").textContent = range ? `${name(range[0])} – ${name(range[1])}` : "";
+    strip.querySelector("[data-do=whole]").hidden = !range;
+    strip.querySelector("[data-do=lanes]").textContent = open ? "▾" : "▴";
   }
 
   const name = (frame) => (ids && ids[frame] !== undefined ? ids[frame] : String(frame + 1));
@@ -165,7 +265,7 @@
     context.font = "10px system-ui, sans-serif";
     for (let frame = Math.ceil(view[0] / step) * step; frame < view[1]; frame += step) {
       const x = xOf(frame);
-      context.fillRect(x, 0, 1, TOP - 4);
+      context.fillRect(x, 0, 1, TICKS - 4);
       const seconds = fps ? frame / fps : null;
       const time = seconds === null || seconds < 1 ? "" : ` ${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
       context.fillText(`${frame + 1}${time}`, x + 3, 8);
@@ -182,6 +282,10 @@
       context.fillStyle = FIT[(code >> 3) & 3] ?? REVIEW[code & 7];
       context.fillRect((number * w) / cells, top + 2, Math.max(w / cells, 1), WHOLE - 4);
     });
+    if (range) {
+      context.fillStyle = "#f59e0b";
+      context.fillRect((range[0] / frames) * w, top, Math.max(((range[1] + 1 - range[0]) / frames) * w, 1), 2);
+    }
     context.strokeStyle = light ? "#0f766e" : "#2dd4a7";
     context.strokeRect((view[0] / frames) * w + 0.5, top + 0.5, ((view[1] - view[0]) / frames) * w - 1, WHOLE - 1);
     context.fillStyle = context.strokeStyle;
@@ -192,7 +296,7 @@
     requestAnimationFrame(everyFrame);
     build();
     if (!canvas || !frames) return;
-    const size = `${canvas.clientWidth} ${canvas.clientHeight} ${document.documentElement.dataset.mantineColorScheme}`;
+    const size = `${canvas.clientWidth} ${high()} ${document.documentElement.dataset.mantineColorScheme}`;
     if (size !== everyFrame.size) { everyFrame.size = size; dirty = true; }
     if (!dirty) return;
     dirty = false;
@@ -200,27 +304,31 @@
   }
 
   document.addEventListener("carts-page", ({ detail }) => {
+    dirty = true;
+    shown = detail;
+    if (dragging !== "range") range = detail.range;
     if (detail.frame === here) return;
     here = detail.frame;
     const count = view[1] - view[0];
     // What is shown follows the frame, but not while somebody drags.
     if (dragging === null && (here < view[0] || here >= view[1])) show(here - count / 2, count);
-    dirty = true;
   });
   Object.assign(window.carts, {
     /** All that is known, or with `whole` unset what has changed: pairs of frame and code in one row. */
     setTimeline(message) {
       if (message.whole) {
         const other = frames !== message.frames;
-        [frames, fps, ids] = [message.frames, message.fps, message.ids];
+        [frames, fps, ids, known] = [message.frames, message.fps, message.ids, message];
         codes = new Uint32Array(frames);
         if (other) view = [0, frames];
+        fillPicker();
       }
       for (let place = 0; place < message.codes.length; place += 2) codes[message.codes[place]] = message.codes[place + 1];
       solving = message.solving;
+      if (message.whole || message.traced) window.carts.lanes.forget();
       dirty = true;
     },
-    timeline: () => ({ view, frames, here, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
+    timeline: () => ({ view, frames, here, range, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
     showFrames: show,
   });
   everyFrame();

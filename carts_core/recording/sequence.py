@@ -16,7 +16,7 @@ from .background import MeanBackground, background_of_recording, spread
 from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
-from .images import read_image, read_mask
+from .images import ImageSource, read_image, read_mask
 from .matching import TimeMatching
 from .toml_table import closest
 
@@ -194,6 +194,10 @@ class Sequence:
         """
         return self._camera(name).camera
 
+    def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
+        """Where a camera's images come from, as recorded; nothing is kept. Errors as `has_masks`."""
+        return self._camera(camera).images[self._domain(domain)]
+
     def has_masks(self, camera: str, domain: str | None = None) -> bool:
         """Whether the sequence file gives masks for a camera (in a domain).
 
@@ -216,10 +220,9 @@ class Sequence:
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
         """The same with where it is known, and whether it tells what is there without arms; errors as `background`."""
         domain = self._domain(domain)
-        entry = self._camera(camera)
         with self._background_lock:
             if (camera, domain) not in self._backgrounds:
-                self._backgrounds[camera, domain] = self._make_background(entry, domain)
+                self._backgrounds[camera, domain] = self._make_background(self._camera(camera), domain)
             return self._backgrounds[camera, domain]
 
     def _make_background(self, entry: CameraInput, domain: str) -> MeanBackground:
@@ -249,8 +252,7 @@ class Sequence:
         entry = self._camera(camera)
 
         def decode() -> np.ndarray:
-            source = entry.images[domain]
-            image = source.read(index)
+            image = (source := entry.images[domain]).read(index)
             self._check_size(image, camera, f"image {source.name(index)}")
             return entry.camera.undistort(image)
 

@@ -1,5 +1,6 @@
 """Video files as images of a camera: a frame is found by its presentation time, never by counting from a jump."""
 
+import copy
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
@@ -78,6 +79,13 @@ class Video:
                 )
             # Without a number of threads swscale starts some for every frame, which takes 20 times as long.
             return np.ascontiguousarray(frame.to_ndarray(format="rgb24", threads=1))
+
+    def another(self) -> "Video":
+        """A reader of its own of the same file: who jumps about with it does not disturb who reads on with this one."""
+        other = copy.copy(self)
+        other._lock, other._kept = threading.Lock(), _Kept(_KEPT_BYTES // 4)
+        other._open, other._frames, other._last = None, iter(()), None
+        return other
 
     def _decode(self, number: int) -> VideoFrame | None:
         """Decode up to frame `number`; None when it does not come out."""

@@ -12,6 +12,7 @@ from carts_viewer import intents
 from carts_viewer.checks import clamped, finite, one_of, unknown
 from carts_viewer.compare import Against
 from carts_viewer.context import Context, OpenRun
+from carts_viewer.joint_range import Reach
 from carts_viewer.state import RunState
 
 _log = logging.getLogger(__name__)
@@ -46,7 +47,8 @@ class BrowsingHandler:
         if self.wait_time() == 0.0:
             state = self._context.state
             self._next_frame_at = time.monotonic() + 1.0 / state.fps
-            self.show(index=(state.index + 1) % len(self._session.sequence))
+            first, last = state.range or (0, len(self._session.sequence) - 1)
+            self.show(index=state.index + 1 if first <= state.index < last else first)
 
     def show(
         self, *, index: int | None = None, domain: str | None = None, camera: str | None = None, again: bool = False
@@ -129,6 +131,26 @@ class BrowsingHandler:
     @handle.register
     def _(self, intent: intents.ShowBeside) -> None:
         self._context.change(beside=not self._context.state.beside if intent.on is None else intent.on)
+
+    @handle.register
+    def _(self, intent: intents.SetReach) -> None:
+        self._context.change(reach=Reach(intent.reach))
+
+    @handle.register
+    def _(self, intent: intents.SetRange) -> None:
+        end = len(self._session.sequence) - 1
+        first, last = sorted(min(max(int(one), 0), end) for one in intent.frames or (0, end))
+        self._context.change(range=None if (first, last) == (0, end) else (first, last))
+
+    @handle.register
+    def _(self, intent: intents.MarkRange) -> None:
+        index, end = self._context.state.index, len(self._session.sequence) - 1
+        first, last = self._context.state.range or (0, end)
+        # An end before the beginning begins anew there, with the rest of the sequence.
+        if intent.end:
+            self.handle(intents.SetRange((first if first <= index else 0, index)))
+        else:
+            self.handle(intents.SetRange((index, last if last >= index else end)))
 
     @handle.register
     def _(self, intent: intents.CompareWith) -> None:

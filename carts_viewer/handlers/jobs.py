@@ -90,10 +90,13 @@ class JobsHandler:
 
     @handle.register
     def _(self, intent: intents.Solve) -> None:
-        index = self._choices.index
-        self._queue(
-            "solve", "Solve all frames" if intent.whole else "Solve between keyframes", {**asdict(intent), "at": index}
-        )
+        state = self._choices
+        options = {**asdict(intent), "at": state.index}
+        title = "Solve all frames" if intent.whole else "Solve between keyframes"
+        if intent.whole and state.range is not None:
+            first, last = (self._context.session.sequence.frame_ids[index] for index in state.range)
+            title, options["range"] = f"Solve frames {first} to {last}", list(state.range)
+        self._queue("solve", title, options)
 
     @handle.register
     def _(self, intent: intents.Export) -> None:
@@ -179,7 +182,9 @@ class JobsHandler:
             asker.choose(self._context)
         try:
             if job.kind == "solve":
-                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)))
+                part = job.options.get("range")
+                part = None if part is None else range(int(part[0]), int(part[1]) + 1)
+                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)), part)
             elif job.kind == "export":
                 names = ("format", "frames", "parts", "images", "shown_camera")
                 self._exporting.handle(intents.Export(**{name: job.options[name] for name in names}))
@@ -261,6 +266,9 @@ class JobsHandler:
         view = self._context.session.editor.view
         if which == "found":
             frames = found(view, self._choices.filter)
+        elif which == "range":
+            first, last = self._choices.range or (0, len(self._context.session.sequence) - 1)
+            frames = list(range(first, last + 1))
         elif which == "all":
             frames = list(range(len(self._context.session.sequence)))
         else:

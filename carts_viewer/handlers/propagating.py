@@ -71,8 +71,8 @@ class PropagatingHandler:
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
-    def solve(self, whole: bool, at: int) -> None:
-        """Begin to solve all frames, or those between the kept frames around the frame `at`.
+    def solve(self, whole: bool, at: int, part: range | None = None) -> None:
+        """Begin to solve all frames, or those of a part, or those between the kept frames around the frame `at`.
 
         Raises:
             CartsError: there is nothing to solve, or it could not be saved.
@@ -89,7 +89,10 @@ class PropagatingHandler:
             raise CartsError(
                 "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
             )
-        frames = range(len(self._session.sequence)) if whole else between_kept(view, at)
+        everything = range(len(self._session.sequence))
+        if part is not None and (part.start not in everything or part.stop - 1 not in everything or not part):
+            raise CartsError("The chosen range lies outside of the sequence. Choose another one in the timeline.")
+        frames = (part or everything) if whole else between_kept(view, at)
         kept = [frame for frame in view.kept_frames if frame in frames]
         if len(kept) == len(frames):
             raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")

@@ -27,10 +27,13 @@ from .base import Released as Released
 from .base import SetName as SetName
 from .browsing import Browsing as Browsing
 from .browsing import CompareWith as CompareWith
+from .browsing import MarkRange as MarkRange
 from .browsing import MoveFrame as MoveFrame
 from .browsing import Peek as Peek
 from .browsing import Play as Play
 from .browsing import SetOpacity as SetOpacity
+from .browsing import SetRange as SetRange
+from .browsing import SetReach as SetReach
 from .browsing import SetSpeed as SetSpeed
 from .browsing import SetSwipe as SetSwipe
 from .browsing import SetTimeOffset as SetTimeOffset

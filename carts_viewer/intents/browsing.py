@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from carts_viewer.compare import Against
 from carts_viewer.intents.base import Intent, Latest
+from carts_viewer.joint_range import Reach
 from carts_viewer.layers import Layer
 
 
@@ -66,6 +67,27 @@ class ShowBeside(Browsing):
     """Show the other cameras' images beside the active one's, or not; None changes over."""
 
     on: bool | None = None
+
+
+@dataclass(frozen=True)
+class SetReach(Browsing, Latest):
+    """Let the joints' sliders reach so far from the measured values."""
+
+    reach: Reach
+
+
+@dataclass(frozen=True)
+class SetRange(Browsing, Latest):
+    """Choose the part of the sequence from the first to the last of these frames (0-based); None: all of it."""
+
+    frames: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class MarkRange(Browsing):
+    """Begin, or end, the chosen part of the sequence at the shown frame."""
+
+    end: bool = False
 
 
 @dataclass(frozen=True)

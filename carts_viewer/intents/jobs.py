@@ -6,7 +6,7 @@ from typing import Literal
 from carts_viewer.intents.base import Intent
 
 JobKind = Literal["optimize", "solve", "calibrate", "export"]
-Frames = Literal["found", "unreviewed", "all"]
+Frames = Literal["found", "unreviewed", "range", "all"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class OptimizeFrames(Jobs):
     """Run the optimizer on many frames, each alone, from where it is."""
 
     frames: Frames = "unreviewed"
-    """Those that the filter finds, those that nobody has judged, or all."""
+    """Those that the filter finds, those that nobody has judged, those in the chosen range, or all."""
 
 
 @dataclass(frozen=True)

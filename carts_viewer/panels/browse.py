@@ -36,9 +36,9 @@ class BrowsePanel:
         with gui.add_folder("Sequence"):
             # A slider needs two ends even for a sequence of a single frame.
             self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
-            back = gui.add_button("", icon=viser.Icon.CHEVRON_LEFT, color="gray")
+            back = gui.add_button("", icon=viser.Icon.CHEVRON_LEFT, color="gray", hint="Previous frame (B)")
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, color="gray")
-            forward = gui.add_button("", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            forward = gui.add_button("", icon=viser.Icon.CHEVRON_RIGHT, color="gray", hint="Next frame (N)")
             page.row(back, self._play, forward, weights=(1, 2, 1))
             self._speed = gui.add_number("Frames/s", 10.0, min=SPEEDS[0], max=SPEEDS[1], step=0.5)
             self._domains = {humanized(name): name for name in sequence.domains}

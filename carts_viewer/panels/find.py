@@ -26,15 +26,26 @@ class FindPanel:
         with gui.add_folder("Find", expand_by_default=False):
             self._widgets = {
                 "review": gui.add_dropdown("Review", [ANY, *map(str, ReviewState), BY_HAND]),
-                "fit": gui.add_dropdown("Fit", [ANY, *VERDICTS, NOT_CHECKED], hint="What the images say of it"),
+                "fit": gui.add_dropdown(
+                    "Fit",
+                    [ANY, *VERDICTS, NOT_CHECKED],
+                    hint="Frames with this verdict: what the images say of the fit",
+                ),
                 "arm": gui.add_dropdown("Corrected", [ANY, *(arm.name for arm in session.scene.arms)]),
-                "dice": gui.add_number("Dice below", 1.0, min=0.0, max=1.0, step=0.01, hint="1: whatever it is"),
+                "dice": gui.add_number(
+                    "Dice below",
+                    1.0,
+                    min=0.0,
+                    max=1.0,
+                    step=0.01,
+                    hint="Frames that overlap the true mask by less, 0 to 1; 1: whatever it is",
+                ),
                 "note": gui.add_text("Note has", ""),
             }
             self._list = gui.add_html("")
             before = gui.add_button("Previous", icon=viser.Icon.CHEVRON_LEFT, color="gray")
             after = gui.add_button("Next", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
-            clear = gui.add_button("Clear", color="gray")
+            clear = gui.add_button("Clear", color="gray", hint="Forget these conditions")
             page.row(before, after, clear)
             self._bulk = [gui.add_button(name, color="gray") for name in _BULK]
             page.row(*self._bulk)

@@ -21,7 +21,9 @@ class ImportPanel:
         cameras = [camera.name for camera in session.scene.cameras]
         with gui.add_folder("Masks of others", expand_by_default=False):
             self._place = gui.add_text("From", "", hint=_HINT)
-            self._camera = gui.add_dropdown("Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1)
+            self._camera = gui.add_dropdown(
+                "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Whose images the masks are of"
+            )
             self._replace = gui.add_checkbox("Replace", False, hint="Replace what was imported before")
             self._import = gui.add_button("Import masks", icon=viser.Icon.FILE_IMPORT, color="gray")
             self._text = gui.add_html("")

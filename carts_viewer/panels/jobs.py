@@ -11,7 +11,7 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"
-_FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "All": "all"}
+_FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "Range in the timeline": "range", "All": "all"}
 
 
 class JobsPanel:

@@ -3,18 +3,16 @@
 import math
 from collections.abc import Callable
 
-import numpy as np
 import viser
 
 from carts_viewer import intents
 from carts_viewer.handlers.posing import LARGEST_PERTURBATION
-from carts_viewer.joint_range import JointRange
+from carts_viewer.joint_range import JointRange, Reach
 from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
-_WINDOWS = {"± 5": 5.0, "± 20": 20.0, "Full range": math.inf}
 _STEP = 0.05
 """Of the sliders [deg] and [mm]."""
 
@@ -35,17 +33,15 @@ class JointsPanel:
         self._session = session
         self._waits = waits
         self._page = page
-        self._window = 5.0
         self._sliders: dict[tuple[str, int], tuple[JointRange, viser.GuiSliderHandle[float]]] = {}
-        self._centred_on: object = None
         tabs = gui.add_tab_group()
         for arm in session.scene.arms:
             with tabs.add_tab(arm.name, viser.Icon.GRAIN):
                 self._add_arm(page, arm.name, state, emit)
-        window = gui.add_dropdown(
+        self._reach = gui.add_dropdown(
             "Slider range",
-            list(_WINDOWS),
-            initial_value="± 5",
+            [str(reach) for reach in Reach],
+            initial_value=str(state.reach),
             hint="How far the sliders reach from the measured values [° or mm]",
         )
         perturb = gui.add_button("Perturb all joints", color="gray")
@@ -67,14 +63,8 @@ class JointsPanel:
         on_click(measured, lambda _: intents.BackToMeasured(), emit)
         on_click(before, lambda _: intents.CopyCorrection(-1), emit)
         on_click(after, lambda _: intents.CopyCorrection(1), emit)
+        on_input(self._reach, lambda name: intents.SetReach(Reach(name)), emit)
         on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]), emit)
-
-        @window.on_update
-        async def _(event: viser.GuiEvent) -> None:
-            if event.client_id is not None and window.value in _WINDOWS:
-                self._window = _WINDOWS[window.value]
-                self._centred_on = None
-                emit(intents.Refresh())
 
     def perturb(self) -> intents.Perturb:
         """The perturbation that the fields describe."""
@@ -89,16 +79,12 @@ class JointsPanel:
         """Bring the widgets up to date."""
         joints = self._session.joints(state.pose.scene)
         with self._page.atomic():
-            if self._centred_on != state.frame.index:
-                self._centred_on = state.frame.index
-                self._centre(state, joints)
             for (arm, joint), (limits, slider) in self._sliders.items():
-                shown = to_shown(limits, float(joints[arm][joint]))
                 # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
-                near = math.isfinite(slider.value) and abs(slider.value - shown) < _STEP / 2
-                if not near and not self._waits((intents.SetJoint, arm, joint)):
-                    self._widen(slider, shown)
-                    slider.value = round(shown, 2)
+                if not self._waits((intents.SetJoint, arm, joint)):
+                    measured, shown = (to_shown(limits, float(of[arm][joint])) for of in (state.frame.measured, joints))
+                    self._place(slider, limits, state, measured, shown)
+        write(self._reach, str(state.reach))
         if state.joint is not None:
             write(self._nudged, next(name for name, joint in self._names.items() if joint == state.joint))
 
@@ -110,40 +96,51 @@ class JointsPanel:
             value = to_shown(limits, float(joints[joint]))
             unit = "°" if limits.revolute else "mm"
             label = f"{humanized(limits.joint)} [{unit}]"
+            ends = f"limits {low:.0f} to {high:.0f} {unit}"
+            hint = f"{'Angle' if limits.revolute else 'Position'} of this joint of {arm} [{unit}], {ends}"
             slider = gui.add_slider(
-                label, math.floor(min(low, value)), math.ceil(max(high, value)), _STEP, round(value, 2)
+                label, math.floor(min(low, value)), math.ceil(max(high, value)), _STEP, round(value, 2), hint=hint
             )
             self._sliders[arm, joint] = (limits, slider)
             on_input(slider, self._intent(arm, joint, limits), emit)
         if len(self._session.scene.arms) > 1:
-            reset = gui.add_button(f"{arm} back to measured", icon=viser.Icon.HISTORY, color="gray")
+            reset = gui.add_button(
+                f"{arm} back to measured",
+                icon=viser.Icon.HISTORY,
+                color="gray",
+                hint=f"Forget the corrections of {arm} in this frame",
+            )
             on_click(reset, lambda _: intents.BackToMeasured(arm), emit)
 
     def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], intents.Intent]:
         return lambda shown: intents.SetJoint(arm, joint, from_shown(limits, shown))
 
-    def _centre(self, state: ViewState, joints: dict[str, np.ndarray]) -> None:
-        """Put the sliders' ends around the measured values, within the joints' limits, and the sliders where they are.
-
-        Whatever a slider showed before was of another frame.
-        """
-        measured = state.frame.measured
-        for (arm, joint), (limits, slider) in self._sliders.items():
-            low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
-            middle = to_shown(limits, float(measured[arm][joint]))
-            shown = round(to_shown(limits, float(joints[arm][joint])), 2)
-            first, last = max(low, min(middle - self._window, high)), min(high, max(middle + self._window, low))
-            slider.min = _tidy(min(first, math.floor(shown)))
-            slider.max = _tidy(max(last, math.ceil(shown)))
-            slider.value = shown
-
     @staticmethod
-    def _widen(slider: viser.GuiSliderHandle[float], value: float) -> None:
-        """Let the slider reach a value beyond its ends."""
-        if value < slider.min:
-            slider.min = math.floor(value)
-        if value > slider.max:
-            slider.max = math.ceil(value)
+    def _place(
+        slider: viser.GuiSliderHandle[float], limits: JointRange, state: ViewState, measured: float, shown: float
+    ) -> None:
+        """Put a slider's ends around the measured value, within the joint's limits, and the slider where it is.
+
+        The ends reach as far as the shown value, and come back when it does; not while somebody drags, or what is under
+        the pointer would be another value.
+        """
+        low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
+        middle, width = max(low, min(measured, high)), state.reach.width
+        first = _tidy(min(max(low, middle - width), math.floor(shown)))
+        last = _tidy(max(min(high, middle + width), math.ceil(shown)))
+        if state.unsaved:
+            first, last = min(first, slider.min), max(last, slider.max)
+        write_end(slider, "min", first)
+        write_end(slider, "max", last)
+        near = math.isfinite(slider.value) and abs(slider.value - shown) < _STEP / 2
+        if not near:
+            slider.value = round(shown, 2)
+
+
+def write_end(slider: viser.GuiSliderHandle[float], end: str, value: float) -> None:
+    """Set an end of a slider if it is another one."""
+    if getattr(slider, end) != value:
+        setattr(slider, end, value)
 
 
 def to_shown(limits: JointRange, value: float) -> float:

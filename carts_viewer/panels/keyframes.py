@@ -52,6 +52,7 @@ class KeyframesPanel:
         """Bring the widgets up to date."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
+        self._all.label = "Solve all" if state.range is None else "Solve the range"
         self._all.disabled = self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)

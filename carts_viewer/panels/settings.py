@@ -100,7 +100,8 @@ class FreePanel:
             for arm in session.scene.arms:
                 gui.add_html(f'<p class="carts-caption"><b>{escaped(arm.name)}</b> joints</p>')
                 for joint in arm.robot.joint_names:
-                    box = gui.add_checkbox(humanized(joint), is_free(state, arm.name, joint))
+                    hint = f"Let the optimizer move this joint of {arm.name}"
+                    box = gui.add_checkbox(humanized(joint), is_free(state, arm.name, joint), hint=hint)
                     self._joints[arm.name, joint] = box
                     on_input(box, _free_joint(arm.name, joint), emit)
                 page.columns([self._joints[arm.name, joint] for joint in arm.robot.joint_names])

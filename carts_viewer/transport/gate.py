@@ -4,7 +4,7 @@ import contextlib
 import http
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import websockets.asyncio.server
@@ -20,7 +20,9 @@ _SERVER_CONSTRUCTION = threading.Lock()
 
 
 @contextlib.contextmanager
-def gated(respond: Callable[[Request], Response | None], refuse: Callable[[object], str | None]) -> Iterator[None]:
+def gated(
+    respond: Callable[[Request], Response | Awaitable[Response] | None], refuse: Callable[[object], str | None]
+) -> Iterator[None]:
     """While active, a websocket server that is started gets a gate.
 
     Args:

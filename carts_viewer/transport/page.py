@@ -14,7 +14,7 @@ import io
 import json
 import mimetypes
 import secrets
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import viser
@@ -31,9 +31,10 @@ from carts_viewer.transport.outgoing import queue_safely
 from carts_viewer.transport.tab_page import call
 from carts_viewer.transport.viser_private import element_id, on_sent, run_script, value_of
 
-OWN_KEYS = ("[", "]", "escape")
+OWN_KEYS = ("[", "]", "(", ")", "escape")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
 
+_THUMBNAIL = "/thumbnail/"
 _FIELDS = {
     "drawn": "it has drawn a new overlay",
     "released": "somebody let go of a slider or left a field",
@@ -78,6 +79,8 @@ class Page:
         self.project = ""
         """Name of the recording that is shown; empty while none is."""
         self.media = Media()
+        self.thumbnail: Callable[[str], Awaitable[Response]] | None = None
+        """Answers what is asked for below `/thumbnail/`; None while no recording is shown."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
@@ -113,6 +116,7 @@ class Page:
         self._farewells.clear()
         self.key_groups = []
         self.project = ""
+        self.thumbnail = None
         self.server.gui.reset()
         self.server.scene.reset()
         self._add_fields()
@@ -202,7 +206,7 @@ class Page:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
         return element_id(handle)
 
-    def _respond(self, request: Request) -> Response | None:
+    def _respond(self, request: Request) -> Response | Awaitable[Response] | None:
         """Our own answer to a request, or None to let viser answer it."""
         reason = self._guard.refusal(request.path, request.headers)
         if reason is not None:
@@ -212,6 +216,8 @@ class Page:
             return self._static(path.removeprefix("/static/"))
         if path.startswith(MEDIA):
             return self.media.answer(path.removeprefix(MEDIA))
+        if path.startswith(_THUMBNAIL) and self.thumbnail is not None:
+            return self.thumbnail(path.removeprefix(_THUMBNAIL))
         if path in ("/", "/index.html") and request.headers.get("Upgrade") != "websocket":
             # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
             own = f"connect-src 'self' ws://{request.headers['Host']} data: blob:"
@@ -253,7 +259,9 @@ class Page:
                 '<script src="/static/marks.js" defer></script>'
                 '<script src="/static/loupe.js" defer></script>'
                 '<script src="/static/drag.js" defer></script>'
+                '<script src="/static/lanes.js" defer></script>'
                 '<script src="/static/timeline.js" defer></script>'
+                '<script src="/static/tour.js" defer></script>'
                 '<script src="/static/shell.js" defer></script>'
                 '<link rel="stylesheet" href="/static/document.css" />'
                 '<script src="/static/document.js" defer></script>',

@@ -46,6 +46,10 @@ class TabPage:
         """Send what waits."""
         self.client.flush()
 
+    def widgets(self) -> list[Any]:
+        """Every widget of the tab that holds a value, buttons included."""
+        return list(widgets(self.gui))
+
     def find(self, label: str) -> Any:
         """The widget with this label (for tests and scripts)."""
         return next(handle for handle in widgets(self.gui) if getattr(handle, "label", None) == label)

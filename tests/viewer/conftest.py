@@ -77,12 +77,17 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
-    """Opens a tab of a viewer, in a window of any size, when the first picture is there."""
+    """Opens a tab of a viewer, in a window of any size, when the first picture is there.
+
+    The browser has seen the page before, unless it is a `new` one.
+    """
     with ExitStack() as stack:
 
-        def make(app: ViewerApp, window: tuple[int, int] = (1280, 800)) -> Tab:
+        def make(app: ViewerApp, window: tuple[int, int] = (1280, 800), *, new: bool = False) -> Tab:
             context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
             stack.callback(context.close)
+            if not new:
+                context.add_init_script("localStorage.setItem('carts-tour', 'seen')")
             page = context.new_page()
             page.goto(app.url)
             tab = Tab(app, page, Canvas(app, page))

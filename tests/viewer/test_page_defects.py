@@ -1,8 +1,13 @@
 """What once stood in people's way, in a real browser: one session, several checks."""
 
+import csv
+import math
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
+from cut_off import hardly_legible
 from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
@@ -99,6 +104,15 @@ def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab
     app.queue.put(intents.ShowFrame(11))
     app.wait_until_shown()
     assert slider.max - slider.min <= 12 and slider.min <= slider.value <= slider.max
+    # They reach as far as the joint goes, and come back when it does.
+    tab.place_in_viewer.put(intents.SetJoint("PSM1", 0, math.radians(slider.value - 15.0)))
+    tab.place_in_viewer.put(intents.Released())
+    eventually(lambda: (slider.min, slider.max, slider.value), lambda now: now[0] <= now[2] and now[1] - now[0] > 18)
+    tab.button("Back to measured")
+    eventually(lambda: slider.max - slider.min, lambda wide: wide <= 12)
+    track = f"[id='{app.page.element_id(slider)}'] [role=slider]"
+    for name, end in (("aria-valuemin", slider.min), ("aria-valuemax", slider.max)):
+        expect(tab.page.locator(track)).to_have_attribute(name, f"{end:g}")
     # Keys go on working after a list was used.
     tab.choose("Domain", "Smoke")
     eventually(lambda: app.state.domain, lambda domain: domain == "smoke")
@@ -179,6 +193,11 @@ def test_jobs_go_on_while_the_page_is_used_and_a_server_that_comes_back_finds_ev
     eventually(lambda: app.state.index, lambda index: index == 1)
     tab.button("Cancel")
     expect(tab.page.locator(".carts-jobs li.cancelled")).to_be_visible()
+    # So is how far sliders reach, and what is drawn over the image, in a server that knows nothing of this tab.
+    tab.choose("Slider range", "± 20")
+    tab.choose("Layer", "Contour")
+    eventually(lambda: (app.state.reach, app.state.layer), lambda now: now == ("± 20", "Contour"))
+    tab.page.wait_for_function("JSON.parse(localStorage.getItem('carts-settings')).layer == 'Contour'")
     # The same address answers again, by another server: frame and tab are those from before.
     app.queue.put(intents.ShowFrame(4))
     app.wait_until_shown()
@@ -191,3 +210,119 @@ def test_jobs_go_on_while_the_page_is_used_and_a_server_that_comes_back_finds_ev
         eventually(lambda: again.state.index, lambda index: index == 4, timeout=60)
         expect(tab.page.locator("[role=tab][aria-selected=true]").filter(has_text="Jobs")).to_be_visible(timeout=20_000)
         expect(tab.page.locator(".carts-jobs li.cancelled")).to_be_visible()
+        eventually(lambda: (again.state.reach, again.state.layer), lambda now: now == ("± 20", "Contour"))
+        view = tab.place_in(again).view
+        assert view is not None
+        slider = view.layout.joints.slider("PSM1", 0)
+        assert slider.max - slider.min > 30
+
+
+def test_times_of_ros_are_read_as_dates_and_seconds(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    def as_ros(folder: Path) -> None:
+        table = folder / "kinematics.csv"
+        rows = list(csv.reader(table.open()))
+        place = rows[0].index("time")
+        for row in rows[1:]:
+            row[place] = f"{1467072000.25 + float(row[place]):.6f}"
+        table.write_text("\n".join(map(",".join, rows)) + "\n")
+
+    app = open_viewer(width=160, height=120, prepare=as_ros)
+    tab = open_tab(app)
+    tab.page.keyboard.press("n")
+    caption = tab.page.locator(".carts-caption").filter(has_text="(2 of 3)")
+    expect(caption).to_contain_text("0.100 s after the first, 2016-06-28 00:00:00 UTC")
+    assert "e+09" not in tab.page.locator("body").inner_text()
+
+
+def test_clicked_keypoints_stay_when_the_optimizer_runs(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(width=160, height=120)
+    tab = open_tab(app)
+    tab.page.keyboard.press("h")
+    tab.page.keyboard.down("Shift")
+    tab.page.mouse.click(*tab.place(80, 60))
+    tab.page.keyboard.up("Shift")
+    expect(tab.page.locator(".carts-pin")).to_have_count(1)
+    # What is to be clicked is not hidden: a ring is open, and fades with its name near the pointer.
+    ring = tab.page.locator(".carts-point circle").first
+    assert ring.evaluate("one => getComputedStyle(one).fill") == "none"
+    box = ring.bounding_box()
+    assert box is not None
+    tab.page.mouse.move(box["x"] + 9, box["y"] + 9)
+    expect(tab.page.locator(".carts-point.near")).not_to_have_count(0)
+    tab.button("Run")
+    eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
+    expect(tab.page.locator(".carts-pin")).to_have_count(1)
+
+
+_LINKS_IN_3D = """() => {
+    const { nodeRefFromName: nodes, camera, canvas } = window.__viserMutable;
+    const depth = nodes['/frame'].position.z;
+    const inverse = nodes[''].matrixWorld.clone().invert();
+    const places = [];
+    for (const [name, node] of Object.entries(nodes)) {
+        if (!/^\\/world\\/\\d+\\/[^/]+$/.test(name) || !node) continue;
+        const at = camera.position.clone().setFromMatrixPosition(node.matrixWorld);
+        if (at.clone().applyMatrix4(inverse).length() > 14 * depth) continue;
+        at.project(camera);
+        places.push([(at.x + 1) / 2 * canvas.clientWidth, (1 - at.y) / 2 * canvas.clientHeight]);
+    }
+    return places;
+}"""
+
+
+def test_the_3d_view_shows_the_arms_whole_with_grid_axes_and_the_measured_arms(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(width=160, height=120)
+    tab = open_tab(app)
+    tab.place_in_viewer.put(intents.Perturb(6.0, 0))
+    app.wait_until_shown()
+    tab.page.keyboard.press("v")
+    tab.page.wait_for_timeout(1500)
+    strip, canvas = (tab.page.locator(name).first.bounding_box() for name in (".carts-strip", "canvas"))
+    assert strip is not None and canvas is not None
+
+    def seen_whole() -> bool:
+        places = tab.page.evaluate(_LINKS_IN_3D)
+        bottom = strip["y"] - canvas["y"]
+        return len(places) >= 3 and all(0 < x < canvas["width"] and 40 < y < bottom for x, y in places)
+
+    assert seen_whole()
+    # Fit brings it back from anywhere.
+    tab.page.mouse.move(canvas["x"] + 560, canvas["y"] + 300)
+    tab.page.mouse.down(button="right")
+    tab.page.mouse.move(canvas["x"] + 40, canvas["y"] + 300, steps=6)
+    tab.page.mouse.up(button="right")
+    eventually(seen_whole, lambda whole: not whole)
+    tab.page.get_by_role("button", name="Fit", exact=True).click()
+    eventually(seen_whole, bool)
+    tab.page.wait_for_timeout(1200)
+    # Grid and measured arms are there, and can be switched off.
+    for name in ("Grid", "Measured"):
+        before = tab.canvas.screenshot().astype(int)
+        tab.page.get_by_role("button", name=name, exact=True).click()
+        tab.page.wait_for_timeout(700)
+        changed = np.abs(before - tab.canvas.screenshot()).max(axis=-1) > 12
+        assert changed.sum() > 150, name
+    axes = "Object.keys(window.__viserMutable.nodeRefFromName).filter(name => name.endsWith('/axes')).length"
+    assert tab.page.evaluate(axes) == 2
+    tab.page.keyboard.press("v")
+    tab.page.wait_for_function("carts.imageOnScreen() !== null")
+
+
+def test_every_text_can_be_read_in_the_light_and_in_the_dark(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(cameras=("left", "right"), width=160, height=120)
+    tab = open_tab(app)
+    for scheme in ("dark", "light"):
+        expect(tab.page.locator(f"html[data-mantine-color-scheme={scheme}]")).to_have_count(1)
+        for name in ("Optimize", "Review", "Values", "Jobs", "Export", "Help"):
+            tab.page.get_by_role("tab", name=name, exact=True).click()
+            tab.page.wait_for_timeout(200)
+            assert hardly_legible(tab.page) == [], (scheme, name)
+        tab.page.get_by_role("button", name="Light or dark").click()

@@ -68,9 +68,9 @@ class Canvas:
         return image
 
     def _strip_height(self) -> int:
-        """How far up the timeline and its label hide the picture [px]."""
-        boxes = [self._page.locator(f".carts-strip{part}").first.bounding_box() for part in ("", " output")]
-        return int(sum(box["height"] for box in boxes if box is not None)) + 1
+        """How far up the timeline hides the picture [px]."""
+        box = self._page.locator(".carts-strip").first.bounding_box()
+        return 1 if box is None else int(box["height"]) + 1
 
     def _bar_height(self) -> int:
         """How far down the tool bar hides the picture [px]."""

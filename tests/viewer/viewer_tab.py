@@ -22,8 +22,12 @@ class Tab:
     @property
     def place_in_viewer(self) -> Place:
         """What the viewer keeps of this tab."""
+        return self.place_in(self.app)
+
+    def place_in(self, app: ViewerApp) -> Place:
+        """What another viewer at the same address keeps of it."""
         key = self.page.evaluate("carts.key")
-        return next(place for place in self.app.tabs if place.key == key)
+        return next(place for place in app.tabs if place.key == key)
 
     @property
     def state(self) -> ViewState:

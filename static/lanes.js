@@ -1,0 +1,139 @@
+// The timeline's thumbnails and its curve. Only what is in view is asked for: pictures from the server one after the
+// other, the curve as lowest and highest value of every column. timeline.js says where to draw. Needs page.js.
+(() => {
+  "use strict";
+
+  const KEPT = 800; // pictures
+  const AT_ONCE = 2;
+  const WAIT = 90; // before a curve is asked for anew while somebody zooms [ms]
+  const COLOURS = ["#8b98a5", "#2dd4a7"]; // of a curve: as measured, and corrected
+
+  // ---- Thumbnails -----------------------------------------------------------------------------------------------------
+
+  const pictures = new Map(); // address -> image, or null where there is none
+  const loading = new Set();
+  let waiting = [];
+  let drawAgain = () => {};
+
+  function load() {
+    while (loading.size < AT_ONCE && waiting.length) {
+      const address = waiting.shift();
+      const image = new Image();
+      const done = (found) => {
+        loading.delete(address);
+        pictures.set(address, found);
+        if (pictures.size > KEPT) pictures.delete(pictures.keys().next().value);
+        drawAgain();
+        load();
+      };
+      loading.add(address);
+      image.onload = () => done(image);
+      image.onerror = () => done(null);
+      image.src = address;
+    }
+  }
+
+  /** Pictures of some frames in view, so many frames apart that they do not overlap. */
+  function drawThumbnails(context, { view, frames, xOf, top, height, light }, { camera, domain, aspect }) {
+    const wide = Math.max(height * aspect, 8);
+    const one = xOf(1) - xOf(0);
+    const step = one >= wide ? 1 : 2 ** Math.ceil(Math.log2(wide / one));
+    const missing = [];
+    for (let frame = Math.floor(view[0] / step) * step; frame < Math.min(view[1], frames); frame += step) {
+      const address = `/thumbnail/${camera}/${domain}/${frame}.jpg`;
+      const x = xOf(frame);
+      const picture = pictures.get(address);
+      if (picture) context.drawImage(picture, x, top, wide - 1, height);
+      else {
+        context.fillStyle = light ? "#e5e7eb" : "#1f2528";
+        context.fillRect(x, top, wide - 1, height);
+        if (picture === undefined && !loading.has(address)) missing.push(address);
+      }
+    }
+    // What was asked for and has gone out of view is not wanted any more.
+    waiting = missing;
+    load();
+  }
+
+  // ---- The curve ---------------------------------------------------------------------------------------------------------
+
+  let chosen = localStorage.getItem("carts-curve") ?? "";
+  let curve = null; // the newest answer
+  let asked = "";
+  let timer = null;
+
+  /** Ask for the curve in view, unless that was done; the old one is drawn meanwhile. */
+  function ask(view, columns) {
+    const [first, last] = [Math.floor(view[0]), Math.ceil(view[1])];
+    const key = `${chosen} ${first} ${last} ${columns}`;
+    if (key === asked) return;
+    asked = key;
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      window.carts.report("asked", `trace ${JSON.stringify({ name: chosen, first, last, columns })}`);
+    }, WAIT);
+  }
+
+  function limits() {
+    const values = curve.curves.flat(2).filter((value) => value !== null);
+    if (!values.length) return null;
+    const [low, high] = values.reduce(([a, b], value) => [Math.min(a, value), Math.max(b, value)], [Infinity, -Infinity]);
+    const room = Math.max((high - low) * 0.08, Math.abs(high) * 1e-4, 1e-6);
+    return [low - room, high + room];
+  }
+
+  function drawCurve(context, { view, xOf, top, height, ink, w }) {
+    ask(view, Math.floor(w));
+    context.font = "10px system-ui, sans-serif";
+    const ends = curve?.name === chosen ? limits() : null;
+    if (!ends) {
+      context.fillStyle = ink;
+      if (curve?.name === chosen) context.fillText(`${chosen}: nothing known of these frames`, 4, top + height / 2 + 3);
+      return;
+    }
+    const yOf = (value) => top + height - ((value - ends[0]) / (ends[1] - ends[0])) * height;
+    curve.curves.forEach(([lows, highs], number) => {
+      context.strokeStyle = COLOURS[curve.curves.length === 1 ? 1 : number];
+      context.lineWidth = 1.3;
+      context.lineCap = "round";
+      context.beginPath();
+      let pen = false;
+      lows.forEach((low, column) => {
+        if (low === null) { pen = false; return; }
+        const x = (xOf(curve.edges[column]) + xOf(curve.edges[column + 1])) / 2;
+        if (pen) context.lineTo(x, yOf(highs[column]));
+        else context.moveTo(x, yOf(highs[column]));
+        context.lineTo(x, yOf(low) + 0.01); // a single value is seen as a dot
+        pen = true;
+      });
+      context.stroke();
+    });
+    context.fillStyle = ink;
+    context.fillText(String(Number(ends[1].toPrecision(4))), 4, top + 9);
+    context.fillText(String(Number(ends[0].toPrecision(4))), 4, top + height - 2);
+  }
+
+  /** The curve's value at a frame, in words; empty where it is not known. */
+  function valueAt(frame) {
+    if (!curve || curve.name !== chosen) return "";
+    const column = curve.edges.findIndex((edge, place) => edge <= frame && frame < curve.edges[place + 1]);
+    if (column < 0) return "";
+    const [lows, highs] = curve.curves.map((ends) => ends.map((values) => values[column])).findLast(([low]) => low !== null) ?? [];
+    if (lows === undefined) return "";
+    return ` · ${lows === highs ? lows : `${lows} to ${highs}`} ${/\[(.*)\]/.exec(chosen)?.[1].replace(/^1$/, "") ?? ""}`.trimEnd();
+  }
+
+  Object.assign(window.carts, {
+    lanes: {
+      drawThumbnails, drawCurve, valueAt,
+      onChange: (callback) => { drawAgain = callback; },
+      chosen: () => chosen,
+      choose(name) { chosen = name; localStorage.setItem("carts-curve", name); asked = ""; drawAgain(); },
+      /** Other values are known now. */
+      forget() { asked = ""; },
+      loaded: () => [...pictures.keys()],
+      curve: () => curve,
+    },
+    setTrace(message) { curve = message; drawAgain(); },
+  });
+})();

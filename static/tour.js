@@ -1,0 +1,120 @@
+// A tour over the page: one thing after the other is framed and explained. It is offered once, can be left at any time
+// and begun again from the sheet of keys. Needs page.js and shell.js.
+(() => {
+  "use strict";
+
+  const SEEN = "carts-tour";
+  const STEPS = [
+    ["canvas", "The picture", "The recorded image, with the arm over it where the joint positions say it is. Wheel: zoom; drag: move; " +
+      "a click chooses a camera."],
+    [".carts-verdict", "The verdict", "Whether the fit can be relied on: good, doubtful or failed, with the reason and what to try. " +
+      "It comes from the images, not from the solver."],
+    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
+    ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
+    [".carts-strip", "The timeline", "All frames: high bars fit badly. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
+      "White ticks are keyframes and frames that stay as they are."],
+    ["Review", "Review", "Accept (G) goes on to the next frame. Here are also keyframes, Solve between, search and history."],
+    ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
+    ["Export", "Export", "Masks, keypoints and kinematics for other tools. Everything is saved at once; Undo takes back anything."],
+    [".carts-bar [data-do=help]", "More", "The sheet of keys is here, and under ?. Every control says what it does when the pointer rests on it."],
+  ];
+  let place = -1;
+  let frame = null;
+  let card = null;
+
+  /** What a step is about: by selector, or by the text of a button, tab or folder; null when it is not in view. */
+  function target(name) {
+    const visible = (one) => one && one.getClientRects().length > 0;
+    const direct = /^[A-Z]/.test(name) ? null : document.querySelector(name);
+    if (direct) return visible(direct) ? direct : null;
+    const named = [...document.querySelectorAll("button, [role=tab], .mantine-Paper-root *")];
+    return named.find((one) => one.textContent.trim() === name && visible(one)) ?? null;
+  }
+
+  function build() {
+    frame = document.createElement("div");
+    frame.className = "carts-tour-frame";
+    card = document.createElement("div");
+    card.className = "carts-tour";
+    card.setAttribute("role", "dialog");
+    card.setAttribute("aria-label", "Tour");
+    document.body.append(frame, card);
+  }
+
+  /** Frame what this step is about, and put the card beside it, inside the window. */
+  function draw() {
+    if (place < 0) return;
+    const [name, title, text] = STEPS[place];
+    const box = target(name)?.getBoundingClientRect();
+    frame.style.display = box ? "" : "none";
+    if (box) {
+      const [left, top] = [Math.max(box.left - 4, 2), Math.max(box.top - 4, 2)];
+      Object.assign(frame.style, {
+        left: `${left}px`, top: `${top}px`, width: `${Math.min(box.right + 4, innerWidth - 2) - left}px`,
+        height: `${Math.min(box.bottom + 4, innerHeight - 2) - top}px`,
+      });
+    }
+    card.innerHTML = `<b>${title}</b><p>${text}</p><footer><span>${place + 1} of ${STEPS.length}</span>
+      <button data-do="leave">Leave</button><button data-do="back"${place ? "" : " disabled"}>Back</button>
+      <button data-do="next" class="main">${place + 1 < STEPS.length ? "Next" : "Done"}</button></footer>`;
+    const actions = { leave: end, back: () => go(place - 1), next: () => go(place + 1) };
+    for (const button of card.querySelectorAll("button")) button.onclick = actions[button.dataset.do];
+    const around = box ?? { left: innerWidth / 2, right: innerWidth / 2, top: innerHeight / 2, bottom: innerHeight / 2 };
+    const beside = around.right + card.offsetWidth + 16 < innerWidth ? around.right + 12 : around.left - card.offsetWidth - 12;
+    const inside = (value, size, room) => Math.min(Math.max(value, 8), room - size - 8);
+    const large = around.right - around.left > innerWidth / 2 || (beside < 8 && around.right > innerWidth - card.offsetWidth);
+    const x = large ? (around.left + around.right - card.offsetWidth) / 2 : beside;
+    const y = large && around.top > innerHeight / 2 ? around.top - card.offsetHeight - 12 : around.top + (large ? 80 : 0);
+    card.style.left = `${inside(x, card.offsetWidth, innerWidth)}px`;
+    card.style.top = `${inside(y, card.offsetHeight, innerHeight)}px`;
+    card.querySelector(".main").focus();
+  }
+
+  function go(step) {
+    if (step >= STEPS.length) { end(); return; }
+    place = Math.max(step, 0);
+    draw();
+  }
+
+  function start() {
+    localStorage.setItem(SEEN, "begun");
+    document.querySelector(".carts-offer")?.remove();
+    if (!card) build();
+    document.body.classList.add("carts-touring");
+    go(0);
+  }
+
+  function end() {
+    place = -1;
+    card?.remove();
+    frame?.remove();
+    card = frame = null;
+    document.body.classList.remove("carts-touring");
+  }
+
+  /** Once in a browser, when there is something to show. */
+  function offer() {
+    if (localStorage.getItem(SEEN) || !document.querySelector(".carts-strip") || document.querySelector(".carts-offer")) return;
+    localStorage.setItem(SEEN, "offered");
+    const note = document.createElement("div");
+    note.className = "carts-note carts-offer";
+    note.setAttribute("role", "status");
+    note.innerHTML = `New here? <button data-do="start">Take the tour</button><button data-do="close" aria-label="No tour">×</button>`;
+    note.querySelector("[data-do=start]").onclick = start;
+    note.querySelector("[data-do=close]").onclick = () => note.remove();
+    document.body.append(note);
+    setTimeout(() => note.remove(), 20_000);
+  }
+
+  document.addEventListener("carts-page", () => setTimeout(offer, 1500), { once: true });
+  window.addEventListener("resize", draw);
+  window.addEventListener("keydown", (event) => {
+    if (place < 0) return;
+    const step = { Escape: end, ArrowRight: () => go(place + 1), ArrowLeft: () => go(place - 1) }[event.key];
+    if (!step) return;
+    step();
+    event.preventDefault();
+    event.stopImmediatePropagation();
+  }, { capture: true });
+  Object.assign(window.carts, { startTour: start });
+})();

@@ -1,0 +1,80 @@
+"""What the page says of itself: tooltips, and the tour."""
+
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import expect
+from viewer_tab import Tab
+
+from carts_viewer.app import ViewerApp
+from carts_viewer.panels.hints import HINTS, explain
+
+pytestmark = pytest.mark.browser
+
+
+def test_every_control_says_what_it_does_when_the_pointer_rests_on_it(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(cameras=("left", "right"), domains=("regular", "smoke"), width=160, height=120)
+    tab = open_tab(app)
+    view = tab.place_in_viewer.view
+    assert view is not None
+    assert len(view.page.widgets()) > 120 and explain(view.page) == []
+    # It is seen over buttons, also greyed out, and over labels and fields; of a joint with its unit and limits.
+    joint = view.layout.joints.slider("PSM1", 0)
+    assert joint.hint is not None and "[°], limits" in joint.hint
+    for name in ("Run", "Pause", "Accept + next", "Export mask"):
+        if name == "Accept + next":
+            tab.page.get_by_role("tab", name="Review", exact=True).click()
+        if name == "Export mask":
+            tab.page.get_by_role("tab", name="Export", exact=True).click()
+        tab.page.mouse.move(640, 5)
+        tab.page.get_by_role("button", name=name, exact=True).hover(force=True)
+        expect(tab.page.get_by_role("button", name=name, exact=True)).to_have_attribute("title", HINTS[name])
+    for handle in (joint, view.page.find("Seed"), view.page.find("Layer")):
+        element = app.page.element_id(handle)
+        expect(tab.page.locator(f"label[for='{element}']")).to_have_attribute("title", str(handle.hint))
+        tab.page.locator(f"[id='{element}']").first.hover(force=True)
+        expect(tab.page.get_by_role("tooltip").filter(has_text=str(handle.hint))).to_be_visible()
+        tab.page.mouse.move(640, 5)
+    # Our own buttons and bars have titles, too.
+    bare = "button:not([title]):not([aria-label]), select:not([title])"
+    for bar in (".carts-bar", ".carts-strip"):
+        assert tab.page.locator(bar).locator(bare).count() == 0
+
+
+def test_the_tour_is_offered_once_goes_over_the_page_and_can_be_left_at_any_time(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_viewer(width=160, height=120), new=True)
+    tab.page.get_by_role("button", name="Take the tour").click()
+    card, frame = tab.page.get_by_role("dialog", name="Tour"), tab.page.locator(".carts-tour-frame")
+    seen = []
+    while card.count():
+        title = card.locator("b").inner_text()
+        box = card.bounding_box()
+        assert box is not None and box["x"] >= 0 and box["y"] >= 0
+        assert box["x"] + box["width"] <= 1280 and box["y"] + box["height"] <= 800
+        expect(frame).to_be_visible()
+        seen.append(title)
+        card.locator("[data-do=next]").click()
+    assert len(seen) == 9 and seen[0] == "The picture" and len(set(seen)) == 9
+    # Not a second time, unless somebody asks for it.
+    tab.page.reload()
+    tab.wait_until_ready()
+    tab.page.wait_for_timeout(2500)
+    expect(tab.page.locator(".carts-offer")).to_have_count(0)
+    tab.page.keyboard.press("?")
+    tab.page.get_by_role("button", name="Take the tour").click()
+    tab.page.keyboard.press("ArrowRight")
+    expect(card).to_contain_text("The verdict")
+    tab.page.keyboard.press("Escape")
+    expect(card).to_have_count(0)
+    expect(frame).to_have_count(0)
+    # Somebody who does not want it is not asked again.
+    other = open_tab(tab.app, new=True)
+    other.page.get_by_role("button", name="No tour").click()
+    other.page.reload()
+    other.wait_until_ready()
+    other.page.wait_for_timeout(2500)
+    expect(other.page.locator(".carts-offer")).to_have_count(0)
