@@ -13,7 +13,7 @@ from carts_core.files import output_path, write_text
 from carts_core.files.reading import Kind, read_text
 
 _KEPT = 50
-"""Jobs that are remembered."""
+"""Jobs that are remembered when they have ended."""
 _LONGEST_LOG = 200
 """Lines."""
 _FILE = Kind("list of jobs", 8 * 2**20)
@@ -79,7 +79,9 @@ class JobList:
         """Queue a job."""
         number = max((job.number for job in self.jobs), default=0) + 1
         job = Job(number, kind, title, dict(options))
-        self.jobs = (*self.jobs, job)[-_KEPT:]
+        ended = [job for job in self.jobs if job.over]
+        dropped = ended[: max(len(ended) - _KEPT, 0)]
+        self.jobs = (*(job for job in self.jobs if job not in dropped), job)
         self._write()
         return job
 

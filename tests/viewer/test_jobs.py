@@ -84,6 +84,16 @@ def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_s
     assert JobList(tmp_path / "work.carts", kept=True).jobs == ()
 
 
+def test_only_jobs_that_have_ended_are_forgotten_however_many_wait(tmp_path: Path) -> None:
+    jobs = JobList(tmp_path / "work.carts", kept=True)
+    for number in range(1, 121):
+        jobs.add("export", "Export", {})
+        jobs.change(number, state=JobState.DONE if number % 2 else JobState.WAITING)
+    kept = [job.number for job in jobs.jobs]
+    assert kept[:3] == [2, 4, 6] and len([n for n in kept if n % 2 == 0]) == 60
+    assert [job.number for job in jobs.jobs if job.over][-1] == 119 and len([n for n in kept if n % 2]) == 50
+
+
 def test_a_line_says_how_far_a_job_is_and_how_long_it_will_take() -> None:
     job = Job(3, "solve", "Solve <all>", state=JobState.RUNNING, done=10, total=40, began=100.0, text="Frame 10")
     line = job_line(job, now=120.0)
