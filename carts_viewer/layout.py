@@ -87,16 +87,7 @@ class Layout:
                 FreePanel(page, session, state, emit),
             ]
         with right.add_tab("Review"):
-            panels += [
-                TimelinePanel(gui),
-                ReviewPanel(page, emit, waits),
-                KeyframesPanel(page, session, emit),
-                KeypointsPanel(page, session, emit),
-                ImportPanel(page, session, emit),
-                FindPanel(page, session, emit, waits),
-                HistoryPanel(page, emit),
-                PeoplePanel(page, state, emit, waits),
-            ]
+            panels += _review(page, session, state, emit, waits)
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
         with right.add_tab("Jobs"):
@@ -112,3 +103,17 @@ class Layout:
         right.set_width(_WIDTH)
         self.timeline = TimelineData(page, session)
         self.panels = [*panels, self.joints, PageState(page, session), self.timeline]
+
+
+def _review(page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> list[Panel]:
+    """What is said and known of frames."""
+    return [
+        TimelinePanel(page.gui),
+        ReviewPanel(page, emit, waits),
+        KeyframesPanel(page, session, emit),
+        KeypointsPanel(page, session, emit),
+        ImportPanel(page, session, emit),
+        FindPanel(page, session, emit, waits),
+        HistoryPanel(page, emit),
+        PeoplePanel(page, state, emit, waits),
+    ]

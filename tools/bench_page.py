@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import BinaryIO
 
 import av
 import numpy as np
@@ -77,7 +78,7 @@ def make_recording(folder: Path, frames: int, cameras: int) -> Path:
     return folder / "sequence.toml"
 
 
-def _write_video(file: io.IOBase, pictures: list[np.ndarray], frames: int) -> None:
+def _write_video(file: BinaryIO, pictures: list[np.ndarray], frames: int) -> None:
     """Encode the pictures once, and write what came out again and again."""
     with av.open(file, "w", format="mp4") as container:
         options = {"preset": "ultrafast", "crf": "33", "bf": "0", "g": "60", "sc_threshold": "0"}

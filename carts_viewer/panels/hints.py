@@ -82,6 +82,9 @@ HINTS = {
     "Cancel": "Stop this job, or take it out of the queue; what it has saved stays",
     "Start again": "Queue this job once more; one on many frames goes on where it stopped",
     "Clear ended": "Take all jobs that have ended off the list",
+    # Live
+    "Start": "Follow the source in the place of the recording",
+    "Stop": "Go back to the recording",
     # Export
     "Format": "What other tools will read",
     "Frames": "Which frames are written, by their review state",

@@ -321,7 +321,7 @@ def test_every_text_can_be_read_in_the_light_and_in_the_dark(
     tab = open_tab(app)
     for scheme in ("dark", "light"):
         expect(tab.page.locator(f"html[data-mantine-color-scheme={scheme}]")).to_have_count(1)
-        for name in ("Optimize", "Review", "Values", "Jobs", "Export", "Help"):
+        for name in ("Optimize", "Review", "Values", "Jobs", "Live", "Export", "Help"):
             tab.page.get_by_role("tab", name=name, exact=True).click()
             tab.page.wait_for_timeout(200)
             assert hardly_legible(tab.page) == [], (scheme, name)

@@ -11,7 +11,7 @@ from carts_viewer.app import ViewerApp
 
 pytestmark = pytest.mark.browser
 
-TABS = ("Optimize", "Review", "Values", "Jobs", "Export", "Help")
+TABS = ("Optimize", "Review", "Values", "Jobs", "Live", "Export", "Help")
 
 
 @pytest.mark.parametrize("window", [(1280, 800), (1920, 1080)])
