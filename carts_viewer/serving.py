@@ -85,8 +85,9 @@ def serve_site(
     inference: Inference = "auto",
     weights: tuple[Path, ...] = (),
     open_browser: bool = False,
+    batch: Path | None = None,
 ) -> None:
-    """Serve the start page until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
+    """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
     Args:
         folders: What the page may look into, and nothing outside.
@@ -96,6 +97,7 @@ def serve_site(
         inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
         open_browser: Open the page in the default browser.
+        batch: Folder of the batch that is shown first; None for the start page.
 
     Raises:
         SystemExit: as `serve`.
@@ -105,7 +107,14 @@ def serve_site(
         try:
             check_address(host, port)
             site = Site(
-                folders, host=host, port=port, device=device, inference=inference, weights=weights, report=_say_doing
+                folders,
+                host=host,
+                port=port,
+                device=device,
+                inference=inference,
+                weights=weights,
+                report=_say_doing,
+                batch=batch,
             )
         except CartsError as error:
             print(f"error: {visible(str(error))}", file=sys.stderr)

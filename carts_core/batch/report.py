@@ -3,7 +3,6 @@
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path, PurePath
 from string import Template
@@ -16,9 +15,9 @@ from ..evaluation.calibration import pose_distance
 from ..files import OutputPath, output_stream, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
 from ..html import STYLE, Cell, Table, anchor, figure_html, section_html, table_html
-from .findings import Findings, FrameFinding, read_findings
+from .findings import FrameFinding
+from .folder import ORDER, KnownJob, known_jobs, most_urgent_first
 from .manifest import Job
-from .state import JobState, present_status
 
 matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False
@@ -35,16 +34,6 @@ _PAGE = Template("""<!doctype html>
 _VERDICTS = ("good", "doubtful", "failed")
 
 
-@dataclass(frozen=True)
-class _Done:
-    """What is known of a job."""
-
-    job: Job
-    status: str
-    state: JobState
-    findings: Findings | None
-
-
 def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
     """Write `report/report.html`, `report/report.json` and the pictures; returns the page's path.
 
@@ -53,11 +42,7 @@ def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Pa
         title: of the page.
         jobs: all of the manifest.
     """
-    folder, known = batch / "report", []
-    for job in jobs:
-        place = batch / "jobs" / job.name
-        status, state = present_status(place) if place.path.is_dir() else ("waiting", JobState())
-        known.append(_Done(job, status, state, read_findings(place) if place.path.is_dir() else None))
+    folder, known = batch / "report", known_jobs(batch, jobs)
     drifts, joints = _drifts(known), _joints(known)
     sections = {
         "Jobs": table_html(_job_table(known)),
@@ -81,14 +66,12 @@ def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Pa
     return (folder / "report.html").path
 
 
-def _job_table(known: Sequence[_Done]) -> Table:
+def _job_table(known: Sequence[KnownJob]) -> Table:
     """Jobs that need somebody first."""
-    order = ["failed", "lost", "stopped", "running", "waiting", "done"]
-    rows = sorted(known, key=lambda entry: order.index(entry.status))
     counts = Counter(entry.status for entry in known)
     return Table(
         "What became of the jobs",
-        ", ".join(f"{counts[status]} {status}" for status in order if counts[status]),
+        ", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
         ("job", "recording", "status", "seconds", "error"),
         tuple(
             (
@@ -96,19 +79,19 @@ def _job_table(known: Sequence[_Done]) -> Table:
                 Cell(str(entry.job.recording)),
                 Cell(entry.status),
                 Cell(f"{sum(step.seconds for step in entry.state.steps.values()):.1f}"),
-                Cell(entry.state.error.strip().splitlines()[-1] if entry.state.error.strip() else ""),
+                Cell(entry.error),
             )
-            for entry in rows
+            for entry in most_urgent_first(known)
         ),
     )
 
 
-def _verdicts(entry: _Done) -> dict[str, int]:
+def _verdicts(entry: KnownJob) -> dict[str, int]:
     counts = Counter(frame.verdict for frame in (entry.findings.frames if entry.findings else ()))
     return {verdict: counts[verdict] for verdict in _VERDICTS}
 
 
-def _verdict_table(known: Sequence[_Done]) -> Table:
+def _verdict_table(known: Sequence[KnownJob]) -> Table:
     """Jobs with the largest share of bad frames first."""
     counted = [(entry, _verdicts(entry)) for entry in known]
     rows = [(entry.job.name, counts) for entry, counts in counted if sum(counts.values())]
@@ -126,7 +109,7 @@ def _verdict_table(known: Sequence[_Done]) -> Table:
     )
 
 
-def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[_Done]) -> str:
+def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> str:
     """Pictures of the frames whose masks are wrong most probably; copied, so that the folder can be sent on its own."""
     frames: list[tuple[Job, FrameFinding]] = [
         (entry.job, frame)
@@ -152,7 +135,7 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[_Done]) -> str
     return text + f'<div class="gallery">{"".join(shown)}</div>' if shown else "<p>No frame has a verdict.</p>"
 
 
-def _drifts(known: Sequence[_Done]) -> list[dict[str, object]]:
+def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
     """Of each base frame in each job: how far it is from that of the job before, in the manifest's order."""
     found, before = [], {}
     for entry in known:
@@ -185,7 +168,7 @@ _Values = tuple[list[float], list[float]]
 """Corrections and reported deviations of a joint [deg, mm]."""
 
 
-def _joints(known: Sequence[_Done]) -> dict[str, _Values]:
+def _joints(known: Sequence[KnownJob]) -> dict[str, _Values]:
     found: dict[str, _Values] = {}
     for entry in known:
         if entry.findings is not None:

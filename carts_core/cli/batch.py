@@ -55,6 +55,7 @@ class Batch:
         Raises:
             CartsError: the manifest is not usable, or jobs have failed.
         """
+        from ..batch.folder import write_jobs
         from ..batch.manifest import read_manifest, shard
         from ..batch.report import write_batch_report
         from .batch_job import check_options
@@ -64,6 +65,7 @@ class Batch:
         chosen = shard(jobs, self.shard)
         check_options(jobs)
         folder = output_folder(self.output, "batch", self.manifest.stem)
+        write_jobs(folder, jobs)
         failed: dict[str, str] = {}
         if not self.report_only:
             failed = self._run(console, chosen, folder)
@@ -71,6 +73,7 @@ class Batch:
             console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
         else:
             console.print("this was one shard; --report-only writes the report once all are done")
+        console.print(f"look at frames of any job: carts view {folder}")
         if failed:
             named = "".join(f"\n  {name}: {_last_line(error)}" for name, error in list(failed.items())[:_NAMED])
             raise CartsError(

@@ -15,7 +15,7 @@ class View:
     """Open a sequence in the browser; without one, a page to choose a recording, or to begin a new one."""
 
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
-    """Sequence file."""
+    """Sequence file, or the folder of a batch."""
     root: tuple[Path, ...] = ()
     """Folders that the page to choose a recording may look into, and nothing outside; by default the working folder.
     With a sequence, folders that masks of others may be imported from, besides its own."""
@@ -33,17 +33,20 @@ class View:
         """Serve until Ctrl-C."""
         from carts_viewer.serving import serve, serve_site
 
-        if self.sequence is None:
+        from ..batch.folder import is_batch
+
+        if self.sequence is None or is_batch(self.sequence):
             if self.project is not None:
                 raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
             serve_site(
-                self.root or (Path(),),
+                self.root or (Path(), *([self.sequence] if self.sequence is not None else [])),
                 host=self.host,
                 port=self.port,
                 device=self.network.device,
                 inference=self.network.inference,
                 weights=self.network.weights,
                 open_browser=self.open_browser,
+                batch=None if self.sequence is None else self.sequence.resolve(),
             )
             return
         serve(

@@ -48,8 +48,17 @@ class Host(Protocol):
     def show_recording(self, draft: str | None = None) -> None:
         """Go to New recording: a new one, or a draft that is there."""
 
-    def open_sequence(self, path: Path) -> None:
-        """Go to the viewer of a sequence; if it cannot be opened, to the start page with the reason."""
+    def show_batch(self, folder: Path) -> None:
+        """Go to a batch; if it cannot be read, to the start page with the reason."""
+
+    def open_sequence(self, path: Path, *, project: Path | None = None, frame: int | None = None) -> None:
+        """Go to the viewer of a sequence; if it cannot be opened, to the start page with the reason.
+
+        Args:
+            path: the sequence file.
+            project: its project; None for the default one.
+            frame: index of the frame to begin with; None for the first.
+        """
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""

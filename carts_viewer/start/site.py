@@ -12,8 +12,10 @@ import viser
 from carts_core.errors import CartsError
 from carts_core.resources import sample_sequence
 from carts_core.settings.inference import Inference
+from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.recording.place import RecordingPlace
+from carts_viewer.start.batch_page import BatchPage
 from carts_viewer.start.host import Place
 from carts_viewer.start.recent import remember
 from carts_viewer.start.roots import Roots
@@ -47,11 +49,13 @@ class Site:
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
         report: Callable[[str], None] = lambda line: None,
+        batch: Path | None = None,
     ) -> None:
-        """Start serving the start page.
+        """Start serving the start page, or a batch.
 
         Args:
             folders: what people may look into, and nothing outside.
+            batch: folder of the batch that is shown first.
             host: the address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
             device: where to render and optimize.
@@ -76,7 +80,7 @@ class Site:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="carts-site", daemon=True)
         self._thread.start()
-        self.post(self.show_start)
+        self.post(self.show_start if batch is None else lambda: self.show_batch(batch))
 
     def __enter__(self) -> "Site":
         return self
@@ -127,8 +131,15 @@ class Site:
         """Open the shipped sequence."""
         self.open_sequence(sample_sequence())
 
-    def open_sequence(self, path: Path) -> None:
-        """Go to the viewer of a sequence; if it cannot be opened, to the start page with the reason."""
+    def show_batch(self, folder: Path) -> None:
+        """Go to a batch; if it cannot be read, to the start page with the reason."""
+        try:
+            self._go(lambda: BatchPage(self, folder))
+        except CartsError as error:
+            self.show_start(str(error))
+
+    def open_sequence(self, path: Path, *, project: Path | None = None, frame: int | None = None) -> None:
+        """See `Host.open_sequence`."""
         self.document.show(f"<h1>Opening {escaped(path.name)}</h1><p>This takes a few seconds.</p>")
         try:
             self._leave()
@@ -136,6 +147,7 @@ class Site:
             self.page.clear(f"{path.stem} · CaRTS")
             app = ViewerApp.open(
                 path,
+                project=project,
                 device=self.device,
                 inference=self.inference,
                 weights=self.weights,
@@ -150,6 +162,8 @@ class Site:
         back = self.page.server.gui.add_button("All recordings", icon=viser.Icon.ARROW_LEFT, color="gray", order=-1.0)
         back.on_click(lambda _: self.post(self.show_start))
         self.app = app
+        if frame is not None:
+            app.queue.put(intents.ShowFrame(frame))
         with suppress(CartsError):
             remember(app)
         self.document.show("")

@@ -37,7 +37,7 @@ class StartPage:
         self._site.document.show(
             "<h1>CaRTS</h1><p>Correct a surgical robot's kinematics from its endoscope image.</p>"
             f'<div class="bar">{button("new", "New recording", kind="main")}{button("open", "Open a sequence file …")}'
-            f"</div>{problem}{self._open()}{unfinished}{shown}"
+            f"{button('open-batch', 'Open a batch …')}</div>{problem}{self._open()}{unfinished}{shown}"
             f'<h2>To try</h2><div class="cards">{self._sample(projects)}</div>'
         )
 
@@ -62,10 +62,14 @@ class StartPage:
                 purpose = "Choose a sequence file (.toml)."
                 new = FileBrowser(self._site.roots, wanted=_is_toml, folders=False, purpose=purpose)
                 self._browser = None if browser is not None else new
+            case "open-batch":
+                purpose = "Choose the folder that carts batch has written to."
+                new = FileBrowser(self._site.roots, wanted=lambda _: False, folders=True, purpose=purpose)
+                self._browser = None if browser is not None else new
             case "browse" if browser is not None:
                 browser.browse(value)
             case "pick" if browser is not None and (path := browser.picked(value)) is not None:
-                return self._site.open_sequence(path)
+                return self._site.show_batch(path) if path.is_dir() else self._site.open_sequence(path)
         self.show()
 
     def click(self, u: float, v: float) -> None:

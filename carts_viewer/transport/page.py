@@ -56,6 +56,13 @@ _FORGET_TOKEN = (
     "history.replaceState(null, '', address);"
 )
 
+_RELOAD = """
+const address = new URL(location.href);
+for (const name of ["project", "frame", "camera", "domain"]) address.searchParams.delete(name);
+history.replaceState(null, "", address);
+location.reload();
+"""
+
 
 class Page:
     """A viser server that answers its own page only, plus the script that runs in that page."""
@@ -129,9 +136,9 @@ class Page:
         initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
 
     def reload(self) -> None:
-        """Have every tab load the page anew."""
+        """Have every tab load the page anew, at no place of the recording that was shown."""
         for client in self.server.get_clients().values():
-            run_script(client, "location.reload();")
+            run_script(client, _RELOAD)
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""

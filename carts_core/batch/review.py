@@ -1,0 +1,86 @@
+"""A project to review a job in: its recording, with what the job has found as corrections."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import CartsError
+from ..export import KinematicsRow, read_kinematics_csv
+from ..files import OutputPath, holds_file
+from ..files.reading import TABLE, VALUES, parse_json, read_bytes
+from ..fingerprints import fingerprint
+from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
+from ..recording import Sequence
+from .manifest import Job
+
+_MADE = {"calibrate": "calibration", "import": "recording"}
+"""Step -> folder with the sequence file that it writes; the first one that a job has is that of its results."""
+
+
+def sequence_file(folder: OutputPath, job: Job) -> Path:
+    """The sequence file that a job's results belong to.
+
+    Args:
+        folder: of the job.
+        job: which one.
+    """
+    made = [folder / name / "sequence.toml" for step, name in _MADE.items() if step in job.steps]
+    return next((path.path for path in made if holds_file(path)), job.recording)
+
+
+def review_project(folder: OutputPath, job: Job) -> Path:
+    """The project to review a job in, begun if it is not there. New results get a new project, the old one stays.
+
+    Args:
+        folder: of the job.
+        job: which one.
+
+    Raises:
+        CartsError: the recording cannot be opened, the results are damaged, or the project cannot be written.
+    """
+    tables = _tables(folder, job)
+    digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
+    path = (folder / f"review-{digest[:12]}.carts").path
+    if not path.exists():
+        project = Project.open(sequence := Sequence.open(sequence_file(folder, job)), path)
+        try:
+            edits = {key: value for table in tables for key, value in _edits(sequence, table)}
+            project.apply(f"Results of {job.name}", edits)
+        finally:
+            project.close()
+    return path
+
+
+def _tables(folder: OutputPath, job: Job) -> list[Path]:
+    steps = [step for step in ("sequence", "optimize") if step in job.steps]
+    return sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
+
+
+def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
+    """Corrected joints and the verdict of each frame of a table."""
+    order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+    try:
+        records: Mapping[str, Any] = parse_json(read_bytes(table.parent / "results.json", VALUES))["frames"]
+        for row in read_kinematics_csv(table, sequence.scene):
+            if row.source != "measured":
+                yield from _of_frame(sequence, order[row.frame_id], row, records[row.frame_id])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CartsError(
+            f"{table.parent} holds no results that can be read: {error!r}. Run the batch again."
+        ) from error
+
+
+def _of_frame(
+    sequence: Sequence, index: int, row: KinematicsRow, record: Mapping[str, Any]
+) -> Iterator[tuple[Key[Any], Any]]:
+    origin = {str(name): str(value) for name, value in record["origin"].items()}
+    made_by = Provenance.made_by_optimizer({"batch": origin}, origin["weights"])
+    for arm in sequence.scene.arms:
+        positions = tuple(map(float, row.joint_positions[arm.name]))
+        std = None if row.joint_std is None else np.asarray(row.joint_std.get(arm.name, np.nan), float)
+        known = None if std is None or not np.isfinite(std).any() else tuple(std.tolist())
+        yield Key.joints(index, arm.name), JointCorrection(positions, made_by, known)
+    if record.get("verdict"):
+        yield Key.verdict(index), FitVerdict(record["verdict"], record["reason"], "", float(record["probability"] or 0))
