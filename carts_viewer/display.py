@@ -7,7 +7,7 @@ from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
 from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer.compare import composed, other_pose
 from carts_viewer.imported import with_imported
-from carts_viewer.layers import Layer, Rgba, imported, paint_over
+from carts_viewer.layers import Layer, Rgba, imported, paint_over, parts
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.rate_limit import RateLimit
@@ -82,6 +82,9 @@ class PageDisplay:
         def at(scene: SceneState, maps: Maps | None) -> Rgba:
             if state.layer is Layer.IMPORTED and not state.streaming:
                 return self._imported(state, camera)
+            if state.layer is Layer.PARTS:
+                painted = state.part_labels_of(camera)
+                return parts(self._renderer.classes(scene, camera, correction, painted), state.opacity)
             return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
 
         overlay, share = at(state.pose.scene, state.maps), state.compare.share
@@ -124,7 +127,8 @@ class PageDisplay:
 
 def _picture(state: ViewState) -> tuple:
     brush = state.brush
-    keys = Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
+    painted_kinds = Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.PART_LABELS
+    keys = *painted_kinds, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
     entries = state.project.records.get(state.index)
     layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
     painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted
@@ -137,6 +141,6 @@ def _draw_paint(
     """Draw what was painted, unless somebody wants to see nothing but the frame."""
     at_work = state.brush.tool is not Tool.OFF
     if at_work or state.layer is not Layer.NONE:
-        # The comparison with the truth shows the corrected mask itself.
-        correction = None if state.layer is Layer.TRUTH else corrected
+        # The comparison with the truth, and the parts, show the corrected mask itself.
+        correction = None if state.layer in (Layer.TRUTH, Layer.PARTS) else corrected
         paint_over(overlay, correction, ignored, max(state.opacity, 0.4) if at_work else state.opacity)

@@ -23,6 +23,7 @@ class Layer(StrEnum):
     SIMILARITY = "Feature similarity"
     NONE = "None"
     IMPORTED = "Imported masks"
+    PARTS = "Parts"
 
 
 ARM_COLORS = ((45, 212, 167), (96, 165, 250), (250, 204, 21), (232, 121, 249))
@@ -63,6 +64,14 @@ def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
     colors, _ = _palette(arm_ids)
     colors[1:, 3] = _byte(opacity)
     return np.take(colors, arm_ids + 1, axis=0)
+
+
+def parts(classes: Int[np.ndarray, "height width"], opacity: float) -> Rgba:
+    """Each class of parts in its colour (`label_color`); 0 is the background."""
+    # As in `_palette`, the background has a colour that cannot be seen.
+    numbers = range(1, int(classes.max(initial=0)) + 1)
+    rows = [(*ARM_COLORS[0], 0), *((*label_color(number), _byte(opacity)) for number in numbers)]
+    return np.take(np.array(rows, np.uint8), classes, axis=0)
 
 
 def contour(arm_ids: ArmIds, opacity: float) -> Rgba:

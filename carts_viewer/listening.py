@@ -4,6 +4,7 @@ import logging
 
 from carts_core.errors import CartsError
 from carts_core.model.camera import Camera
+from carts_core.model.parts import part_classes
 from carts_core.project import ReviewState
 from carts_core.recording import Sequence
 from carts_viewer import intents
@@ -33,6 +34,7 @@ class Listening:
 
     def __init__(self, page: Page, tabs: Tabs, worker: Worker, sequence: Sequence) -> None:
         self._page, self._tabs, self._worker, self._sequence = page, tabs, worker, sequence
+        self._classes = max((one.number for one in part_classes(sequence.scene.arms)), default=0)
         page.on_asked(self._answer)
         page.on_disconnect(lambda client_id: worker.call(lambda: tabs.detach(client_id)))
         page.on_drawn(self._drawn)
@@ -113,7 +115,7 @@ class Listening:
     def _painted(self, client_id: int, text: str) -> None:
         try:
             cameras = {camera.name: camera for camera in self._sequence.scene.cameras}
-            stroke = read_stroke(text, len(self._sequence), cameras)
+            stroke = read_stroke(text, len(self._sequence), cameras, self._classes)
         except CartsError as error:
             # Our page sends no such thing.
             _log.info("Refused: %s", error)

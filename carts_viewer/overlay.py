@@ -2,12 +2,14 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.export.dataset import labelled
 from carts_core.model.keypoints import Keypoint
+from carts_core.model.parts import link_classes
 from carts_core.model.scene import SceneState
-from carts_core.project import MaskCorrection
+from carts_core.project import MaskCorrection, PartLabels
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer, pick_point
 from carts_viewer import layers
@@ -31,6 +33,24 @@ class OverlayRenderer:
         if camera not in self._last or self._last[camera][0] is not state:
             self._last[camera] = (state, self._renderer(camera).segment(state.to(self._device))[0])
         return self._last[camera][1]
+
+    def classes(
+        self, state: SceneState, camera: str, correction: MaskCorrection | None, painted: PartLabels | None
+    ) -> Int[np.ndarray, "height width"]:
+        """Number of the class (`carts_core.model.parts.PartClass`) of every pixel, as it is exported; 0 for none.
+
+        What was added to the mask where nothing is rendered at all has no class.
+        """
+        rendered = self._renderer(camera).segment_links(state.to(self._device))[0]
+        classes = np.append(link_classes(self._scene.arms), 0)
+        links = rendered
+        if correction is not None and (rendered >= 0).any():
+            links = labelled(correction.applied_to(rendered >= 0), rendered, camera)
+        found = classes[links]
+        if painted is not None:
+            labels = painted.labels()
+            found = np.where(labels > 0, labels, found)
+        return found
 
     def mask(
         self, state: SceneState, camera: str, correction: MaskCorrection | None = None

@@ -10,7 +10,7 @@ import torch
 from carts_core.model.scene import SceneState
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings
 from carts_core.optimization.keypoints import Pin
-from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, ProjectState, Review, Source
+from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, PartLabels, ProjectState, Review, Source
 from carts_core.recording import Frame
 from carts_core.settings import Direction, SolverName
 from carts_viewer.compare import Compare
@@ -289,6 +289,10 @@ class ViewState:
     def mask_correction_of(self, camera: str) -> MaskCorrection | None:
         """What was painted on the mask of the shown frame in a camera."""
         return None if self.streaming else self.project.get(Key.mask_correction(self.index, camera))
+
+    def part_labels_of(self, camera: str) -> PartLabels | None:
+        """What pixels of the shown frame were painted as in a camera."""
+        return None if self.streaming else self.project.get(Key.part_labels(self.index, camera))
 
     def ignore_region_of(self, camera: str) -> IgnoreRegion | None:
         """The pixels of the shown frame that the optimizer leaves out in a camera."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from carts_core.errors import SettingsError
 from carts_core.model.camera import Camera
-from carts_core.project import IgnoreRegion, MaskCorrection
+from carts_core.project import IgnoreRegion, MaskCorrection, PartLabels
 
 DIAMETERS = (1, 300)
 """Thinnest and thickest brush [px]."""
@@ -48,6 +48,8 @@ class Brush:
 
     tool: Tool = Tool.OFF
     target: Target = Target.MASK
+    label: int = 0
+    """Number of the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0: any arm."""
     diameter: int = 20
     """[px]"""
     painted: Mapping[int, int] = field(default_factory=dict)
@@ -70,6 +72,8 @@ class Stroke:
     """[px]; a polygon has none."""
     points: Float[np.ndarray, "points 2"]
     """(u, v) [px], at most one image size beyond the image."""
+    label: int = 0
+    """Number of the class that it paints; 0: any arm."""
 
     def covers(self, camera: Camera) -> Mask:
         """The pixels of the camera's image that it covers."""
@@ -86,13 +90,14 @@ class Stroke:
         return canvas.astype(bool)
 
 
-def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera]) -> Stroke:
+def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera], classes: int = 0) -> Stroke:
     """A stroke as a browser sends it, JSON text, which is not trusted.
 
     Args:
         text: what came.
         frames: how many frames there are.
         cameras: by name.
+        classes: the highest number of a class.
 
     Raises:
         SettingsError: it is no stroke over one of these frames and cameras. Points beyond the image and a brush that
@@ -114,6 +119,7 @@ def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera]) -> Stroke
             polygon=values["polygon"] is True,
             diameter=_diameter(values["diameter"]),
             points=_points(values["points"], camera, 3 if values["polygon"] is True else 1),
+            label=_whole(values.get("label", 0), classes + 1),
         )
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise SettingsError(
@@ -134,6 +140,18 @@ def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase
     else:
         added, removed = added | (stroke & ~rendered), removed & ~stroke
     return MaskCorrection.of(added & ~removed, removed) if added.any() or removed.any() else None
+
+
+def relabelled(old: PartLabels | None, stroke: Mask, label: int, *, erase: bool) -> PartLabels | None:
+    """The painted classes after a stroke on the mask; None if none is left.
+
+    What is taken out of the mask has no class any more; what is added without a class keeps the one it has.
+    """
+    if (not erase and not label) or (erase and old is None):
+        return old
+    labels = np.zeros(stroke.shape, np.uint8) if old is None else old.labels().copy()
+    labels[stroke] = 0 if erase else label
+    return PartLabels.of(labels) if labels.any() else None
 
 
 def ignored(old: IgnoreRegion | None, stroke: Mask, *, erase: bool) -> IgnoreRegion | None:

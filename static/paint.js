@@ -39,9 +39,9 @@
   }
 
   function begin(point) {
-    const { frame, camera, target, diameter, tool, colors } = brush;
+    const { frame, camera, target, label, diameter, tool, colors } = brush;
     drawing = {
-      frame, camera, target, diameter, polygon: tool === "polygon", erase: (tool === "eraser") !== shift,
+      frame, camera, target, label, diameter, polygon: tool === "polygon", erase: (tool === "eraser") !== shift,
       points: [point], colors,
     };
   }
@@ -69,9 +69,10 @@
     stroke.number = ++count;
     stroke.sent = performance.now();
     pending.push(stroke);
-    const { number, frame, camera, target, erase, polygon, diameter } = stroke;
+    const { number, frame, camera, target, label, erase, polygon, diameter } = stroke;
     const points = stroke.points.map((point) => point.map((value) => Math.round(value * 10) / 10));
-    window.carts.report("painted", JSON.stringify({ number, frame, camera, target, erase, polygon, diameter, points }));
+    const message = { number, frame, camera, target, label, erase, polygon, diameter, points };
+    window.carts.report("painted", JSON.stringify(message));
   }
 
   function drop() {

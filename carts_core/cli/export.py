@@ -27,7 +27,7 @@ class Export:
     kinematics: Path | None = None
     """Export the frames of this table (what `carts optimize` wrote) instead of the measured kinematics."""
     parts: Parts = "arms"
-    """Give every arm a category of its own, or every link."""
+    """Give every arm a category of its own, or every part of it (shaft, wrist, jaws), or every link."""
     images: bool = True
     """Write the images beside their labels."""
     frame_rate: float | None = None

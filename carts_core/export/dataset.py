@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, unique_file_names, write_bytes
 from ..model.camera import Camera
+from ..model.parts import link_classes, part_classes
 from ..model.scene import Scene, SceneState
 from ..recording import Sequence
 from ..rendering import Renderer
@@ -28,7 +29,7 @@ class Category:
     id: int
     """From 1; 0 is the background."""
     name: str
-    """The arm's name, or `ARM.LINK`."""
+    """The arm's name, `ARM.PART` or `ARM.LINK`."""
     arm: str
 
 
@@ -95,7 +96,21 @@ class Dataset:
     @property
     def categories(self) -> tuple[Category, ...]:
         """The categories that `parts` asks for."""
-        return self.arms if self.parts == "arms" else self.links
+        return self.categories_of(self.parts)
+
+    def categories_of(self, parts: Parts) -> tuple[Category, ...]:
+        """A category for each arm, for each part of one, or for each link."""
+        if parts == "arms":
+            return self.arms
+        if parts == "links":
+            return self.links
+        classes = part_classes(self.scene.arms)
+        return tuple(Category(id, f"{one.arm}.{one.part}", one.arm) for id, one in enumerate(classes, start=1))
+
+    @cached_property
+    def link_classes(self) -> Int[np.ndarray, " links"]:
+        """Number of the class of every link, in the order of `View.link_ids`."""
+        return link_classes(self.scene.arms)
 
     @cached_property
     def renderers(self) -> dict[str, Renderer]:
@@ -116,17 +131,30 @@ class Dataset:
             CartsError: a mask is of another size than its camera, or of pixels that no arm is near.
         """
         for number, (name, frame, camera) in enumerate(monitor.track(self.steps), start=1):
-            link_ids = self.renderers[camera.name].segment_links(self.state(frame))[0]
-            if camera.name in frame.masks:
-                link_ids = labelled(frame.masks[camera.name], link_ids, f"frame {frame.frame_id}, camera {camera.name}")
+            rendered = self.renderers[camera.name].segment_links(self.state(frame))[0]
+            mask, painted = frame.masks.get(camera.name), frame.part_labels.get(camera.name)
+            where, link_ids = f"frame {frame.frame_id}, camera {camera.name}", rendered
+            if mask is not None:
+                link_ids = labelled(mask if painted is None else mask & (painted == 0), rendered, where)
+            if painted is not None:
+                link_ids = painted_links(painted, link_ids, rendered, self.link_classes, where)
             yield View(number, frame, camera, name, link_ids)
 
     def label_image(self, view: View, parts: Parts | None = None) -> UInt[np.ndarray, "height width"]:
         """Category of every pixel, 0 for background; 8 bits if that is enough for all categories, else 16."""
-        ids = {arm.name: arm.id for arm in self.arms}
-        links = (parts or self.parts) == "links"
-        of_link = [0, *(link.id if links else ids[link.arm] for link in self.links)]
+        of_link = [0, *self._category_ids(parts or self.parts)]
         return np.array(of_link, np.uint8 if max(of_link) <= 255 else np.uint16)[view.link_ids + 1]
+
+    def _category_ids(self, parts: Parts) -> list[int]:
+        """The category of every link, in the order of `View.link_ids`."""
+        if parts == "links":
+            return [link.id for link in self.links]
+        if parts == "arms":
+            ids = {arm.name: arm.id for arm in self.arms}
+            return [ids[link.arm] for link in self.links]
+        numbers = [one.number for one in part_classes(self.scene.arms)]
+        # Links that nothing shows have a class that need not be there.
+        return [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
 
     def instances(self, view: View) -> Iterator[tuple[Category, Bool[np.ndarray, "height width"]]]:
         """The categories that are visible, each with its mask."""
@@ -179,3 +207,39 @@ def labelled(
         )
     rows, columns = np.asarray(distance_transform_edt(rendered < 0, return_distances=False, return_indices=True))
     return np.where(mask, rendered[rows, columns], -1)
+
+
+def painted_links(
+    painted: UInt8[np.ndarray, "height width"],
+    link_ids: Int[np.ndarray, "height width"],
+    rendered: Int[np.ndarray, "height width"],
+    classes: Int[np.ndarray, " links"],
+    where: str,
+) -> Int[np.ndarray, "height width"]:
+    """`link_ids` with what was painted as a class: each such pixel gets the nearest rendered link of that class.
+
+    Args:
+        painted: number of a class, 0 for none.
+        link_ids: labels from 0, -1 for background.
+        rendered: the same before a mask was applied.
+        classes: number of the class of every link.
+        where: what errors call the view.
+
+    Raises:
+        CartsError: the labels have another size, or name a class that no link has.
+    """
+    if painted.shape != link_ids.shape:
+        raise CartsError(f"{where}: painted classes are {painted.shape}, the camera's images are {link_ids.shape}.")
+    numbers = np.unique(painted[painted > 0])
+    if unknown := set(numbers.tolist()) - set(classes.tolist()):
+        raise CartsError(f"{where}: a pixel was painted as class {min(unknown)}, which no link of the scene has.")
+    found = link_ids.copy()
+    for number in numbers:
+        own = np.isin(rendered, np.flatnonzero(classes == number))
+        pixels = painted == number
+        if own.any():
+            rows, columns = np.asarray(distance_transform_edt(~own, return_distances=False, return_indices=True))
+            found[pixels] = rendered[rows, columns][pixels]
+        else:
+            found[pixels] = np.flatnonzero(classes == number)[0]
+    return found

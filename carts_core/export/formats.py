@@ -7,7 +7,9 @@ from pathlib import Path
 
 from ..files import MARKER, OutputPath, published, published_file, write_text
 from ..settings import FormatName
+from .bop import write_bop
 from .coco import write_coco
+from .coco_keypoints import write_coco_keypoints
 from .cvat import write_cvat
 from .dataset import Dataset
 from .datumaro import write_datumaro
@@ -35,6 +37,8 @@ class ExportFormat:
 FORMATS: dict[FormatName, ExportFormat] = {
     "masks": ExportFormat("PNG masks", write_masks),
     "coco": ExportFormat("COCO", write_coco),
+    "coco-keypoints": ExportFormat("COCO keypoints", write_coco_keypoints),
+    "bop": ExportFormat("BOP poses", write_bop),
     "yolo": ExportFormat("YOLO segmentation", write_yolo),
     "voc": ExportFormat("Pascal VOC", write_voc),
     "cvat": ExportFormat("CVAT for images", write_cvat),

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
 from ..errors import SequenceError
@@ -19,6 +19,9 @@ class ExportFrame(KinematicsRow):
     """0-based position in the sequence."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> where arms are visible, at the camera's size; a camera without an entry gets the rendered mask."""
+    part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
+    """Camera -> number of the class (`carts_core.model.parts.PartClass`) that a pixel was painted as, 0 for none. What
+    was painted belongs to that part whatever is rendered there, and to the mask."""
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:

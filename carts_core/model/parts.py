@@ -1,15 +1,50 @@
 """Parts that surgical instruments have in common, whatever their links are called."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Int
 
 from .robot import SLENDER, Robot
+from .scene import Arm
 
 PARTS = ("shaft", "wrist", "jaws")
 """In the order of their index."""
 
 _PROBE = 0.1
+
+
+@dataclass(frozen=True)
+class PartClass:
+    """A part of an arm as a class of pixels."""
+
+    number: int
+    """From 1, and 3 to an arm whatever parts it has: 1 + 3 * index of the arm + index of the part."""
+    arm: str
+    part: str
+    """One of `PARTS`."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.arm} {self.part}"
+
+
+def part_classes(arms: Sequence[Arm]) -> tuple[PartClass, ...]:
+    """The classes of these arms, of parts that have a mesh."""
+    classes: list[PartClass] = []
+    for index, arm in enumerate(arms):
+        seen = link_parts(arm.robot)[[mesh.link for mesh in arm.robot.meshes]]
+        first = 1 + len(PARTS) * index
+        classes += [PartClass(first + part, arm.name, PARTS[part]) for part in np.unique(seen).tolist()]
+    return tuple(classes)
+
+
+def link_classes(arms: Sequence[Arm]) -> Int[np.ndarray, " links"]:
+    """Number of the class of every link, counted through all arms."""
+    return np.concatenate([1 + len(PARTS) * index + link_parts(arm.robot) for index, arm in enumerate(arms)])
 
 
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:

@@ -14,6 +14,7 @@ from .keys import Kind as Kind
 from .layers import IgnoreRegion as IgnoreRegion
 from .layers import ImportedMask as ImportedMask
 from .layers import MaskCorrection as MaskCorrection
+from .layers import PartLabels as PartLabels
 from .place import default_path as default_path
 from .place import rescued_copies as rescued_copies
 from .project import Project as Project

@@ -81,7 +81,11 @@ VERSION_5 = """
 -- The same tables. Changes may be of the kinds imported_mask, imported_keypoints and imported_labels.
 """
 
-MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5)
+VERSION_6 = """
+-- The same tables. Changes may be of the kind part_labels.
+"""
+
+MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6)
 """Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
 SEALED = 3
 """The first schema with digests."""

@@ -11,7 +11,7 @@ from ..errors import ProjectError
 from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
 from .imported_values import ImportedKeypoints, ImportedLabels
-from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection
+from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection, PartLabels
 from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review, TimeOffset
 
 V_co = TypeVar("V_co", covariant=True)
@@ -26,6 +26,7 @@ class Kind(StrEnum):
     JOINTS = "joints"
     MASK_CORRECTION = "mask_correction"
     IGNORE_REGION = "ignore_region"
+    PART_LABELS = "part_labels"
     BASE_FRAME = "base_frame"
     EXTRINSICS = "extrinsics"
     INTRINSICS = "intrinsics"
@@ -42,6 +43,7 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.JOINTS: JointCorrection,
     Kind.MASK_CORRECTION: MaskCorrection,
     Kind.IGNORE_REGION: IgnoreRegion,
+    Kind.PART_LABELS: PartLabels,
     Kind.BASE_FRAME: CorrectedTransform,
     Kind.EXTRINSICS: CorrectedTransform,
     Kind.INTRINSICS: CorrectedIntrinsics,
@@ -56,7 +58,8 @@ VALUE_TYPES: dict[Kind, type] = {
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
 _IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}
-_OF_FRAME = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.IGNORE_REGION, *_IMPORTED, *_MARKS}
+_PAINTED = {Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.PART_LABELS}
+_OF_FRAME = {Kind.JOINTS, *_PAINTED, *_IMPORTED, *_MARKS}
 _OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET, Kind.IMPORTED_LABELS}
 
 
@@ -84,6 +87,11 @@ class Key(Generic[V_co]):
     def ignore_region(frame: int, camera: str) -> "Key[IgnoreRegion]":
         """Pixels where something hides the arms."""
         return Key(Kind.IGNORE_REGION, operator.index(frame), camera)
+
+    @staticmethod
+    def part_labels(frame: int, camera: str) -> "Key[PartLabels]":
+        """Classes that a person gave to pixels."""
+        return Key(Kind.PART_LABELS, operator.index(frame), camera)
 
     @staticmethod
     def imported_mask(frame: int, camera: str) -> "Key[ImportedMask]":

@@ -108,6 +108,23 @@ class IgnoreRegion(Layer):
         return self.pixels() == _IGNORED
 
 
+class PartLabels(Layer):
+    """What a person painted a pixel as: the number of a class (`carts_core.model.parts.PartClass`), 0 for none."""
+
+    @classmethod
+    def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
+        """The layer of these numbers.
+
+        Raises:
+            ProjectError: they are no picture of 8 bits.
+        """
+        return cls(_png(_of_8_bits(labels)))
+
+    def labels(self) -> UInt8[np.ndarray, "height width"]:
+        """Class of every pixel, not to be written to."""
+        return self.pixels()
+
+
 class ImportedMask(Layer):
     """What others marked in a frame: the number of a label (`ImportedLabels`) per pixel, 0 where nothing is marked."""
 
@@ -118,10 +135,7 @@ class ImportedMask(Layer):
         Raises:
             ProjectError: they are no picture of 8 bits.
         """
-        labels = np.asarray(labels)
-        if labels.ndim != 2 or labels.dtype != np.uint8:
-            raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
-        return cls(_png(labels))
+        return cls(_png(_of_8_bits(labels)))
 
     def labels(self) -> UInt8[np.ndarray, "height width"]:
         """Label of every pixel, not to be written to."""
@@ -141,6 +155,13 @@ def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height wid
     image = image.astype(np.uint8, copy=False)
     image.flags.writeable = False
     return image
+
+
+def _of_8_bits(labels: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    labels = np.asarray(labels)
+    if labels.ndim != 2 or labels.dtype != np.uint8:
+        raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
+    return labels
 
 
 def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:

@@ -5,6 +5,8 @@ from typing import Literal
 FormatName = Literal[
     "masks",
     "coco",
+    "coco-keypoints",
+    "bop",
     "yolo",
     "voc",
     "cvat",
@@ -19,5 +21,5 @@ FormatName = Literal[
 ]
 """Names of the export formats."""
 
-Parts = Literal["arms", "links"]
-"""What gets a category of its own."""
+Parts = Literal["arms", "parts", "links"]
+"""What gets a category of its own: every arm, every part of it (shaft, wrist, jaws), or every link."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, export, mask_png
+from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, Parts, export, mask_png
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.model.scene import SceneState
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
@@ -32,6 +32,8 @@ FRAME_CHOICES = {
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
 }
 """What people can choose: review states of the frames that are exported."""
+PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
+"""What may get a category of its own."""
 _STEMS = {
     "csv": "kinematics",
     "npz": "kinematics",
@@ -118,7 +120,7 @@ class ExportingHandler:
     def _(self, intent: intents.Export) -> None:
         if self._job is not None:
             raise CartsError("Something is being exported already. Wait, or cancel that first.")
-        if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in ("arms", "links"):
+        if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
             raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
         self._open_run.end("Stopped: frames are exported")
         self._context.save()
@@ -178,6 +180,9 @@ def shown_mask(context: Context) -> tuple[str, bytes]:
     state, sequence = context.state, context.session.sequence
     name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
     mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)
+    painted = state.part_labels_of(state.camera)
+    if painted is not None:
+        mask = mask | (painted.labels() > 0)
     return name, mask_png(mask)
 
 
@@ -205,12 +210,14 @@ def export_frame(
     pose = session.pose(frame, project)
     known = {name: value.standard_deviations for name, value in project.joints(index).items()}
     painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
+    labels = {camera: project.get(Key.part_labels(index, camera)) for camera in cameras}
     return ExportFrame(
         frame.frame_id,
         _SOURCES[pose.source],
         session.joints(pose.scene),
         {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
         index=index,
+        part_labels={name: value.labels() for name, value in labels.items() if value is not None},
         masks=CorrectedMasks(renderer, pose.scene, {name: p for name, p in painted.items() if p is not None}),
     )
 

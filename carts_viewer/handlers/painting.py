@@ -4,11 +4,14 @@ from dataclasses import replace
 from functools import singledispatchmethod
 from typing import Any
 
-from carts_core.project import Key, Kind
+from carts_core.errors import CartsError
+from carts_core.model.parts import part_classes
+from carts_core.project import Key, Kind, ProjectState
 from carts_viewer import intents
 from carts_viewer.checks import clamped, unknown
 from carts_viewer.context import Context, OpenRun
-from carts_viewer.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored
+from carts_viewer.layers import Layer
+from carts_viewer.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored, relabelled
 
 _STEPS = {
     (Target.MASK, False): "Add to the mask",
@@ -50,6 +53,16 @@ class PaintingHandler:
         self._hold(target=intent.target or other)
 
     @handle.register
+    def _(self, intent: intents.SetPaintClass) -> None:
+        known = {0, *(one.number for one in part_classes(self._session.scene.arms))}
+        if intent.number not in known:
+            raise CartsError(f"There is no class {intent.number!r} to paint; there are: {sorted(known)}.")
+        self._hold(label=intent.number, target=Target.MASK)
+        if intent.number:
+            # Otherwise nobody would see which class is where.
+            self._context.change(layer=Layer.PARTS)
+
+    @handle.register
     def _(self, intent: intents.SetDiameter) -> None:
         self._hold(diameter=round(clamped(intent.diameter, *DIAMETERS)))
 
@@ -67,12 +80,11 @@ class PaintingHandler:
             covered = stroke.covers(self._session.scene.camera(stroke.camera))
             project = self._session.editor.view
             if stroke.target is Target.MASK:
-                key: Key[Any] = Key.mask_correction(stroke.frame, stroke.camera)
-                layer = corrected(project.get(key), covered, self._rendered(stroke), erase=stroke.erase)
+                edits = self._masked(project, stroke, covered)
             else:
                 key = Key.ignore_region(stroke.frame, stroke.camera)
-                layer = ignored(project.get(key), covered, erase=stroke.erase)
-            self._change(_STEPS[stroke.target, stroke.erase], key, layer)
+                edits = {key: ignored(project.get(key), covered, erase=stroke.erase)}
+            self._change(self._step(stroke), edits)
         finally:
             self._hold(painted=painted)
 
@@ -80,20 +92,37 @@ class PaintingHandler:
     def _(self, intent: intents.ClearLayer) -> None:
         state = self._context.state
         target = intent.target or state.brush.target
-        make = Key.mask_correction if target is Target.MASK else Key.ignore_region
-        self._change(_CLEARED[target], make(state.index, state.camera), None)
+        painted = (Key.mask_correction, Key.part_labels) if target is Target.MASK else (Key.ignore_region,)
+        self._change(_CLEARED[target], {make(state.index, state.camera): None for make in painted})
 
-    def _change(self, name: str, key: Key[Any], layer: Any) -> None:
-        """Save a layer as one step of undo, if it is another one."""
-        if self._session.editor.view.get(key) != layer:
+    def _masked(self, project: ProjectState, stroke: Stroke, covered: Mask) -> dict[Key[Any], Any]:
+        """What a stroke on the mask changes: the mask, and which part a pixel is."""
+        mask, labels = Key.mask_correction(stroke.frame, stroke.camera), Key.part_labels(stroke.frame, stroke.camera)
+        return {
+            mask: corrected(project.get(mask), covered, self._rendered(stroke), erase=stroke.erase),
+            labels: relabelled(project.get(labels), covered, stroke.label, erase=stroke.erase),
+        }
+
+    def _step(self, stroke: Stroke) -> str:
+        """What the history calls a stroke."""
+        if stroke.label and not stroke.erase and stroke.target is Target.MASK:
+            names = {one.number: one.name for one in part_classes(self._session.scene.arms)}
+            return f"Paint {names[stroke.label]}"
+        return _STEPS[stroke.target, stroke.erase]
+
+    def _change(self, name: str, edits: dict[Key[Any], Any]) -> None:
+        """Save layers as one step of undo, those that are others than before."""
+        view = self._session.editor.view
+        changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}
+        if changed:
             self._open_run.end("Stopped: something was painted; Run starts anew from here")
-            self._context.edit(name, {key: layer}, loss=self._loss(key))
+            self._context.edit(name, changed, loss=self._loss(next(iter(changed))))
 
     def _loss(self, key: Key[Any]) -> float | None:
         """The optimizer's loss that still holds after this layer changes: a corrected mask changes nothing for it."""
         figures = self._session.editor.view.figures(key.frame)
         shown = key.frame == self._context.state.index
-        return figures.loss if figures and shown and key.kind is Kind.MASK_CORRECTION else None
+        return figures.loss if figures and shown and key.kind is not Kind.IGNORE_REGION else None
 
     def _rendered(self, stroke: Stroke) -> Mask:
         """The mask that the stroke corrects, as it is rendered in the stroke's frame."""

@@ -80,6 +80,7 @@ from .painting import Paint as Paint
 from .painting import Painting as Painting
 from .painting import ScaleBrush as ScaleBrush
 from .painting import SetDiameter as SetDiameter
+from .painting import SetPaintClass as SetPaintClass
 from .painting import SetTarget as SetTarget
 from .painting import SetTool as SetTool
 from .painting import ToggleTool as ToggleTool

@@ -33,6 +33,13 @@ class SetTarget(Painting, Latest):
 
 
 @dataclass(frozen=True)
+class SetPaintClass(Painting, Latest):
+    """Paint this class on the mask (`carts_core.model.parts.PartClass`); 0: any arm."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class SetDiameter(Painting, Latest):
     """Make the brush this thick [px]."""
 

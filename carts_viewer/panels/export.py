@@ -13,11 +13,11 @@ from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
 from carts_viewer.transport.tab_page import TabPage
 
-_PARTS = {"Arm": "arms", "Link": "links"}
+_PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
 _WITHOUT_IMAGES = ("masks", "csv", "npz", "json", *_DVRK, "video")
 """Formats with no images beside their labels."""
-_WITHOUT_PARTS = ("masks", "csv", "npz", "json", *_DVRK, "video")
+_WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
 _NOT_KEPT = "This project ends with the viewer, and its exports with it: download them."
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from carts_core.model.parts import part_classes
 from carts_core.project import Key
 from carts_core.wording import counted
 from carts_viewer import intents
@@ -28,6 +29,7 @@ class OverlayPanel:
         sequence = session.sequence
         self._waits, self._session = waits, session
         self._arms = [arm.name for arm in sequence.scene.arms]
+        self._classes = part_classes(sequence.scene.arms)
         options = offered_layers(session)
         with gui.add_folder("Overlay"):
             self._layer = gui.add_dropdown("Layer", [str(layer) for layer in options], initial_value=str(state.layer))
@@ -61,6 +63,8 @@ class OverlayPanel:
             return " ".join(
                 swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
             )
+        if state.layer is Layer.PARTS:
+            return " ".join(swatch(label_color(one.number), one.name) for one in self._classes)
         if state.layer is Layer.TRUTH:
             if state.camera not in (with_imported(state.frame, self._session.scene, state.project).masks or {}):
                 return "This frame has no mask to compare with."

@@ -2,9 +2,10 @@
 
 import viser
 
+from carts_core.model.parts import part_classes
 from carts_core.settings import DescentSolver
 from carts_viewer import intents
-from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR
+from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, label_color
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -24,6 +25,7 @@ _HINTS = {
     Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
     "<b>Backspace</b> takes back a corner.",
 }
+_ANY = "Any arm"
 _MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
 
 
@@ -33,6 +35,7 @@ class PaintPanel:
     def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.gui
         self._page, self._scene, self._waits = page, session.scene, waits
+        self._classes = {_ANY: 0} | {one.name: one.number for one in part_classes(session.scene.arms)}
         self._sent: dict[str, object] = self._message(state)
         with gui.add_folder("Paint", expand_by_default=False):
             self._tools = {tool: gui.add_button(str(tool), icon=icon) for tool, icon in _ICONS.items()}
@@ -40,6 +43,9 @@ class PaintPanel:
                 page.row(*list(self._tools.values())[first : first + 2])
             self._targets = {target: gui.add_button(str(target)) for target in Target}
             page.row(*self._targets.values(), weights=(2, 3))
+            self._class = gui.add_dropdown(
+                "Class", list(self._classes), hint="What the brush paints: any arm, or a part of one (layer Parts)"
+            )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")
             self._clear = gui.add_button("Clear", icon=viser.Icon.TRASH, color="gray")
@@ -47,6 +53,7 @@ class PaintPanel:
             on_click(button, lambda _, tool=tool: intents.SetTool(tool), emit)
         for target, button in self._targets.items():
             on_click(button, lambda _, target=target: intents.SetTarget(target), emit)
+        on_input(self._class, lambda name: intents.SetPaintClass(self._classes[name]), emit)
         on_input(self._size, intents.SetDiameter, emit)
         on_click(self._clear, lambda _: intents.ClearLayer(), emit)
         page.call("setBrush", self._sent)
@@ -60,10 +67,14 @@ class PaintPanel:
             _press(button, target is brush.target)
         if not self._waits(intents.SetDiameter):
             write(self._size, brush.diameter)
+        write(self._class, next(name for name, number in self._classes.items() if number == brush.label))
+        self._class.visible = brush.target is Target.MASK
         self._size.disabled = brush.tool is Tool.POLYGON
         layer = state.mask_correction if brush.target is Target.MASK else state.ignore_region
         self._clear.label = "Clear the correction" if brush.target is Target.MASK else "Clear the ignore region"
-        self._clear.disabled = layer is None
+        self._clear.disabled = layer is None and (
+            brush.target is Target.IGNORE or state.part_labels_of(state.camera) is None
+        )
         hint = f"{_HINTS[brush.tool]} {_MOVING}" if brush.tool is not Tool.OFF else _HINTS[brush.tool]
         if brush.target is Target.IGNORE and isinstance(state.settings, DescentSolver):
             hint += " This solver does not use the ignore region; <b>Surface maps</b> does."
@@ -77,7 +88,11 @@ class PaintPanel:
         """What a page must know to draw strokes by itself."""
         camera, brush = self._scene.camera(state.camera), state.brush
         add, erase = (ADDED_COLOR, REMOVED_COLOR) if brush.target is Target.MASK else (IGNORED_COLOR, (255, 255, 255))
+        label = brush.label if brush.target is Target.MASK else 0
+        if label:
+            add = label_color(label)
         return {
+            "label": label,
             "tool": brush.tool.lower(),
             "target": brush.target,
             "diameter": brush.diameter,

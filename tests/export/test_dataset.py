@@ -10,6 +10,7 @@ from carts_core.errors import CartsError, SequenceError, SettingsError
 from carts_core.export import Dataset, KinematicsRow, corrected_frames, measured_frames
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
+from carts_core.model.parts import part_classes
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 
@@ -99,3 +100,35 @@ def test_rows_of_unknown_or_repeated_frames_are_refused(sequence: Sequence) -> N
         corrected_frames(sequence, range(3), [row, row])
     with pytest.raises(SequenceError, match=r"'999', which .* does not have"):
         corrected_frames(sequence, range(3), [replace(row, frame_id="999")])
+
+
+def test_parts_of_an_arm_make_up_the_arm(dataset: Dataset) -> None:
+    by_part = replace(dataset, parts="parts")
+    names = {category.name for category in by_part.categories}
+    assert names == {f"{arm}.{part}" for arm in ARMS for part in ("shaft", "wrist", "jaws")}
+    view = all_views(dataset)[0]
+    parts = list(by_part.instances(view))
+    for category, mask in dataset.instances(view):
+        own = [part for one, part in parts if one.arm == category.name]
+        np.testing.assert_array_equal(np.sum(own, axis=0), mask)
+
+
+def test_a_painted_class_belongs_to_its_part_whatever_is_rendered_there(dataset: Dataset) -> None:
+    wanted = part_classes(dataset.scene.arms)[2]
+    assert wanted.part == "jaws"
+    painted = np.zeros((127, 161), np.uint8)
+    painted[40:50, 30:60] = wanted.number
+    frames = tuple(replace(frame, part_labels={CAMERA: painted}) for frame in dataset.frames)
+    for before, view in zip(all_views(dataset), all_views(replace(dataset, frames=frames)), strict=True):
+        by_part = dataset.label_image(view, "parts")
+        category = next(one for one in dataset.categories_of("parts") if one.name == f"{wanted.arm}.jaws")
+        assert (by_part[painted > 0] == category.id).all()
+        elsewhere = painted == 0
+        np.testing.assert_array_equal(view.link_ids[elsewhere], before.link_ids[elsewhere])
+
+
+def test_a_painted_class_that_no_link_has_is_refused(dataset: Dataset) -> None:
+    painted = np.full((127, 161), 99, np.uint8)
+    frame = replace(dataset.frames[0], part_labels={CAMERA: painted})
+    with pytest.raises(CartsError, match="painted as class 99"):
+        all_views(replace(dataset, frames=(frame,)))

@@ -132,7 +132,9 @@ def test_png_masks_come_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -
     meaning = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
     assert list(meaning["arms"].values()) == ["background", *ARMS]
     for view in all_views(dataset):
-        read = {kind: np.array(Image.open(folder / kind / f"{view.name}.png")) for kind in ("binary", "arms", "links")}
+        kinds = ("binary", "arms", "parts", "links")
+        read = {kind: np.array(Image.open(folder / kind / f"{view.name}.png")) for kind in kinds}
+        np.testing.assert_array_equal(read["parts"], dataset.label_image(view, "parts"))
         np.testing.assert_array_equal(read["binary"], np.where(view.link_ids >= 0, 255, 0))
         np.testing.assert_array_equal(read["links"].astype(int), view.link_ids + 1)
         for value, name in meaning["links"].items():

@@ -83,8 +83,8 @@ def check_whole(path: Path, frames: int) -> None:
         assert len(json.loads(annotations.read_text())["images"]) == frames, path
         folders = ("images",)
     else:
-        assert json.loads((path / "labels.json").read_text()).keys() == {"binary", "arms", "links"}, path
-        folders = ("images", "binary", "arms", "links")
+        assert json.loads((path / "labels.json").read_text()).keys() == {"binary", "arms", "parts", "links"}, path
+        folders = ("images", "binary", "arms", "parts", "links")
     for folder in folders:
         pictures = list((path / folder).iterdir())
         assert len(pictures) == frames, path / folder
