@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from carts_core.model.keypoints import keypoints, project_keypoints
 
 def test_coco_keypoints_lie_where_the_camera_sees_them(dataset: Dataset, tmp_path: Path) -> None:
     folder = export(dataset, "coco-keypoints", tmp_path / "out")
-    coco = COCO(str(folder / "annotations" / "person_keypoints_default.json"))
+    coco: Any = COCO(str(folder / "annotations" / "person_keypoints_default.json"))
     views = {view.id: view for view in all_views(dataset)}
     seen: set[int] = set()
     for annotation in coco.loadAnns(coco.getAnnIds()):
@@ -46,7 +47,7 @@ def test_bop_poses_put_the_models_where_the_masks_are(dataset: Dataset, tmp_path
         json.loads((scene / f"scene_{name}.json").read_text()) for name in ("camera", "gt", "gt_info")
     )
     info, names = (json.loads((folder / "models" / f"{name}.json").read_text()) for name in ("models_info", "names"))
-    models = {key: trimesh.load(folder / "models" / f"obj_{int(key):06d}.ply") for key in names}
+    models: dict[str, Any] = {key: trimesh.load(folder / "models" / f"obj_{int(key):06d}.ply") for key in names}
     camera = dataset.scene.camera(CAMERA)
     assert poses.keys() == cameras.keys() == {"0", "1", "2"} and names.keys() == info.keys()
     for key, model in models.items():
@@ -61,7 +62,8 @@ def test_bop_poses_put_the_models_where_the_masks_are(dataset: Dataset, tmp_path
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-5)
             stem = f"{int(image):06d}_{number:06d}.png"
             whole, visible = (
-                cv2.imread(str(scene / kind / stem), cv2.IMREAD_GRAYSCALE) > 0 for kind in ("mask", "mask_visib")
+                np.asarray(cv2.imread(str(scene / kind / stem), cv2.IMREAD_GRAYSCALE)) > 0
+                for kind in ("mask", "mask_visib")
             )
             assert (whole.sum(), visible.sum()) == (counts["px_count_all"], counts["px_count_visib"])
             assert not (visible & ~whole).any()
