@@ -70,8 +70,11 @@ def _objects(arms: tuple[Arm, ...]) -> Iterator[_Object]:
         for link, name in enumerate(arm.robot.link_names):
             meshes = [mesh for mesh in arm.robot.meshes if mesh.link == link]
             if meshes:
-                parts = [trimesh.Trimesh(_MM * mesh.vertices, mesh.faces, process=False) for mesh in meshes]
-                yield _Object(number, f"{arm.name}.{name}", first + link, trimesh.util.concatenate(parts))
+                counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+                vertices = np.concatenate([_MM * mesh.vertices for mesh in meshes])
+                faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, counts, strict=False)])
+                joined = trimesh.Trimesh(vertices, faces, process=False)
+                yield _Object(number, f"{arm.name}.{name}", first + link, joined)
                 number += 1
         first += len(arm.robot.link_names)
 
@@ -85,6 +88,7 @@ def _write_models(objects: list[_Object], folder: OutputPath) -> None:
         entry |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
         info[str(one.id)], names[str(one.id)] = entry, one.name
         content = one.mesh.export(file_type="ply")
+        assert isinstance(content, bytes), "PLY is binary unless it is asked for as text"
         write_bytes(folder / f"obj_{one.id:06d}.ply", content)
     write_text(folder / "models_info.json", json.dumps(info, indent=1))
     write_text(folder / "names.json", json.dumps(names, indent=1, ensure_ascii=False))
