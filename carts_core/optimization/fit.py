@@ -83,6 +83,7 @@ class Fit:
     edges: Linearization | None = None
     """What edges say around the estimate, after `AlignEdges`."""
     restarts: int = 0
+    """How often the estimate has jumped elsewhere; after the first time, descents stop at a smaller tolerance."""
     used: int = 0
     """Evaluations so far."""
     solver: LevenbergMarquardt = field(init=False)

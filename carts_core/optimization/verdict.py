@@ -30,7 +30,7 @@ class Evidence:
     start_area: float
     """The same at the start [1]."""
     loss: float
-    """The optimizer's, of the loss `surface`."""
+    """Of the surface factor: its cost per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
     residual: float
     """Squared difference of what is rendered and what the network predicts, conditioned on the fit, as a share of
     their mean area [1]."""

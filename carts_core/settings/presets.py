@@ -1,4 +1,9 @@
-"""The solvers that ship, each a tuple of stages to be read from top to bottom."""
+"""The solvers that ship, each a tuple of stages to be read from top to bottom.
+
+What a stage does and what its numbers mean is in the module `stages` beside this one; terms are in docs/glossary.md. A
+network predicts what each pixel shows of the arms, given a rendering of a state that it is conditioned on (`Observe`);
+`Descend` then fits the rendering to that prediction, under less and less blur.
+"""
 
 from dataclasses import replace
 
@@ -45,7 +50,12 @@ _FITTED: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST)
 _ALONE: tuple[Stage, ...] = (*_FITTED, AlignEdges(), PreferStart())
 
 FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate(), RejectFailed())
-"""One frame alone: the default."""
+"""One frame alone: the default.
+
+`SilhouetteSearch` acts only where given masks are the target, `RandomRestart` only where the fit is bad, and
+`OtherBackground` only where it has failed and the empty background is known. Once the evaluations are used up, all
+stages but `RejectFailed` are skipped.
+"""
 
 OCCLUDED: tuple[Stage, ...] = (
     *(*_FITTED, IgnoreOccluders(then=_FITTED), AlignEdges(), PreferStart(), Evaluate(), RejectFailed()),

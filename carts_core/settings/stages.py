@@ -21,7 +21,10 @@ class Given(StrEnum):
 
 @dataclass(frozen=True)
 class Observe:
-    """Have the network predict the surface map of the images. Only this stage calls the network."""
+    """Have the network predict the surface map of the images: per pixel the coverage of each part of the arms, and the
+    normal (`carts_core.model.surface`). `Descend` and `AlignEdges` never call the network; a `RandomRestart` and a
+    `PreferStart` observe once more, and verdicts (`OtherBackground`, `RejectFailed`) need it for their evidence.
+    """
 
     scale: float = 1.5
     """How many times larger than the working image the images are, up to the camera's own size [1]."""
@@ -30,9 +33,9 @@ class Observe:
     margin: int = 16
     """How far the network's input reaches beyond the arms of that state [px]."""
     attention: int = 8
-    """Distance from the arms of that state beyond which nothing counts [px]."""
+    """Distance from the arms of that state beyond which nothing counts, the paper's attention [px]."""
     haze: bool = True
-    """Whether pixels under haze count less. A search does better with all pixels."""
+    """Whether pixels under haze or smoke count less, by its transmission. A search does better with all pixels."""
 
     def __post_init__(self) -> None:
         require(0.1 <= self.scale <= 8, "Observe.scale", self.scale, "0.1 to 8")
@@ -42,12 +45,12 @@ class Observe:
 
 @dataclass(frozen=True)
 class Descend:
-    """Levenberg-Marquardt on the surface factor under one blur."""
+    """Levenberg-Marquardt on the surface factor (rendered minus observed surface map) and the prior, under one blur."""
 
     blur: float
     """Deviation of the blur under which surface maps are compared [px]."""
     robust: float = 0.5
-    """Difference of surface maps beyond which a pixel loses its weight [1]."""
+    """Difference of surface maps beyond which a pixel loses its weight (Geman-McClure's scale) [1]."""
     steps: int = 6
     """Largest number of steps [1]."""
     tolerance: float = 1e-2
@@ -61,22 +64,22 @@ class Descend:
 
 
 FINEST = Descend(blur=0.8)
-"""How estimates are compared in the end."""
+"""The last descent; estimates are compared as it compares them."""
 
 
 @dataclass(frozen=True)
 class RandomRestart:
-    """Where the fit is bad or an arm was lost: draw random states, compare them with the whole image, and descend
-    again from the best."""
+    """Where the fit is bad or an arm was lost (it has left the image, or is where none was observed): draw random
+    states, compare them with the whole image, and descend again from the best."""
 
     then: tuple["Stage", ...]
     """What runs from there. States are compared as the first `Descend` of these compares them."""
     if_loss: float = 0.045
-    """Loss from which a fit is bad [1]."""
+    """Cost per pixel of the arms, without the prior, from which a fit is bad [1]."""
     candidates: int = 64
     """Random states per arm [1]."""
     deviation: float = 1.8
-    """Their deviation, in expected errors [1]."""
+    """Their deviation, in deviations of the prior (`SurfaceSolver.prior_deg` and its like) [1]."""
     scale: float = 0.75
     """Of the whole image that they are compared with, as `Observe.scale` [1]."""
 

@@ -136,7 +136,11 @@ class Page:
         initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
 
     def reload(self) -> None:
-        """Have every tab load the page anew, at no place of the recording that was shown."""
+        """Have every tab load the page anew, at no place of the recording that was shown.
+
+        A tab that has loaded the page and is not connected yet does so when it is.
+        """
+        self._name = secrets.token_hex(8)
         for client in self.server.get_clients().values():
             run_script(client, _RELOAD)
 

@@ -113,8 +113,7 @@ def test_another_recording_in_the_same_tab_is_not_taken_for_a_wrong_link(
     with Site([tmp_path], port=0) as site:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.add_init_script(NOTE_NOTES)
-        page.goto(site.url)
-        expect(page.get_by_text("Open the sample")).to_be_visible()
+        page.goto(site.url)  # and at once, before it is connected:
         for path, name in ((first, "tiny"), (second, "other")):
             site.post(lambda path=path: site.open_sequence(path))
             expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible(timeout=60_000)
