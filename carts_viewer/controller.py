@@ -39,6 +39,8 @@ _BEGINNING = (
     intents.RepeatJob,
 )
 """What ends a run here before it begins."""
+_COMMON = ("jobs", "solve", "export", "networks", "network")
+"""What of the background's state is for everybody."""
 WATCH_EVERY = 1.0
 """How often the project's file is checked while nothing is edited [s]."""
 
@@ -128,8 +130,9 @@ class Controller:
     def follow(self) -> None:
         """Bring the state up to date with what others, and the background, have done."""
         state, shared = self.state, self._background.state
-        if (state.jobs, state.solve, state.export) != (shared.jobs, shared.solve, shared.export):
-            self._context.change(jobs=shared.jobs, solve=shared.solve, export=shared.export)
+        common = {name: getattr(shared, name) for name in _COMMON}
+        if common != {name: getattr(state, name) for name in _COMMON}:
+            self._context.change(**common)
         people, person = self._editor.people, self._editor.person
         others = tuple((one.name, one.index) for one in people.persons if one is not person and one.present)
         if others != state.others:

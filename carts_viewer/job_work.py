@@ -1,6 +1,6 @@
 """What jobs do that no other part of the viewer does: runs on many frames, each alone, and a calibration."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,9 +24,11 @@ class Progress:
     text: str
     line: str | None = None
     """For the log."""
+    wait: float = 0.0
+    """How long there is nothing to do [s]."""
 
 
-def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Iterator[Progress]:
+def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
     """Run on each of these frames alone, from the one at place `first` on; a result that fits worse is not taken.
 
     Every frame is a step of undo of its own, and is saved before the next one begins.
@@ -65,7 +67,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
     yield Progress(len(frames), len(frames), text)
 
 
-def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Iterator[Progress]:
+def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress]:
     """Fit base frames, and cameras where they are free, to frames spread over the sequence; one step of undo."""
     session, state = context.session, context.state
     sequence = session.sequence

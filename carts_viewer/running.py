@@ -1,8 +1,7 @@
 """Makes what optimizes: frames alone, frames together, and what only compares a pose with its images."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -27,48 +26,16 @@ from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.recording import Sequence as Recording
 from carts_core.settings import Direction, presets
-from carts_core.settings.inference import Inference
 from carts_core.settings.serialization import to_plain
 from carts_viewer.active_run import Optimizer
+from carts_viewer.loading import NetworkLoader
 from carts_viewer.observing import NETWORK, Target
 from carts_viewer.sequence_run import SequenceRun
 from carts_viewer.state import Pose
 
 
-class OptimizerFactory:
-    """Makes optimizers; loads the networks once, when they are first needed."""
-
-    def __init__(
-        self,
-        *,
-        weights: Sequence[Path] = (),
-        device: str = "cpu",
-        inference: Inference = "auto",
-        report: Callable[[str], None],
-    ) -> None:
-        """
-        Args:
-            weights: Weights files; a network that none is given of is the shipped one.
-            device: Where to compute.
-            inference: Who runs the surface network.
-            report: Called with a line for people about what takes long.
-        """
-        self._weights = weights
-        self._device = device
-        self._inference: Inference = inference
-        self._report = report
-        self._extractor: FeatureExtractor | None = None
-
-    def prepare(self) -> FeatureExtractor:
-        """The networks.
-
-        Raises:
-            WeightsError: it cannot be loaded.
-        """
-        if self._extractor is None:
-            self._report("Loading the networks")
-            self._extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
-        return self._extractor
+class OptimizerFactory(NetworkLoader):
+    """Makes optimizers."""
 
     def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
         """What says what images show; with masks alone no network is loaded.

@@ -228,6 +228,12 @@ class ViewState:
     """Of the shown pose, frame and domain; None while nobody needs them."""
     scores: Scores | None = None
     """Of the shown pose; None until they are computed, which is after its picture has been sent."""
+    networks: tuple[str, ...] = ()
+    """Networks that can be chosen: that of the beginning, and those that were adapted to the recording."""
+    network: str = ""
+    """The one that runs."""
+    unfamiliar: tuple[str, ...] = ()
+    """What speaks against the network for these arms and images, for people."""
     jobs: tuple[Job, ...] = ()
     """What takes long, oldest first."""
     can_undo: bool = False

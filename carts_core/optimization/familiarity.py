@@ -38,26 +38,27 @@ class Familiarity:
     elsewhere: float
     """Share of the image, far from the arms as measured, that the network takes for arms [1]."""
 
-    def warnings(self, where: str, *, background: bool = False) -> list[str]:
+    def warnings(self, where: str, remedy: str = _REMEDY, *, background: bool = False) -> list[str]:
         """What people should know before they solve; nothing where all is well.
 
         Args:
             where: says which images are meant.
+            remedy: what to do where the network does not know arms or images.
             background: whether the empty background is known; then what is taken for arms in it does no harm.
         """
         found = []
         if self.recognized is None:
-            remedy = "Check T_camera_world, T_world_base and the units of the joints."
-            found.append(f"{where}: no arm is in view as measured. {remedy}")
+            place = "Check T_camera_world, T_world_base and the units of the joints."
+            found.append(f"{where}: no arm is in view as measured. {place}")
         elif self.recognized < _RECOGNIZED:
             found.append(
                 f"{where}: the network recognizes a rendering of these arms with an overlap of {self.recognized:.2f} "
-                f"only ({_RECOGNIZED} or more is usual), so it may not know this robot at this distance. {_REMEDY}"
+                f"only ({_RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(
                 f"{where}: the network takes {100 * self.elsewhere:.0f} % of the image for arms where none can be, and "
-                f"the empty background is not known. {_REMEDY}"
+                f"the empty background is not known. {remedy}"
             )
         return found
 

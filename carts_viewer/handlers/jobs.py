@@ -1,8 +1,8 @@
 """What intents about jobs do: one after the other is started, followed, stopped and remembered."""
 
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Generator
+from dataclasses import asdict
 from functools import singledispatchmethod
 from typing import Any
 
@@ -11,6 +11,8 @@ from carts_core.export import FORMATS
 from carts_core.project import frames_in
 from carts_core.project.queries import UNREVIEWED
 from carts_viewer import intents
+from carts_viewer.adapting import adapt
+from carts_viewer.asker import Asker
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun
 from carts_viewer.finding import found
@@ -18,28 +20,15 @@ from carts_viewer.handlers.exporting import ExportingHandler
 from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.job_work import Progress, calibrate, optimize_frames
 from carts_viewer.jobs import Job, JobList, JobState
-from carts_viewer.people import Person
+from carts_viewer.networks import Networks
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.solved import Comparison
 from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
 """How often it is written down how far a job is [s]."""
-_CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
-"""What of a tab's state a job depends on."""
-
-
-@dataclass(frozen=True, eq=False)
-class Asker:
-    """Who has asked for a job, and what they had chosen then."""
-
-    person: Person
-    state: ViewState
-
-    def choose(self, context: Context) -> None:
-        """Have a job do what it does with these choices, in this person's name."""
-        context.session.editor.person = self.person
-        context.change(**{name: getattr(self.state, name) for name in _CHOICES})
+LONGEST = 240
+"""Most time for adapting a network [min]."""
 
 
 class JobsHandler:
@@ -64,8 +53,10 @@ class JobsHandler:
         """Who asks for what is queued now."""
         self._asked: dict[int, Asker] = {}
         """By number of job; a job of an earlier viewer has none."""
-        self._work: Iterator[Progress] | None = None
+        self._work: Generator[Progress] | None = None
+        self._wait = 0.0
         self._saved_at = 0.0
+        self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers)
         self._publish()
 
     def ask(self, intent: intents.Intent, asker: Asker) -> None:
@@ -84,7 +75,7 @@ class JobsHandler:
 
     def wait_time(self) -> float | None:
         """0 while there is something to do; None when there is not."""
-        return 0.0 if any(not job.over for job in self._list.jobs) else None
+        return self._wait if any(not job.over for job in self._list.jobs) else None
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
@@ -113,6 +104,19 @@ class JobsHandler:
         self._queue("calibrate", f"Calibrate on {intent.frames} frames", {"frames": int(intent.frames)})
 
     @handle.register
+    def _(self, intent: intents.Adapt) -> None:
+        minutes = min(max(int(intent.minutes), 1), LONGEST)
+        if not self._context.session.editor.project.writable:
+            raise CartsError("The project is read-only here, so no network can be kept beside it.")
+        options = {"minutes": minutes, "folder": self._networks.next_number()}
+        self._queue("adapt", f"Adapt the network to this recording, {minutes} minutes at most", options)
+
+    @handle.register
+    def _(self, intent: intents.UseNetwork) -> None:
+        self._networks.use(intent.name)
+        self._publish()
+
+    @handle.register
     def _(self, intent: intents.CancelJob) -> None:
         job = self._list.find(intent.number)
         if job.state is JobState.RUNNING:
@@ -126,7 +130,10 @@ class JobsHandler:
         if not job.over:
             raise CartsError("This job has not ended yet.")
         first = job.done if job.kind == "optimize" and job.state is not JobState.DONE else 0
-        self._queue(job.kind, job.title, {**job.options, "first": first})
+        options = {**job.options, "first": first}
+        if job.kind == "adapt" and job.state is JobState.DONE:
+            options["folder"] = self._networks.next_number()
+        self._queue(job.kind, job.title, options)
 
     @handle.register
     def _(self, intent: intents.ForgetJobs) -> None:
@@ -163,7 +170,9 @@ class JobsHandler:
             self._end(job, JobState.FAILED, text)
 
     def close(self) -> None:
-        """Write down how far everything is; the viewer ends."""
+        """Write down how far everything is; the viewer ends, and so does what runs in another process."""
+        if self._work is not None:
+            self._work.close()
         self._list.save()
 
     def _queue(self, kind: str, title: str, options: dict[str, Any]) -> None:
@@ -196,12 +205,15 @@ class JobsHandler:
             raise
         self._publish()
 
-    def _own(self, job: Job) -> Iterator[Progress]:
+    def _own(self, job: Job) -> Generator[Progress]:
         if job.kind == "optimize":
             frames = [index for index in job.options["frames"] if 0 <= index < len(self._context.session.sequence)]
             return optimize_frames(self._context, self._comparison, frames, int(job.options.get("first", 0)))
         if job.kind == "calibrate":
             return calibrate(self._context, self._optimizers, int(job.options["frames"]))
+        if job.kind == "adapt":
+            folder, minutes = self._networks.folder(int(job.options["folder"])), float(job.options["minutes"])
+            return adapt(self._context.session.sequence.path, folder, minutes)
         raise CartsError(f"There is no job of the kind {job.kind!r}.")
 
     def _follow(self, job: Job) -> None:
@@ -237,7 +249,7 @@ class JobsHandler:
             self._report(job, progress)
 
     def _report(self, job: Job, progress: Progress) -> None:
-        now = self._list.find(job.number)
+        now, self._wait = self._list.find(job.number), progress.wait
         if (now.done, now.total, now.text) == (progress.done, progress.total, progress.text) and progress.line is None:
             return
         self._list.change(job.number, progress.line, done=progress.done, total=progress.total, text=progress.text)
@@ -251,9 +263,13 @@ class JobsHandler:
             self._propagating.finish()
         elif job.kind == "export":
             self._exporting.cancel()
+        if self._work is not None:
+            self._work.close()
         self._work = None
 
     def _end(self, job: Job, state: JobState, text: str) -> None:
+        self._wait = 0.0
+        self._networks.look()
         done = {"done": job.total} if state is JobState.DONE and job.total else {}
         self._list.change(job.number, f"{state}: {text}", state=state, text=text, ended=time.time(), **done)
         self._context.change(busy=None)
@@ -282,4 +298,5 @@ class JobsHandler:
         return self._context.state if self._asker is None else self._asker.state
 
     def _publish(self) -> None:
-        self._context.change(jobs=self._list.jobs)
+        networks = self._networks
+        self._context.change(jobs=self._list.jobs, networks=networks.names, network=networks.used)

@@ -18,7 +18,7 @@ from carts_viewer.fit_check import FitCheck
 from carts_viewer.layers import Layer
 from carts_viewer.observing import NETWORK, Observed
 from carts_viewer.presets import PRESETS
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.running import OptimizerFactory, scene_at
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
 
 _REASONS = {
@@ -213,7 +213,17 @@ class OptimizingHandler:
         self._context.save()
         self._before = self._session.saved(self._context.state.index)
         run = RunState(Phase.RUNNING, start=self._context.state.pose.scene)
-        self._context.change(run=run, playing=False, error=None, busy=None)
+        self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._doubts())
+
+    def _doubts(self) -> tuple[str, ...]:
+        """What speaks against the network that the run relies on."""
+        state = self._context.state
+        if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
+            return ()
+        scene = scene_at(self._session.scene, state.pose.scene)
+        return self._optimizers.unfamiliar(
+            self._session.sequence, scene, state.index, state.domain, self._context.cameras
+        )
 
     def _iterate(self) -> None:
         run = self._run

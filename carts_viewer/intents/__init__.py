@@ -53,12 +53,14 @@ from .finding import ReviewFound as ReviewFound
 from .finding import SetFilter as SetFilter
 from .finding import ShowFound as ShowFound
 from .importing import ImportMasks as ImportMasks
+from .jobs import Adapt as Adapt
 from .jobs import Calibrate as Calibrate
 from .jobs import CancelJob as CancelJob
 from .jobs import ForgetJobs as ForgetJobs
 from .jobs import Jobs as Jobs
 from .jobs import OptimizeFrames as OptimizeFrames
 from .jobs import RepeatJob as RepeatJob
+from .jobs import UseNetwork as UseNetwork
 from .live import Live as Live
 from .live import StartLive as StartLive
 from .live import StopLive as StopLive

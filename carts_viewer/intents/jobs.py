@@ -5,7 +5,7 @@ from typing import Literal
 
 from carts_viewer.intents.base import Intent
 
-JobKind = Literal["optimize", "solve", "calibrate", "export"]
+JobKind = Literal["optimize", "solve", "calibrate", "adapt", "export"]
 Frames = Literal["found", "unreviewed", "range", "all"]
 
 
@@ -28,6 +28,22 @@ class Calibrate(Jobs):
 
     frames: int = 20
     """How many, spread evenly."""
+
+
+@dataclass(frozen=True)
+class Adapt(Jobs):
+    """Adapt the network to the recording."""
+
+    minutes: int = 15
+    """At most."""
+
+
+@dataclass(frozen=True)
+class UseNetwork(Jobs):
+    """Have another network run, for everybody."""
+
+    name: str
+    """One of `ViewState.networks`."""
 
 
 @dataclass(frozen=True)

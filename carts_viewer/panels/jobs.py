@@ -6,7 +6,8 @@ import viser
 
 from carts_viewer import intents
 from carts_viewer.jobs import Job, JobState
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
+from carts_viewer.networks import STARTED
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
@@ -28,10 +29,21 @@ class JobsPanel:
                 "Calibrate on", 20, min=1, max=500, step=1, hint="Spread evenly over the sequence"
             )
             calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
+            self._minutes = gui.add_number(
+                "Adapt for [min]", 15, min=1, max=240, step=1, hint="At most; it ends when it no longer gains"
+            )
+            adapt = gui.add_button(
+                "Adapt the network",
+                icon=viser.Icon.SCHOOL,
+                color="gray",
+                hint="Train it for the robots, cameras, distances and empty backgrounds of this recording",
+            )
             gui.add_html(
                 '<p class="carts-caption">Solving (Review) and exports queue up here, too. A calibration fits base '
                 "frames, or what is ticked under Free parameters.</p>"
             )
+        self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="For everybody; remembered")
+        self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)
         with gui.add_folder("Jobs"):
             self._list = gui.add_html("")
             self._chosen = gui.add_dropdown("Job", [_NONE])
@@ -42,6 +54,9 @@ class JobsPanel:
             self._log = gui.add_html("")
         on_click(optimize, lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")), emit)  # type: ignore[arg-type]
         on_click(calibrate, lambda _: intents.Calibrate(int(self._count.value)), emit)
+        on_click(adapt, lambda _: intents.Adapt(int(self._minutes.value)), emit)
+        on_input(self._network, intents.UseNetwork, emit)
+        on_click(self._newest, lambda _: intents.UseNetwork(self._network.options[-1]), emit)
         on_click(self._cancel, lambda _: intents.CancelJob(self._number()), emit)
         on_click(self._again, lambda _: intents.RepeatJob(self._number()), emit)
         on_click(self._forget, lambda _: intents.ForgetJobs(), emit)
@@ -49,6 +64,7 @@ class JobsPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the list up to date; the newest job is chosen when it comes."""
+        self._show_networks(state)
         jobs = tuple(reversed(state.jobs))
         numbers = {f"{job.number}. {job.title}": job.number for job in jobs}
         if numbers != self._numbers:
@@ -67,6 +83,14 @@ class JobsPanel:
         self._forget.disabled = not any(job.over for job in jobs)
         lines = "<br>".join(escaped(line) for line in (job.log[-12:] if job else ()))
         self._log.content = f'<p class="carts-caption carts-log" role="log">{lines}</p>'
+
+    def _show_networks(self, state: ViewState) -> None:
+        names = state.networks or (STARTED,)
+        if tuple(self._network.options) != names:
+            self._network.options = names
+        write(self._network, state.network or STARTED)
+        self._network.visible = len(names) > 1
+        self._newest.visible = len(names) > 1 and state.network != names[-1]
 
     def _number(self) -> int:
         return self._numbers.get(self._chosen.value, -1)

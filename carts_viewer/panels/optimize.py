@@ -43,6 +43,8 @@ class OptimizePanel:
         self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
         page.row(self._step, self._reset)
         self._status = gui.add_html("")
+        self._unfamiliar = gui.add_html("", visible=False)
+        self._adapt = gui.add_button("Adapt the network to this recording", icon=viser.Icon.SCHOOL, visible=False)
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         self._observed = gui.add_dropdown("Fit to", list(OBSERVED))
@@ -57,6 +59,7 @@ class OptimizePanel:
         on_click(self._run, lambda _: intents.Run(), emit)
         on_click(self._pause, lambda _: intents.Pause(), emit)
         on_click(self._step, lambda _: intents.Step(), emit)
+        on_click(self._adapt, lambda _: intents.Adapt(), emit)
         on_click(self._reset, lambda _: intents.Reset(), emit)
         on_input(self._solver, lambda label: intents.SetSetting("solver", self._solvers[label]), emit)
         on_input(self._observed, lambda what: intents.SetObserved(OBSERVED[what], MASKS[self._masks.value]), emit)
@@ -71,6 +74,10 @@ class OptimizePanel:
         self._pause.disabled = not running
         self._step.disabled = running
         self._reset.disabled = not state.run.curves.loss
+        self._unfamiliar.content = "".join(
+            f'<p class="carts-notice" role="status">{escaped(warning)}</p>' for warning in state.unfamiliar
+        )
+        self._unfamiliar.visible = self._adapt.visible = bool(state.unfamiliar)
         write(self._solver, SOLVER_LABELS[state.solver])
         write(self._observed, next(label for label, what in OBSERVED.items() if what == state.observed.what))
         write(self._masks, next(label for label, masks in MASKS.items() if masks == state.observed.masks))

@@ -25,7 +25,7 @@ class Desk:
         people = People(project)
         self.session, self.renderer = Session(sequence, people), OverlayRenderer(sequence)
         self.delivered: list[tuple[int, str, bytes]] = []
-        self._factory = factory
+        self.factory = factory
         domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
         frame = self.session.frame(0, domain, camera)
         state = ViewState(
@@ -57,7 +57,7 @@ class Desk:
         self.session.close()
         project.close()
         sequence = self.session.sequence
-        return Desk(sequence, Project.open(sequence, project.path, read_only=read_only), self._factory)
+        return Desk(sequence, Project.open(sequence, project.path, read_only=read_only), self.factory)
 
     @property
     def state(self) -> ViewState:

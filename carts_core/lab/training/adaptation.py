@@ -46,7 +46,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
             _, content = cv2.imencode(".png", background.image[..., ::-1])
             write_bytes(output_path(output, BACKGROUNDS, f"{found}.png"), content.tobytes())
             found += 1
-    default = TrainingConfig()
+    default, samples = TrainingConfig(), given.validation_samples
     robots = tuple(dict.fromkeys(arm.robot.urdf for arm in sequence.scene.arms))
     images = replace(
         given.images,
@@ -65,7 +65,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
         learning_rate=_LEARNING_RATE if given.learning_rate == default.learning_rate else given.learning_rate,
         warmup=_WARMUP,
         average=_AVERAGE,
-        validation_samples=_SAMPLES,
+        validation_samples=_SAMPLES if samples == default.validation_samples else samples,
         validation_minutes=1.0,
         patience=_PATIENCE,
         images=images,

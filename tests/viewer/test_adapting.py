@@ -1,0 +1,162 @@
+"""The network adapted to the recording, as a job of the page, and which network runs."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import expect
+from viewer_canvas import eventually
+from viewer_desk import Desk
+from viewer_tab import Tab
+
+from carts_core.errors import CartsError
+from carts_core.project import Project
+from carts_core.recording import Sequence
+from carts_core.resources import shipped_weights
+from carts_viewer import adapting, intents
+from carts_viewer.app import ViewerApp
+from carts_viewer.jobs import Job, JobState
+from carts_viewer.networks import STARTED, Networks
+from carts_viewer.running import OptimizerFactory
+
+SMALL = (
+    "--steps 2 --batch-size 1 --workers 0 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
+    "--images.field-width 64"
+).split()
+OVER = 120.0
+"""Time for a small run on a busy machine [s]."""
+
+
+@pytest.fixture
+def small_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training of two steps on small images."""
+    monkeypatch.setattr(adapting, "OPTIONS", tuple(SMALL))
+
+
+@pytest.fixture
+def at_desk(tiny_sequence: Callable[..., Path]) -> Desk:
+    """A desk with the shipped networks."""
+    sequence = Sequence.open(tiny_sequence(frames=2))
+    return Desk(sequence, Project.open(sequence), OptimizerFactory(inference="torch", report=lambda line: None))
+
+
+def ended(desk: Desk) -> Job:
+    """The newest job, once it is over."""
+    until = time.monotonic() + OVER
+    while not desk.state.jobs[-1].over:
+        assert time.monotonic() < until, desk.state.jobs[-1]
+        time.sleep(desk.wait_time() or 0.0)
+        desk.advance()
+    return desk.state.jobs[-1]
+
+
+@pytest.mark.usefixtures("small_run")
+def test_a_job_adapts_the_network_and_what_it_made_is_used_and_remembered(at_desk: Desk) -> None:
+    at_desk.do(intents.Adapt(1))
+    assert at_desk.wait_time() == 0.0
+    # The page stays usable meanwhile.
+    assert at_desk.do(intents.ShowFrame(1)).index == 1
+    job = ended(at_desk)
+    assert job.state is JobState.DONE and "Dice" in job.text and "of the error is left" in job.text
+    assert any("step 0: made images of this recording" in line for line in job.log)
+    folder = at_desk.session.editor.project.path.with_name("sequence_adapted_1")
+    assert (folder / "surface.safetensors").is_file()
+    # It is offered, and nothing is changed before somebody wants it.
+    assert at_desk.state.networks == (STARTED, "Adapted 1") and at_desk.state.network == STARTED
+    before = at_desk.factory.prepare().sha256
+    assert at_desk.do(intents.UseNetwork("Adapted 1")).network == "Adapted 1"
+    after = at_desk.factory.prepare().sha256
+    assert before != after
+    project = at_desk.session.editor.project.path
+    again = OptimizerFactory(inference="torch", report=lambda line: None)
+    assert Networks(project, kept=True, optimizers=again).used == "Adapted 1" and again.prepare().sha256 == after
+    # Weights of the command line count more, and weights that are damaged are not used.
+    given = OptimizerFactory(weights=(shipped_weights()[1],), inference="torch", report=lambda line: None)
+    assert Networks(project, kept=True, optimizers=given).used == STARTED
+    (folder / "surface.safetensors").write_bytes(b"nothing")
+    assert Networks(project, kept=True, optimizers=again).used == STARTED
+    with pytest.raises(CartsError, match=r"surface\.safetensors"):
+        at_desk.do(intents.UseNetwork("Adapted 1"))
+    assert at_desk.do(intents.UseNetwork(STARTED)).network == STARTED
+    assert at_desk.factory.prepare().sha256 == before
+    with pytest.raises(CartsError, match=r"no network '\.\./\.\./else'"):
+        at_desk.do(intents.UseNetwork("../../else"))
+
+
+def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
+    at_desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapting, "OPTIONS", ("--steps", "100000", *SMALL[2:]))
+    trainings: list[subprocess.Popen] = []
+    popen = subprocess.Popen
+
+    def watched(*arguments: Any, **options: Any) -> subprocess.Popen:
+        trainings.append(popen(*arguments, **options))
+        return trainings[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", watched)
+    at_desk.do(intents.Adapt(1))
+    until = time.monotonic() + OVER
+    while not any("step 0" in line for line in at_desk.state.jobs[0].log):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+        at_desk.advance()
+    at_desk.do(intents.CancelJob(1))
+    assert at_desk.state.jobs[0].state is JobState.CANCELLED and at_desk.wait_time() is None
+    assert trainings[0].wait(OVER) != 0
+    folder = at_desk.session.editor.project.path.with_name("sequence_adapted_1")
+    assert (folder / "checkpoint.safetensors").is_file()
+    monkeypatch.setattr(adapting, "OPTIONS", tuple(SMALL))
+    at_desk.do(intents.RepeatJob(1))
+    job = ended(at_desk)
+    assert job.state is JobState.DONE and job.options["folder"] == 1
+    at_desk.do(intents.RepeatJob(2))
+    assert at_desk.state.jobs[-1].options["folder"] == 2
+    at_desk.do(intents.CancelJob(3))
+
+
+def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adapting, "OPTIONS", ("--steps", "0"))
+    at_desk.do(intents.Adapt(1))
+    with pytest.raises(CartsError, match="steps is 0; give 1 or more"):
+        ended(at_desk)
+    assert at_desk.state.jobs[0].state is JobState.FAILED and at_desk.state.networks == (STARTED,)
+
+
+def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
+    at_desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_desk.do(intents.SetSetting("solver", "surface"), intents.SetSetting("iterations", 1))
+    state = at_desk.do(intents.Step())
+    assert all("Fit masks (Fit to), or adapt the network" in line for line in state.unfamiliar)
+    monkeypatch.setattr(sys.modules["carts_core.optimization.familiarity"], "_RECOGNIZED", 1.01)
+    at_desk.factory.use(None)
+    at_desk.factory._unfamiliar.clear()
+    state = at_desk.do(intents.Reset(), intents.Step())
+    assert "may not know this robot" in state.unfamiliar[0]
+    assert at_desk.do(intents.Reset(), intents.SetObserved("masks", "recording"), intents.Step()).unfamiliar == ()
+
+
+@pytest.mark.browser
+@pytest.mark.usefixtures("small_run")
+def test_the_network_is_adapted_in_the_page_and_used(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(frames=2)
+    tab = open_tab(app)
+    tab.page.get_by_text("Jobs", exact=True).first.click()
+    expect(tab.page.get_by_role("button", name="Use the newest network", exact=True)).to_have_count(0)
+    tab.button("Adapt the network")
+    offered = tab.page.get_by_role("button", name="Use the newest network", exact=True)
+    expect(offered).to_be_visible(timeout=1000 * OVER)
+    tab.button("Use the newest network")
+    eventually(lambda: tab.state.network, lambda network: network == "Adapted 1")
+    kept = app.project.path.with_name(f"{app.project.path.stem}_network.json")
+    assert json.loads(kept.read_text()) == {"network": "Adapted 1"}
+    with ViewerApp.open(app.sequence.path, port=0) as second:
+        assert second.wait_until_shown(60).network == "Adapted 1"
