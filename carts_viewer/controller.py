@@ -94,6 +94,7 @@ class Controller:
             intents.SetName: lambda intent: self._name(intent.name),
             intents.DismissError: lambda _: context.change(error=None),
         }
+        self._share()
 
     @property
     def state(self) -> ViewState:
@@ -130,9 +131,8 @@ class Controller:
     def follow(self) -> None:
         """Bring the state up to date with what others, and the background, have done."""
         state, shared = self.state, self._background.state
-        common = {name: getattr(shared, name) for name in _COMMON}
-        if common != {name: getattr(state, name) for name in _COMMON}:
-            self._context.change(**common)
+        if any(getattr(shared, name) != getattr(state, name) for name in _COMMON):
+            self._share()
         people, person = self._editor.people, self._editor.person
         others = tuple((one.name, one.index) for one in people.persons if one is not person and one.present)
         if others != state.others:
@@ -140,6 +140,10 @@ class Controller:
         person.index = state.index
         if self._editor.view is not state.project and not self._live.active:
             self._context.refresh()
+
+    def _share(self) -> None:
+        """Take over what the background's state has for everybody."""
+        self._context.change(**{name: getattr(self._background.state, name) for name in _COMMON})
 
     def _name(self, name: str) -> None:
         chosen = " ".join(name.split())[:LONGEST_NAME]

@@ -19,6 +19,7 @@ from carts_viewer.jobs import Job
 from carts_viewer.joint_range import Reach
 from carts_viewer.layers import Layer
 from carts_viewer.observing import Observed
+from carts_viewer.solve_state import SolveState
 from carts_viewer.strokes import Brush
 
 
@@ -100,32 +101,6 @@ class RunState:
     """Where the run began."""
     base_frame_gain: float | None = None
     """The share of the remaining residual that free base frames would explain [1]; None where it is not known."""
-
-
-@dataclass(frozen=True)
-class ListedFrame:
-    """A frame that somebody should look at after many were solved together."""
-
-    index: int
-    reason: str
-    """For people."""
-    taken: bool
-    """Whether what was solved is in the project; otherwise the frame is as it was, until somebody takes it."""
-
-
-@dataclass(frozen=True)
-class SolveState:
-    """Solving many frames together, or how it ended."""
-
-    frames: range
-    """From the first to the last one, kept frames included."""
-    done: int = 0
-    """Frames that were visited."""
-    running: bool = True
-    text: str = ""
-    """How it goes, for people."""
-    listed: tuple[ListedFrame, ...] = ()
-    """Frames whose fit became worse, or is doubtful."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from carts_core.export import FORMATS
 from carts_core.project import frames_in
 from carts_core.project.queries import UNREVIEWED
 from carts_viewer import intents
-from carts_viewer.adapting import adapt
+from carts_viewer.adapting import LONGEST, adapt
 from carts_viewer.asker import Asker
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun
@@ -27,8 +27,6 @@ from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
 """How often it is written down how far a job is [s]."""
-LONGEST = 240
-"""Most time for adapting a network [min]."""
 
 
 class JobsHandler:
@@ -298,5 +296,4 @@ class JobsHandler:
         return self._context.state if self._asker is None else self._asker.state
 
     def _publish(self) -> None:
-        networks = self._networks
-        self._context.change(jobs=self._list.jobs, networks=networks.names, network=networks.used)
+        self._context.change(jobs=self._list.jobs, networks=self._networks.names, network=self._networks.used)

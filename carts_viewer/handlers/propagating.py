@@ -14,8 +14,8 @@ from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.sequence_run import SequenceRun
+from carts_viewer.solve_state import ListedFrame, SolveState
 from carts_viewer.solved import Comparison, Outcome, reviewed, unchecked
-from carts_viewer.state import ListedFrame, SolveState
 
 
 class PropagatingHandler:

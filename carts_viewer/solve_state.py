@@ -1,0 +1,29 @@
+"""How solving many frames together goes, and what came of it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """A frame that somebody should look at after many were solved together."""
+
+    index: int
+    reason: str
+    """For people."""
+    taken: bool
+    """Whether what was solved is in the project; otherwise the frame is as it was, until somebody takes it."""
+
+
+@dataclass(frozen=True)
+class SolveState:
+    """Solving many frames together, or how it ended."""
+
+    frames: range
+    """From the first to the last one, kept frames included."""
+    done: int = 0
+    """Frames that were visited."""
+    running: bool = True
+    text: str = ""
+    """How it goes, for people."""
+    listed: tuple[ListedFrame, ...] = ()
+    """Frames whose fit became worse, or is doubtful."""
