@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from carts_core.recording import Sequence
+from carts_core.segmentation import Segmenter
 from carts_core.settings.inference import Inference
 from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.keys import key_groups
@@ -47,6 +48,7 @@ class ViewerApp:
         device: str = "cpu",
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
+        segmenter: Segmenter | None = None,
         report: Report = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
@@ -61,7 +63,9 @@ class ViewerApp:
         self._storage = storage
         renderer = OverlayRenderer(sequence, device)
         queue: IntentQueue[Tab] = IntentQueue()
-        self._optimizers = OptimizerFactory(weights=weights, device=device, inference=inference, report=self._say)
+        self._optimizers = OptimizerFactory(
+            weights=weights, device=device, inference=inference, segmenter=segmenter, report=self._say
+        )
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")
@@ -87,6 +91,7 @@ class ViewerApp:
         device: str = "cpu",
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
+        segmenter: Segmenter | None = None,
         report: Report = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
@@ -101,6 +106,7 @@ class ViewerApp:
             device: Where to render and optimize, say `cpu` or `cuda`.
             inference: Who runs the surface network.
             weights: Weights files; a network that none is given of is the shipped one.
+            segmenter: Segments what people point at; None for the one that ships.
             report: Called with a line about what takes long.
             page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
             folders: From where masks may be imported, besides the sequence's own folder.
@@ -125,6 +131,7 @@ class ViewerApp:
                 device=device,
                 inference=inference,
                 weights=weights,
+                segmenter=segmenter,
                 report=report,
                 page=page,
                 folders=folders,

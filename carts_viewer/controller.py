@@ -83,7 +83,7 @@ class Controller:
             intents.Annotation: self._annotating.handle,
             intents.Marking: MarkingHandler(context, run).handle,
             intents.ExportMask: lambda intent: deliver(intent.client_id, *shown_mask(context)),
-            intents.Painting: PaintingHandler(context, run).handle,
+            intents.Painting: PaintingHandler(context, run, optimizers.segmenter).handle,
             intents.ImportMasks: ImportingHandler(context, run).handle,
             intents.Live: self._live.handle,
             intents.Finding: FindingHandler(context, run, self._browsing.show).handle,

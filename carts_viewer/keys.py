@@ -83,6 +83,8 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("B", "Brush, or put it away", intents.ToggleTool(Tool.BRUSH), "shift"),
         Shortcut("X", "Eraser, or put it away", intents.ToggleTool(Tool.ERASER), "shift"),
         Shortcut("P", "Polygon, or put it away", intents.ToggleTool(Tool.POLYGON), "shift"),
+        Shortcut("T", "Prompt (click or box), or put it away", intents.ToggleTool(Tool.PROMPT), "shift"),
+        Shortcut("enter", "Prompt: go on with the next object", intents.NextObject()),
         Shortcut("M", "Paint on the mask or on the ignore region", intents.SetTarget(), "shift"),
         Shortcut("[", "Smaller brush", intents.ScaleBrush(1 / _GROWTH)),
         Shortcut("]", "Larger brush", intents.ScaleBrush(_GROWTH)),
@@ -99,7 +101,7 @@ _GROUPS = {
     "Frames": ("frame", "Play", "worst"),
     "Optimize": ("optimizer", "run", "keyframe", "Perturb", "measured", "correction", "joint"),
     "Review": ("Accept", "Mark as", "Reject", "review", "Undo", "Redo"),
-    "Paint": ("Brush", "brush", "Eraser", "Polygon", "polygon", "Paint"),
+    "Paint": ("Brush", "brush", "Eraser", "Polygon", "polygon", "Prompt", "Paint"),
     "View": ("",),
 }
 """Names of groups, and words by which the keys of a group are known; the first group that fits has the key."""

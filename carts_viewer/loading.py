@@ -10,6 +10,7 @@ from carts_core.networks.surface_network import SurfaceNetwork
 from carts_core.networks.weights import read_weights
 from carts_core.optimization import Backgrounds, familiarity
 from carts_core.recording import Sequence as Recording
+from carts_core.segmentation import NetworkSegmenter, Segmenter
 from carts_core.settings.inference import Inference
 
 REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
@@ -25,6 +26,7 @@ class NetworkLoader:
         weights: Sequence[Path] = (),
         device: str = "cpu",
         inference: Inference = "auto",
+        segmenter: Segmenter | None = None,
         report: Callable[[str], None],
     ) -> None:
         """
@@ -32,8 +34,11 @@ class NetworkLoader:
             weights: Weights files; a network that none is given of is the shipped one.
             device: Where to compute.
             inference: Who runs the surface network.
+            segmenter: Segments what people point at; None for the one that ships.
             report: Called with a line for people about what takes long.
         """
+        self._segmenter = segmenter
+        self._own_segmenter: tuple[FeatureExtractor, Segmenter] | None = None
         self._weights = weights
         self._device = device
         self._inference: Inference = inference
@@ -74,6 +79,19 @@ class NetworkLoader:
                 weights = [self._surface, *others]
             self._extractor = FeatureExtractor.load(*weights, device=self._device, inference=self._inference)
         return self._extractor
+
+    def segmenter(self) -> Segmenter:
+        """What segments what people point at.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        if self._segmenter is not None:
+            return self._segmenter
+        extractor = self.prepare()
+        if self._own_segmenter is None or self._own_segmenter[0] is not extractor:
+            self._own_segmenter = extractor, NetworkSegmenter.of(extractor)
+        return self._own_segmenter[1]
 
     def unfamiliar(
         self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]

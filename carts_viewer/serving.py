@@ -10,6 +10,7 @@ from typing import TextIO
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
+from carts_core.segmentation import Segmenter
 from carts_core.settings.inference import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.ending import EndRequest
@@ -28,6 +29,7 @@ def serve(
     device: str = "cpu",
     inference: Inference = "auto",
     weights: tuple[Path, ...] = (),
+    segmenter: Segmenter | None = None,
     open_browser: bool = False,
 ) -> None:
     """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
@@ -41,6 +43,7 @@ def serve(
         device: Where to render and optimize, say `cpu` or `cuda`.
         inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
+        segmenter: Segments what people point at; None for the one that ships.
         open_browser: Open the page in the default browser.
 
     Raises:
@@ -59,6 +62,7 @@ def serve(
                 device=device,
                 inference=inference,
                 weights=weights,
+                segmenter=segmenter,
                 report=_say_doing,
                 folders=tuple(folders),
             )
@@ -84,6 +88,7 @@ def serve_site(
     device: str = "cpu",
     inference: Inference = "auto",
     weights: tuple[Path, ...] = (),
+    segmenter: Segmenter | None = None,
     open_browser: bool = False,
     batch: Path | None = None,
 ) -> None:
@@ -96,6 +101,7 @@ def serve_site(
         device: Where to render and optimize, say `cpu` or `cuda`.
         inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
+        segmenter: Segments what people point at; None for the one that ships.
         open_browser: Open the page in the default browser.
         batch: Folder of the batch that is shown first; None for the start page.
 
@@ -113,6 +119,7 @@ def serve_site(
                 device=device,
                 inference=inference,
                 weights=weights,
+                segmenter=segmenter,
                 report=_say_doing,
                 batch=batch,
             )

@@ -33,6 +33,7 @@ class Tool(StrEnum):
     BRUSH = "Brush"
     ERASER = "Eraser"
     POLYGON = "Polygon"
+    PROMPT = "Prompt"
 
 
 class Target(StrEnum):
@@ -74,6 +75,8 @@ class Stroke:
     """(u, v) [px], at most one image size beyond the image."""
     label: int = 0
     """Number of the class that it paints; 0: any arm."""
+    prompt: bool = False
+    """Whether its one point, or the box between its two, says where something is that is to be segmented."""
 
     def covers(self, camera: Camera) -> Mask:
         """The pixels of the camera's image that it covers."""
@@ -118,8 +121,9 @@ def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera], classes: 
             erase=values["erase"] is True,
             polygon=values["polygon"] is True,
             diameter=_diameter(values["diameter"]),
-            points=_points(values["points"], camera, 3 if values["polygon"] is True else 1),
+            points=_points(values["points"], camera, *_counts(values)),
             label=_whole(values.get("label", 0), classes + 1),
+            prompt=values.get("prompt") is True,
         )
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise SettingsError(
@@ -173,9 +177,16 @@ def _diameter(value: Any) -> int:
     return round(min(max(value, DIAMETERS[0]), DIAMETERS[1]))
 
 
-def _points(value: Any, camera: Camera, fewest: int) -> Float[np.ndarray, "points 2"]:
-    if not isinstance(value, list) or not fewest <= len(value) <= LONGEST_STROKE:
-        raise ValueError(f"not a list of {fewest} to {LONGEST_STROKE} points")
+def _counts(values: Mapping[str, Any]) -> tuple[int, int]:
+    """How many points it must have, and may."""
+    if values.get("prompt") is True:
+        return 1, 2
+    return 3 if values["polygon"] is True else 1, LONGEST_STROKE
+
+
+def _points(value: Any, camera: Camera, fewest: int, most: int) -> Float[np.ndarray, "points 2"]:
+    if not isinstance(value, list) or not fewest <= len(value) <= most:
+        raise ValueError(f"not a list of {fewest} to {most} points")
     points = np.array(value, float)
     if points.shape != (len(value), 2) or not np.isfinite(points).all():
         raise ValueError("a point is not a pair of finite numbers")

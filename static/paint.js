@@ -5,6 +5,7 @@
 
   const SPACING = 0.7; // between points that are kept [px of the image]
   const LONGEST = 15000; // points, then another stroke begins; the server takes 20,000
+  const BOX = 6; // a pointer that has moved further draws a box [px of the screen]
   const NEAR = 9; // of the first corner, where a click closes the polygon [px of the screen]
   const SHOWN_BY_NOW = 250; // [ms] after the server's word, if no new overlay is noticed
   const FORGOTTEN = 60000; // [ms] a stroke that the server has never answered
@@ -41,12 +42,19 @@
   function begin(point) {
     const { frame, camera, target, label, diameter, tool, colors } = brush;
     drawing = {
-      frame, camera, target, label, diameter, polygon: tool === "polygon", erase: (tool === "eraser") !== shift,
+      frame, camera, target, label, diameter, polygon: tool === "polygon", prompt: tool === "prompt",
+      erase: (tool === "eraser") !== shift,
       points: [point], colors,
     };
   }
 
   function add(point) {
+    if (drawing.prompt) {
+      // A click, or a box from there to the pointer.
+      drawing.points = apart(drawing.points[0], point) > BOX ? [drawing.points[0], point] : [drawing.points[0]];
+      dirty = true;
+      return;
+    }
     const last = drawing.points[drawing.points.length - 1];
     if (Math.hypot(point[0] - last[0], point[1] - last[1]) < SPACING) return;
     drawing.points.push(point);
@@ -69,9 +77,9 @@
     stroke.number = ++count;
     stroke.sent = performance.now();
     pending.push(stroke);
-    const { number, frame, camera, target, label, erase, polygon, diameter } = stroke;
+    const { number, frame, camera, target, label, erase, polygon, prompt, diameter } = stroke;
     const points = stroke.points.map((point) => point.map((value) => Math.round(value * 10) / 10));
-    const message = { number, frame, camera, target, label, erase, polygon, diameter, points };
+    const message = { number, frame, camera, target, label, erase, polygon, prompt, diameter, points };
     window.carts.report("painted", JSON.stringify(message));
   }
 
@@ -93,7 +101,7 @@
     }
     event.preventDefault();
     document.activeElement?.blur?.();
-    shift = event.shiftKey;
+    shift = event.shiftKey || (event.altKey && brush.tool === "prompt");
     if (brush.tool !== "polygon") {
       canvas.setPointerCapture(event.pointerId);
       begin(point);
@@ -109,7 +117,7 @@
 
   function move(event) {
     pointer = inImage(event);
-    shift = event.shiftKey;
+    if (!drawing?.prompt) shift = event.shiftKey;
     dirty = true;
     if (!drawing || drawing.polygon) return;
     const moves = event.getCoalescedEvents?.() ?? [];
@@ -132,6 +140,8 @@
       dirty = true;
     } else if (!window.cartsConfiguration.keys.includes(key) || (key === "escape" && !active())) {
       return;
+    } else if (key === "enter" && !(active() && brush.tool === "prompt")) {
+      return; // presses whatever button has the focus
     } else {
       window.carts.report("pressed", key);
     }
@@ -171,6 +181,10 @@
     context.globalAlpha = 0.55;
     context.fillStyle = context.strokeStyle = color;
     context.lineCap = context.lineJoin = "round";
+    if (stroke.prompt) {
+      paintPrompt(context, stroke, image);
+      return;
+    }
     const scale = path(context, stroke, image, stroke.polygon && finished);
     if (!stroke.polygon) {
       context.lineWidth = stroke.diameter * scale;
@@ -184,6 +198,25 @@
     context.stroke();
     const [u, v] = stroke.points[0];
     ring(context, u * scale, (v * image.height) / brush.height, 4);
+  }
+
+  /** Where a prompt points: a dot, or a box. */
+  function paintPrompt(context, stroke, image) {
+    const [x, y] = [image.width / brush.width, image.height / brush.height];
+    const [first, last] = [stroke.points[0], stroke.points[stroke.points.length - 1]];
+    context.globalAlpha = 1;
+    if (stroke.points.length === 1) {
+      context.beginPath();
+      context.arc(first[0] * x, first[1] * y, 5, 0, 2 * Math.PI);
+      context.fill();
+      ring(context, first[0] * x, first[1] * y, 5);
+      return;
+    }
+    for (const [color, width] of [["rgba(0, 0, 0, 0.7)", 3.5], [context.fillStyle, 1.75]]) {
+      context.strokeStyle = color;
+      context.lineWidth = width;
+      context.strokeRect(first[0] * x, first[1] * y, (last[0] - first[0]) * x, (last[1] - first[1]) * y);
+    }
   }
 
   function ring(context, x, y, radius) {
@@ -220,7 +253,7 @@
       paint(context, { ...drawing, points: towards, erase: drawing.polygon ? shift : drawing.erase }, image, false);
     }
     context.restore();
-    if (pointer && active() && brush.tool !== "polygon") {
+    if (pointer && active() && !["polygon", "prompt"].includes(brush.tool)) {
       const scale = image.width / brush.width;
       ring(context, pointer[0] * scale, (pointer[1] * image.height) / brush.height, (brush.diameter / 2) * scale);
     }
@@ -229,7 +262,7 @@
   /** With a tool in hand the pointer is ours, without one it moves the picture. */
   function takePointer(on) {
     canvas.style.pointerEvents = on ? "auto" : "none";
-    canvas.style.cursor = brush.tool === "polygon" ? "crosshair" : "none";
+    canvas.style.cursor = ["polygon", "prompt"].includes(brush.tool) ? "crosshair" : "none";
   }
 
   function everyFrame() {

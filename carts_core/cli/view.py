@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ..errors import SettingsError
 from .selection import Network
+
+if TYPE_CHECKING:
+    from ..segmentation import Segmenter
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class View:
     """Port to listen on; the next free one if it is taken."""
     open_browser: bool = False
     """Open the page in the default browser."""
+    segmenter: tuple[Path, Path] | None = None
+    """Encoder and decoder of a SAM-type model as ONNX files, for the tool *Prompt*; by default the one that ships."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
@@ -35,6 +40,7 @@ class View:
 
         from ..batch.folder import is_batch
 
+        segmenter = self._segmenter()
         if self.sequence is None or is_batch(self.sequence):
             if self.project is not None:
                 raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
@@ -45,6 +51,7 @@ class View:
                 device=self.network.device,
                 inference=self.network.inference,
                 weights=self.network.weights,
+                segmenter=segmenter,
                 open_browser=self.open_browser,
                 batch=None if self.sequence is None else self.sequence.resolve(),
             )
@@ -58,5 +65,13 @@ class View:
             device=self.network.device,
             inference=self.network.inference,
             weights=self.network.weights,
+            segmenter=segmenter,
             open_browser=self.open_browser,
         )
+
+    def _segmenter(self) -> "Segmenter | None":
+        if self.segmenter is None:
+            return None
+        from ..segmentation.onnx_segmenter import OnnxSegmenter
+
+        return OnnxSegmenter.load(*self.segmenter)

@@ -1,16 +1,22 @@
 """What intents about painting do: tools in hand, and layers of the project."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import singledispatchmethod
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
+
 from carts_core.errors import CartsError
 from carts_core.model.parts import part_classes
-from carts_core.project import Key, Kind, ProjectState
+from carts_core.project import Edits, Key, Kind
+from carts_core.segmentation import Segmenter
 from carts_viewer import intents
 from carts_viewer.checks import clamped, unknown
 from carts_viewer.context import Context, OpenRun
 from carts_viewer.layers import Layer
+from carts_viewer.prompting import Prompting
 from carts_viewer.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored, relabelled
 
 _STEPS = {
@@ -25,9 +31,10 @@ _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the 
 class PaintingHandler:
     """The handler that painting is about."""
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
+    def __init__(self, context: Context, run: OpenRun, segmenter: Callable[[], Segmenter]) -> None:
         self._context = context
         self._open_run = run
+        self._prompting = Prompting(segmenter)
         self._session = context.session
 
     @singledispatchmethod
@@ -40,7 +47,12 @@ class PaintingHandler:
         raise unknown(intent)
 
     @handle.register
+    def _(self, intent: intents.NextObject) -> None:
+        self._prompting.finish()
+
+    @handle.register
     def _(self, intent: intents.SetTool) -> None:
+        self._prompting.finish()
         self._hold(tool=intent.tool)
 
     @handle.register
@@ -77,14 +89,7 @@ class PaintingHandler:
         stroke = intent.stroke
         painted = {**self._context.state.brush.painted, intent.client_id: stroke.number}
         try:
-            covered = stroke.covers(self._session.scene.camera(stroke.camera))
-            project = self._session.editor.view
-            if stroke.target is Target.MASK:
-                edits = self._masked(project, stroke, covered)
-            else:
-                key = Key.ignore_region(stroke.frame, stroke.camera)
-                edits = {key: ignored(project.get(key), covered, erase=stroke.erase)}
-            self._change(self._step(stroke), edits)
+            self._change(self._step(stroke), self._edits(stroke))
         finally:
             self._hold(painted=painted)
 
@@ -95,22 +100,43 @@ class PaintingHandler:
         painted = (Key.mask_correction, Key.part_labels) if target is Target.MASK else (Key.ignore_region,)
         self._change(_CLEARED[target], {make(state.index, state.camera): None for make in painted})
 
-    def _masked(self, project: ProjectState, stroke: Stroke, covered: Mask) -> dict[Key[Any], Any]:
-        """What a stroke on the mask changes: the mask, and which part a pixel is."""
-        mask, labels = Key.mask_correction(stroke.frame, stroke.camera), Key.part_labels(stroke.frame, stroke.camera)
-        return {
-            mask: corrected(project.get(mask), covered, self._rendered(stroke), erase=stroke.erase),
-            labels: relabelled(project.get(labels), covered, stroke.label, erase=stroke.erase),
-        }
+    def _edits(self, stroke: Stroke) -> Edits:
+        """What a stroke, or a prompt, changes: the ignore region, or the mask and which part a pixel is."""
+        project, place = self._session.editor.view, (stroke.frame, stroke.camera)
+        mask, labels, region = Key.mask_correction(*place), Key.part_labels(*place), Key.ignore_region(*place)
+
+        def changed(layers: Mapping[Key[Any], Any], covered: Mask, erase: bool) -> Edits:
+            if stroke.target is Target.IGNORE:
+                return {region: ignored(layers[region], covered, erase=erase)}
+            return {
+                mask: corrected(layers[mask], covered, self._rendered(stroke), erase=erase),
+                labels: relabelled(layers[labels], covered, stroke.label, erase=erase),
+            }
+
+        keys: tuple[Key[Any], ...] = (region,) if stroke.target is Target.IGNORE else (mask, labels)
+        if stroke.prompt:
+            return self._prompting.edits(stroke, self._image(stroke), project, keys, changed)
+        covered = stroke.covers(self._session.scene.camera(stroke.camera))
+        return changed({key: project.get(key) for key in keys}, covered, stroke.erase)
+
+    def _image(self, stroke: Stroke) -> UInt8[np.ndarray, "height width 3"]:
+        """The image that a stroke was drawn over."""
+        state = self._context.state
+        if stroke.frame == state.index and stroke.camera in state.frame.images:
+            return state.frame.images[stroke.camera]
+        frame = self._session.sequence.frame(stroke.frame, state.domain, [stroke.camera])
+        return frame.images[stroke.camera]
 
     def _step(self, stroke: Stroke) -> str:
         """What the history calls a stroke."""
+        if stroke.prompt:
+            return "Segment by a prompt"
         if stroke.label and not stroke.erase and stroke.target is Target.MASK:
             names = {one.number: one.name for one in part_classes(self._session.scene.arms)}
             return f"Paint {names[stroke.label]}"
         return _STEPS[stroke.target, stroke.erase]
 
-    def _change(self, name: str, edits: dict[Key[Any], Any]) -> None:
+    def _change(self, name: str, edits: Edits) -> None:
         """Save layers as one step of undo, those that are others than before."""
         view = self._session.editor.view
         changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}

@@ -78,6 +78,7 @@ from .optimizing import SetObserved as SetObserved
 from .optimizing import SetSetting as SetSetting
 from .optimizing import Step as Step
 from .painting import ClearLayer as ClearLayer
+from .painting import NextObject as NextObject
 from .painting import Paint as Paint
 from .painting import Painting as Painting
 from .painting import ScaleBrush as ScaleBrush

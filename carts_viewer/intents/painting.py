@@ -62,6 +62,11 @@ class Paint(Painting):
 
 
 @dataclass(frozen=True)
+class NextObject(Painting):
+    """The next click with the prompt is about something else."""
+
+
+@dataclass(frozen=True)
 class ClearLayer(Painting):
     """Remove what was painted on a layer of the shown frame and camera; None: the layer that is painted on."""
 

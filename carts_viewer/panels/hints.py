@@ -5,6 +5,7 @@ from carts_viewer.transport.viser_private import element_id
 
 HINTS = {
     "Dismiss": "Take the message away; what it is about stays as it is",
+    "Fit to": "What the arms are fitted to: the network's predictions, or masks",
     "Undo": "Take back your last step, in whatever frame it was (Ctrl+Z)",
     "Redo": "Do again what was taken back last (Ctrl+Shift+Z)",
     # Sequence
@@ -21,6 +22,7 @@ HINTS = {
     "Off": "No tool: drag moves the picture again (Esc)",
     "Brush": "Paint with a round brush; Shift erases (Shift+B)",
     "Eraser": "Erase with a round brush; Shift paints (Shift+X)",
+    "Prompt": "Segment what is at a click or in a box; Shift or Alt takes away (Shift+T)",
     "Polygon": "Fill an area: click its corners, Enter or a double click ends it (Shift+P)",
     "Mask": "Correct the mask: what is added or removed counts for Dice and exports",
     "Ignore region": "Mark pixels that the optimizer leaves out",

@@ -17,6 +17,7 @@ _ICONS = {
     Tool.BRUSH: viser.Icon.BRUSH,
     Tool.ERASER: viser.Icon.ERASER,
     Tool.POLYGON: viser.Icon.POLYGON,
+    Tool.PROMPT: viser.Icon.WAND,
 }
 _HINTS = {
     Tool.OFF: "Take a tool to correct the mask, or to hide occluders from the optimizer.",
@@ -24,6 +25,9 @@ _HINTS = {
     Tool.ERASER: "<b>Drag</b> to erase, with <b>Shift</b> to paint.",
     Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
     "<b>Backspace</b> takes back a corner.",
+    Tool.PROMPT: "<b>Click</b> a thing, or drag a <b>box</b> around it, to add it. Further clicks are about the same "
+    "thing: on it, or with <b>Shift</b> (or Alt) beside it; <b>Enter</b> begins the next. <b>Shift</b> on "
+    "something new takes it away.",
 }
 _ANY = "Any arm"
 _MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
@@ -69,7 +73,7 @@ class PaintPanel:
             write(self._size, brush.diameter)
         write(self._class, next(name for name, number in self._classes.items() if number == brush.label))
         self._class.visible = brush.target is Target.MASK
-        self._size.disabled = brush.tool is Tool.POLYGON
+        self._size.disabled = brush.tool in (Tool.POLYGON, Tool.PROMPT)
         layer = state.mask_correction if brush.target is Target.MASK else state.ignore_region
         self._clear.label = "Clear the correction" if brush.target is Target.MASK else "Clear the ignore region"
         self._clear.disabled = layer is None and (

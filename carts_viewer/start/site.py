@@ -11,6 +11,7 @@ import viser
 
 from carts_core.errors import CartsError
 from carts_core.resources import sample_sequence
+from carts_core.segmentation import Segmenter
 from carts_core.settings.inference import Inference
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
@@ -48,6 +49,7 @@ class Site:
         device: str = "cpu",
         inference: Inference = "auto",
         weights: tuple[Path, ...] = (),
+        segmenter: Segmenter | None = None,
         report: Callable[[str], None] = lambda line: None,
         batch: Path | None = None,
     ) -> None:
@@ -61,6 +63,7 @@ class Site:
             device: where to render and optimize.
             inference: who runs the surface network.
             weights: weights files.
+            segmenter: segments what people point at; None for the one that ships.
             report: called with a line about what takes long.
 
         Raises:
@@ -69,6 +72,7 @@ class Site:
         self.roots = Roots(folders)
         self.device, self.weights = device, weights
         self.inference: Inference = inference
+        self._segmenter = segmenter
         self._report = report
         self.page = Page(host=host, port=port, title="CaRTS")
         self.document = Document(self.page)
@@ -151,6 +155,7 @@ class Site:
                 device=self.device,
                 inference=self.inference,
                 weights=self.weights,
+                segmenter=self._segmenter,
                 report=self._report,
                 page=self.page,
                 folders=self.roots.folders,

@@ -31,7 +31,7 @@ from carts_viewer.transport.outgoing import queue_safely
 from carts_viewer.transport.tab_page import call
 from carts_viewer.transport.viser_private import element_id, on_sent, run_script, value_of
 
-OWN_KEYS = ("[", "]", "(", ")", "escape")
+OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
 
 _THUMBNAIL = "/thumbnail/"

@@ -1,0 +1,189 @@
+"""Segmenters of the SAM family from the user's own files: an encoder and a decoder as ONNX graphs.
+
+ONNX is a description of a computation, so a file from anywhere runs no code of its own; PyTorch's `.pt` and `.pth`
+files may, and are refused. The names of inputs and outputs are those that Segment Anything's own export gives its
+decoder, which the exports of its successors keep.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnxruntime
+from jaxtyping import Bool, Float, UInt8
+
+from ..errors import WeightsError
+from ..files.reading import WEIGHTS, read_bytes
+from ..wording import shortened
+from .prompt import Prompt
+
+_MEAN, _DEVIATION = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
+"""Of the colours of an image, as SAM's encoders take it, RGB in 0..255."""
+_INSIDE, _OUTSIDE, _CORNERS, _PADDING = 1.0, 0.0, (2.0, 3.0), -1.0
+"""What SAM calls a point: on the thing, beside it, upper left and lower right corner of a box, none."""
+_REMEDY = (
+    "Give two ONNX files, the encoder first, as Segment Anything's export_onnx_model.py and samexporter write them."
+)
+_KNOWN = {"point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size"}
+"""Inputs of a decoder that no encoder makes."""
+
+
+class OnnxSegmenter:
+    """A SAM-type model; a plug-in of `Segmenter`. Made by `OnnxSegmenter.load`.
+
+    Attributes:
+        name: of the decoder's file, for people.
+    """
+
+    def __init__(
+        self, encoder: onnxruntime.InferenceSession, decoder: onnxruntime.InferenceSession, side: int, name: str
+    ) -> None:
+        self.name = name
+        self._encoder, self._decoder, self._side = encoder, decoder, side
+        self._wanted = {given.name: given for given in decoder.get_inputs()}
+        self._last: tuple[np.ndarray, dict[str, np.ndarray]] | None = None
+
+    @staticmethod
+    def load(encoder: Path, decoder: Path) -> "OnnxSegmenter":
+        """Read a model.
+
+        Args:
+            encoder: an image `[1, 3, side, side]` in; features of it out.
+            decoder: these features, `point_coords`, `point_labels`, and optionally `mask_input`, `has_mask_input` and
+                `orig_im_size` in; `masks` (logits) and, if there are several, `iou_predictions` out.
+
+        Raises:
+            WeightsError: a file is missing, is no ONNX graph, or is one of another kind.
+        """
+        first, second = _session(encoder), _session(decoder)
+        images = first.get_inputs()
+        shape = list(images[0].shape) if images else []
+        if (
+            len(images) != 1
+            or len(shape) != 4
+            or shape[1] != 3
+            or shape[2] != shape[3]
+            or not isinstance(shape[2], int)
+        ):
+            raise WeightsError(
+                f"{encoder} takes {_listed(images)}; an encoder takes one image [1, 3, side, side]. {_REMEDY}"
+            )
+        names = {given.name for given in second.get_inputs()}
+        offered = {found.name for found in first.get_outputs()}
+        missing = {"point_coords", "point_labels"} - names
+        foreign = names - offered - _KNOWN
+        # One output of the encoder under another name is what the decoder's one unknown input means.
+        if missing or len(foreign) > 1 or (foreign and len(offered) != 1):
+            raise WeightsError(
+                f"{decoder} takes {_listed(second.get_inputs())}, and {encoder} makes {', '.join(sorted(offered))}; a "
+                f"decoder takes what its encoder makes, point_coords and point_labels. {_REMEDY}"
+            )
+        if "masks" not in {found.name for found in second.get_outputs()}:
+            raise WeightsError(f"{decoder} makes {_listed(second.get_outputs())}, and no masks. {_REMEDY}")
+        return OnnxSegmenter(first, second, shape[2], decoder.stem)
+
+    def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
+        """The mask of what is at the points or in the box; see `Segmenter`.
+
+        Raises:
+            WeightsError: the model cannot be run, or makes something else than masks.
+        """
+        try:
+            return self._segment(image, prompt)
+        except (ValueError, IndexError, RuntimeError, MemoryError) as error:
+            raise WeightsError(f"{self.name} cannot segment: {shortened(str(error), 300)}. {_REMEDY}") from error
+        except Exception as error:  # ONNX Runtime's errors have no base class but this.
+            raise WeightsError(f"{self.name} cannot be run: {shortened(str(error), 300)}. {_REMEDY}") from error
+
+    def _segment(self, image: np.ndarray, prompt: Prompt) -> np.ndarray:
+        height, width = image.shape[:2]
+        scale = self._side / max(height, width)
+        points, labels = _points(prompt, scale)
+        values: dict[str, np.ndarray] = {
+            "point_coords": points[None],
+            "point_labels": labels[None],
+            "mask_input": np.zeros((1, 1, self._side // 4, self._side // 4), np.float32),
+            "has_mask_input": np.zeros(1, np.float32),
+            "orig_im_size": np.array([height, width]),
+        }
+        features = self._features(image, scale)
+        unknown = [name for name in self._wanted if name not in values and name not in features]
+        if unknown:
+            (features[unknown[0]],) = features.values()
+        values |= features
+        given = {name: _typed(values[name], wanted.type) for name, wanted in self._wanted.items()}
+        names = [found.name for found in self._decoder.get_outputs()]
+        found = dict(zip(names, self._decoder.run(None, given), strict=True))
+        masks = np.asarray(found["masks"], np.float32).reshape(-1, *np.shape(found["masks"])[-2:])
+        best = int(np.argmax(found["iou_predictions"])) if "iou_predictions" in found and len(masks) > 1 else 0
+        return _at_size(masks[best], (height, width)) > 0.0
+
+    def _features(self, image: np.ndarray, scale: float) -> dict[str, np.ndarray]:
+        """What the encoder makes of an image; remembered, since a person's clicks come on the same image."""
+        if self._last is None or self._last[0] is not image:
+            height, width = image.shape[:2]
+            size = round(width * scale), round(height * scale)
+            resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+            square = np.zeros((self._side, self._side, 3), np.float32)
+            square[: size[1], : size[0]] = (resized - _MEAN) / _DEVIATION
+            (given,) = self._encoder.get_inputs()
+            inputs = {given.name: _typed(square.transpose(2, 0, 1)[None], given.type)}
+            names = [found.name for found in self._encoder.get_outputs()]
+            self._last = image, dict(zip(names, self._encoder.run(None, inputs), strict=True))
+        return dict(self._last[1])
+
+
+def _points(prompt: Prompt, scale: float) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
+    """Points and what they are, in pixels of the encoder's image."""
+    places = [*prompt.inside, *prompt.outside]
+    kinds = [_INSIDE] * len(prompt.inside) + [_OUTSIDE] * len(prompt.outside)
+    if prompt.box is not None:
+        places += [prompt.box[:2], prompt.box[2:]]
+        kinds += list(_CORNERS)
+    else:
+        # SAM's decoder was trained with such a point where no box is given.
+        places, kinds = [*places, (0.0, 0.0)], [*kinds, _PADDING]
+    return np.array(places, np.float32) * np.float32(scale), np.array(kinds, np.float32)
+
+
+def _at_size(logits: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
+    """The decoder's mask at the image's size; a low-resolution one covers the padded square."""
+    height, width = size
+    if logits.shape == size:
+        return logits
+    side = max(height, width)
+    return cv2.resize(logits, (side, side), interpolation=cv2.INTER_LINEAR)[:height, :width]
+
+
+def _typed(value: np.ndarray, kind: str) -> np.ndarray:
+    """A value as the graph wants it."""
+    types = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
+    types |= {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
+    if kind not in types:
+        raise ValueError(f"an input is of type {kind}")
+    return np.ascontiguousarray(value, types[kind])
+
+
+def _session(path: Path) -> onnxruntime.InferenceSession:
+    try:
+        content = read_bytes(path, WEIGHTS)
+    except (OSError, ValueError) as error:
+        raise WeightsError(f"segmenter file {path} cannot be read ({shortened(str(error))}). {_REMEDY}") from error
+    if content[:2] == b"PK" or content[:1] == b"\x80":
+        raise WeightsError(
+            f"segmenter file {path} is a PyTorch file, which may run code of whoever made it when it is loaded. Export "
+            f"it as ONNX. {_REMEDY}"
+        )
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # As above.
+        raise WeightsError(
+            f"segmenter file {path} is no ONNX graph that can be run ({shortened(str(error), 300)}). {_REMEDY}"
+        ) from error
+
+
+def _listed(values: list[Any]) -> str:
+    return ", ".join(f"{value.name} {value.shape}" for value in values) or "nothing"
