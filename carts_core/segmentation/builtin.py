@@ -20,8 +20,8 @@ _LONGEST_SIDE = 640
 """Of the image that outlines are looked for in [px]."""
 _ROUNDS = 3
 _BAND, _WIDE = 0.005, 0.2
-"""How far from the network's outline, or from the middle of a box that the network sees nothing in, the image decides, as
-shares of the image's longer side."""
+"""How far from the network's outline, or from the middle of a box in which the network sees nothing, the image decides,
+as shares of the image's longer side."""
 _POINT, _AROUND = 0.006, 0.05
 """Radius of what a point says for certain, and of what one beside the thing puts in question; shares as above."""
 _ALIKE = 25
@@ -188,5 +188,5 @@ def _outlined(
     # It begins with clusters of colours, from random centres.
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), states, None, *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), states, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
     return (states == cv2.GC_FGD) | (states == cv2.GC_PR_FGD)

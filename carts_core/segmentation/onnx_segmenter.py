@@ -5,6 +5,7 @@ files may, and are refused. The names of inputs and outputs are those that Segme
 decoder, which the exports of its successors keep.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,9 +114,8 @@ class OnnxSegmenter:
             (features[unknown[0]],) = features.values()
         values |= features
         given = {name: _typed(values[name], wanted.type) for name, wanted in self._wanted.items()}
-        names = [found.name for found in self._decoder.get_outputs()]
-        found = dict(zip(names, self._decoder.run(None, given), strict=True))
-        masks = np.asarray(found["masks"], np.float32).reshape(-1, *np.shape(found["masks"])[-2:])
+        found = _run(self._decoder, given)
+        masks = found["masks"].astype(np.float32).reshape(-1, *found["masks"].shape[-2:])
         best = int(np.argmax(found["iou_predictions"])) if "iou_predictions" in found and len(masks) > 1 else 0
         return _at_size(masks[best], (height, width)) > 0.0
 
@@ -129,9 +129,15 @@ class OnnxSegmenter:
             square[: size[1], : size[0]] = (resized - _MEAN) / _DEVIATION
             (given,) = self._encoder.get_inputs()
             inputs = {given.name: _typed(square.transpose(2, 0, 1)[None], given.type)}
-            names = [found.name for found in self._encoder.get_outputs()]
-            self._last = image, dict(zip(names, self._encoder.run(None, inputs), strict=True))
+            self._last = image, _run(self._encoder, inputs)
         return dict(self._last[1])
+
+
+def _run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """All outputs by name."""
+    names = [found.name for found in session.get_outputs()]
+    values = session.run(None, dict(inputs))
+    return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
 
 def _points(prompt: Prompt, scale: float) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
@@ -185,5 +191,5 @@ def _session(path: Path) -> onnxruntime.InferenceSession:
         ) from error
 
 
-def _listed(values: list[Any]) -> str:
+def _listed(values: Sequence[Any]) -> str:
     return ", ".join(f"{value.name} {value.shape}" for value in values) or "nothing"
