@@ -31,7 +31,8 @@ class Prompting:
     """Turns clicks and boxes into edits of painted layers.
 
     A click adds what is there. As long as nothing else changes these layers, further clicks are about the same thing:
-    one more point on it, or with `erase` one beside it. Otherwise a click with `erase` takes away what is there.
+    one more point on it, or with `erase` one beside it. Otherwise a click with `erase` takes away what is there. A box
+    replaces: what is in it and not segmented is taken away.
     """
 
     def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
@@ -79,10 +80,19 @@ class Prompting:
             )
         before = begun.before if begun is not None and goes_on else now
         erase = stroke.erase and not goes_on
-        edits = changed(before, self._segmenter().segment(image, prompt), erase)
+        found = self._segmenter().segment(image, prompt)
+        cleared = before if prompt.box is None or erase else changed(before, _boxed(prompt.box, found), True)
+        edits = changed(cleared, found, erase)
         if not erase:
             self._begun = _Begun(place, prompt, before, dict(edits))
         return edits
+
+
+def _boxed(box: tuple[float, float, float, float], found: Mask) -> Mask:
+    """The pixels whose middles are in a box."""
+    rows, columns = np.ogrid[: found.shape[0], : found.shape[1]]
+    left, top, right, low = box
+    return (columns + 0.5 > left) & (columns + 0.5 < right) & (rows + 0.5 > top) & (rows + 0.5 < low)
 
 
 def asked(stroke: Stroke) -> Prompt:

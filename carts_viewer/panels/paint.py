@@ -25,8 +25,8 @@ _HINTS = {
     Tool.ERASER: "<b>Drag</b> to erase, with <b>Shift</b> to paint.",
     Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
     "<b>Backspace</b> takes back a corner.",
-    Tool.PROMPT: "<b>Click</b> a thing, or drag a <b>box</b> around it, to add it. Further clicks are about the same "
-    "thing: on it, or with <b>Shift</b> (or Alt) beside it; <b>Enter</b> begins the next. <b>Shift</b> on "
+    Tool.PROMPT: "<b>Click</b> a thing to add it, or drag a <b>box</b>, which replaces. Further clicks are about the "
+    "same thing: on it, or with <b>Shift</b> (or Alt) beside it; <b>Enter</b> begins the next. <b>Shift</b> on "
     "something new takes it away.",
 }
 _ANY = "Any arm"

@@ -97,6 +97,19 @@ def test_shift_on_something_new_takes_it_away_and_a_box_adds(prompted: Desk, dis
     assert not _region(prompted)[25, 30] and _region(prompted)[12, 12]
 
 
+def test_in_a_box_the_mask_becomes_what_is_segmented_whatever_is_rendered(prompted: Desk, discs: Discs) -> None:
+    rendered = prompted.renderer.mask(prompted.state.pose.scene, "left")
+    height, width = rendered.shape
+    corners = np.array([[0.0, 0.0], [float(width), float(height)]])
+    wanted = np.zeros_like(rendered)
+    wanted[5:15, 5:15] = True
+    discs.segment = lambda image, prompt: wanted  # type: ignore[method-assign]
+    prompted.do(intents.Paint(7, Stroke(1, 0, "left", Target.MASK, False, False, 1, corners, prompt=True)))
+    mask = prompted.renderer.mask(prompted.state.pose.scene, "left", prompted.state.mask_correction)
+    assert rendered.any()
+    np.testing.assert_array_equal(mask, wanted)
+
+
 def test_a_mask_and_its_class_come_from_one_prompt(prompted: Desk) -> None:
     stroke = Stroke(1, 0, "left", Target.MASK, False, False, 1, np.array([[20.0, 20.0]]), 3, prompt=True)
     prompted.do(intents.Paint(7, stroke))
