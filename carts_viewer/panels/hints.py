@@ -22,6 +22,8 @@ HINTS = {
     "Off": "No tool: drag moves the picture again (Esc)",
     "Brush": "Paint with a round brush; Shift erases (Shift+B)",
     "Eraser": "Erase with a round brush; Shift paints (Shift+X)",
+    "Adapt the network to this recording": "Train the network further on images made for this recording; a job",
+    "Use the newest network": "Go on with the network that was adapted last",
     "Prompt": "Segment what is at a click or in a box; Shift or Alt takes away (Shift+T)",
     "Polygon": "Fill an area: click its corners, Enter or a double click ends it (Shift+P)",
     "Mask": "Correct the mask: what is added or removed counts for Dice and exports",
