@@ -17,7 +17,7 @@ from ...settings import TrainingConfig
 from ..randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
 from .objective import dilated, weighted_mean
 from .task import Batch, byte_tensor, flips
-from .validation import dice
+from .validation import pooled_dice
 
 _SMOOTH = 0.2
 
@@ -83,8 +83,8 @@ class SurfaceTask:
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
         cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
         return {
-            "dice": float(dice(guess, true).mean()),
-            "dice_given": float(dice(known, true).mean()),
+            "dice": pooled_dice(guess, true),
+            "dice_given": pooled_dice(known, true),
             "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
             "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
         }

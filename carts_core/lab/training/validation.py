@@ -1,7 +1,7 @@
 """Figures that tell whether the network is good: Dice, and how well features tell aligned from misaligned."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -42,3 +42,11 @@ def dice(predicted: Tensor, truth: Tensor) -> Tensor:
     """Dice of boolean masks [..., h, w]; 1 where both are empty."""
     overlap = (predicted & truth).sum((-2, -1))
     return (2 * overlap + 1e-9) / (predicted.sum((-2, -1)) + truth.sum((-2, -1)) + 1e-9)
+
+
+def pooled_dice(predicted: Bool[Tensor, "n h w"], truth: Bool[Tensor, "n h w"]) -> float:
+    """Dice of the pixels of all images together; 1 where both are empty.
+
+    A mean over images would hang on those that show no arm: their own Dice is 1, or 0 as soon as one pixel is wrong.
+    """
+    return float(dice(predicted.flatten(0, 1), truth.flatten(0, 1)))

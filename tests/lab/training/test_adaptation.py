@@ -15,6 +15,7 @@ from carts_core.lab.randomization.recorded import RecordedPlacements
 from carts_core.lab.training.adaptation import BACKGROUNDS, adapted_to, gain
 from carts_core.lab.training.checkpoint import load_checkpoint
 from carts_core.lab.training.training import train
+from carts_core.lab.training.validation import dice, pooled_dice
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
 from carts_core.recording import Sequence
@@ -128,6 +129,17 @@ def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(tmp_path
 def test_what_is_left_of_the_error_is_said():
     text = gain({"dice": 0.8, "normal_error_deg": 20.0}, {"dice": 0.9, "normal_error_deg": 10.0})
     assert "Dice 0.800 -> 0.900, 50% of the error is left" in text
+
+
+def test_one_wrong_pixel_where_no_arm_is_hardly_changes_the_score():
+    truth = torch.zeros(4, 40, 50, dtype=torch.bool)
+    truth[:3, 10:30, 10:30] = True
+    predicted = truth.clone()
+    assert pooled_dice(predicted, truth) == 1.0
+    predicted[3, 0, 0] = True
+    assert float(dice(predicted, truth).mean()) == pytest.approx(0.75) and pooled_dice(predicted, truth) > 0.999
+    predicted[3] = True
+    assert pooled_dice(predicted, truth) == pytest.approx(2 * 1200 / (1200 + 1200 + 2000))
 
 
 def test_a_missing_recording_is_said_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
