@@ -26,8 +26,8 @@ def pick_point(
         The point, called after its link; None where no arm is that near.
     """
     (camera,) = renderer.scene.cameras
-    rendering = renderer(state)
-    face_ids = rendering.face_ids[0].cpu().numpy()
+    faces, inverse_depth = renderer.visibility(state)
+    face_ids = faces[0].cpu().numpy()
     rows, columns = np.nonzero(face_ids >= 0)
     if not len(rows):
         return None
@@ -37,7 +37,7 @@ def pick_point(
     inside = (column, row) == (int(np.floor(pixel[0])), int(np.floor(pixel[1])))
     if not inside and np.linalg.norm(centres[nearest] - pixel) > radius:
         return None
-    depth = float(rendering.depth[0, row, column])
+    depth = 1.0 / float(inverse_depth[0, row, column])
     view = scene.cameras.index(scene.camera(camera.name))
     fx, fy, cx, cy = state.intrinsics[view].tolist()
     u, v = centres[nearest]

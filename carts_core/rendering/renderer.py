@@ -118,6 +118,16 @@ class Renderer:
         return self._visible(state, self.geometry.face_links)
 
     @torch.no_grad()
+    def visibility(
+        self, state: SceneState
+    ) -> tuple[Int[Tensor, "*batch cameras h w"], Float[Tensor, "*batch cameras h w"]]:
+        """`face_ids` and `inverse_depth` of a `Rendering`, and nothing else."""
+        Ts, intrinsics = self._views(state)
+        shape = (*Ts.shape[:-3], self.height, self.width)
+        face_ids, inverse_depth = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
+        return face_ids.view(shape), inverse_depth.view(shape)
+
+    @torch.no_grad()
     def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
         """Label of the visible triangle per pixel, -1 for background."""
         Ts, intrinsics = self._views(state)
