@@ -42,6 +42,7 @@ HINTS = {
     "Step": "A single iteration (T)",
     "Reset": "Back to where the run began (X)",
     "Solver": "What compares the rendered arm with the image; the default is the most accurate",
+    "Fit to": "What a run compares the rendered arm with: the image, or masks",
     "Cameras": "Which cameras' images count",
     "Advanced settings": "Every number of the chosen solver, with its unit and meaning",
     "Reset all to the preset": "Bring all settings back to those of the chosen preset",
