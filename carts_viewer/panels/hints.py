@@ -15,7 +15,7 @@ HINTS = {
     "Domain": "Which variant of the images is shown and optimized; joint positions are the same in all",
     "Camera": "The camera that is painted on and exported alone; a click on its image chooses it, too",
     # Overlay
-    "Layer": "What is drawn over the image (keys 1 to 8)",
+    "Layer": "What is drawn over the image (the number keys)",
     "Opacity %": "Of the overlay: 0 is invisible, 100 hides the image [%]",
     "Swipe %": "Up to where the other pose is shown, from the left [% of the image's width]",
     # Paint

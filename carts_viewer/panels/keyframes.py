@@ -30,7 +30,7 @@ class KeyframesPanel:
             self._text = gui.add_html("")
             self._between = gui.add_button("Solve between", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal")
             self._all = gui.add_button("Solve all", color="gray")
-            page.row(self._between, self._all, weights=(3, 2))
+            page.row(self._between, self._all, weights=(7, 6))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
@@ -52,7 +52,7 @@ class KeyframesPanel:
         """Bring the widgets up to date."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
-        self._all.label = "Solve all" if state.range is None else "Solve the range"
+        self._all.label = "Solve all" if state.range is None else "Solve range"
         self._all.disabled = self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)

@@ -16,7 +16,8 @@ _FIND = """() => {
     };
     const text = (one) => (one.value ?? one.textContent).trim().slice(0, 40);
     const places =
-        'label, button, th, td, input, select, output, [role=tab], .carts-caption, .carts-verdict, .carts-key';
+        'label, button, .mantine-Button-label, th, td, input, select, output, [role=tab],' +
+        ' .carts-caption, .carts-verdict, .carts-key';
     for (const one of document.querySelectorAll(places)) {
         if (!shown(one) || !text(one) || one.closest('.carts-document')) continue;
         const style = getComputedStyle(one);

@@ -21,6 +21,7 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
     app = open_viewer(cameras=("left", "right"), domains=("regular", "smoke"), width=160, height=120)
     tab = open_tab(app, window)
     tab.place_in_viewer.put(intents.Perturb(2.0, 0))
+    tab.place_in_viewer.put(intents.SetRange((0, 1)))
     app.wait_until_shown()
     for folder in ("Free parameters", "Find", "Masks of others", "Paint"):
         for fold in tab.page.get_by_text(folder, exact=True).all():
