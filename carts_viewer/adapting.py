@@ -19,7 +19,7 @@ LONGEST = 240
 """Most time for a run [min]."""
 _POLL = 0.25
 """How often it is seen how training goes [s]."""
-_PATIENCE = 30.0
+_LONGEST_END = 30.0
 """How long training that is stopped has for its checkpoint [s]."""
 
 
@@ -106,7 +106,7 @@ class _Training:
 
     def _reap(self) -> None:
         try:
-            self._process.wait(_PATIENCE)
+            self._process.wait(_LONGEST_END)
         except subprocess.TimeoutExpired:
             self._process.kill()
 

@@ -30,7 +30,7 @@ class KeyframesPanel:
             self._text = gui.add_html("")
             self._between = gui.add_button("Solve between", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal")
             self._all = gui.add_button("Solve all", color="gray")
-            page.row(self._between, self._all, weights=(7, 6))
+            page.row(self._between, self._all, weights=(13, 10))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
