@@ -42,8 +42,6 @@ HINTS = {
     "Step": "A single iteration (T)",
     "Reset": "Back to where the run began (X)",
     "Solver": "What compares the rendered arm with the image; the default is the most accurate",
-    "Fit to": "What a run compares the rendered arm with: the image, or masks",
-    "Adapt the network to this recording": "Train a copy of the network on synthetic images of these arms, as a job",
     "Cameras": "Which cameras' images count",
     "Advanced settings": "Every number of the chosen solver, with its unit and meaning",
     "Reset all to the preset": "Bring all settings back to those of the chosen preset",
@@ -88,7 +86,6 @@ HINTS = {
     "Cancel": "Stop this job, or take it out of the queue; what it has saved stays",
     "Start again": "Queue this job once more; one on many frames goes on where it stopped",
     "Clear ended": "Take all jobs that have ended off the list",
-    "Use the newest network": "Have runs use the network that the last such job has made",
     # Live
     "Start": "Follow the source in the place of the recording",
     "Stop": "Go back to the recording",
