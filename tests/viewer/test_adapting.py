@@ -91,7 +91,7 @@ def test_a_job_adapts_the_network_and_what_it_made_is_used_and_remembered(at_des
 def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
     at_desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapting, "OPTIONS", ("--steps", "100000", *SMALL[2:]))
+    monkeypatch.setattr(adapting, "OPTIONS", ("--steps", "100000", "--checkpoint-every", "1", *SMALL[2:]))
     trainings: list[subprocess.Popen] = []
     popen = subprocess.Popen
 
@@ -101,15 +101,15 @@ def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
 
     monkeypatch.setattr(subprocess, "Popen", watched)
     at_desk.do(intents.Adapt(1))
-    until = time.monotonic() + OVER
-    while not any("step 0" in line for line in at_desk.state.jobs[0].log):
+    until, folder = time.monotonic() + OVER, at_desk.session.editor.project.path.with_name("sequence_adapted_1")
+    while not (folder / "checkpoint.safetensors").is_file():
         assert time.monotonic() < until
         time.sleep(0.1)
         at_desk.advance()
     at_desk.do(intents.CancelJob(1))
     assert at_desk.state.jobs[0].state is JobState.CANCELLED and at_desk.wait_time() is None
     assert trainings[0].wait(OVER) != 0
-    folder = at_desk.session.editor.project.path.with_name("sequence_adapted_1")
+    assert any("step 0" in line for line in at_desk.state.jobs[0].log)
     assert (folder / "checkpoint.safetensors").is_file()
     monkeypatch.setattr(adapting, "OPTIONS", tuple(SMALL))
     at_desk.do(intents.RepeatJob(1))
