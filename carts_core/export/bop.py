@@ -15,6 +15,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial.distance import pdist
+from trimesh.exchange.ply import export_ply
 
 from ..files import OutputPath, write_bytes, write_text
 from ..model.scene import Arm, SceneState
@@ -87,9 +88,7 @@ def _write_models(objects: list[_Object], folder: OutputPath) -> None:
         entry |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
         entry |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
         info[str(one.id)], names[str(one.id)] = entry, one.name
-        content = one.mesh.export(file_type="ply")
-        assert isinstance(content, bytes), "PLY is binary unless it is asked for as text"
-        write_bytes(folder / f"obj_{one.id:06d}.ply", content)
+        write_bytes(folder / f"obj_{one.id:06d}.ply", export_ply(one.mesh))
     write_text(folder / "models_info.json", json.dumps(info, indent=1))
     write_text(folder / "names.json", json.dumps(names, indent=1, ensure_ascii=False))
 
