@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import TextIO, TypeVar
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
@@ -17,6 +17,8 @@ from carts_viewer.ending import EndRequest
 from carts_viewer.opening import opened_in_browser
 from carts_viewer.start.site import Site
 from carts_viewer.transport.guard import check_address
+
+Served = TypeVar("Served", ViewerApp, Site)
 
 
 def serve(
@@ -50,34 +52,24 @@ def serve(
         SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
             when corrections could not be saved, or not in the project that was opened.
     """
-    log_to_stderr()
     began = time.monotonic()
-    with EndRequest() as end:
-        try:
-            app = ViewerApp.open(
-                sequence_path,
-                project=project,
-                host=host,
-                port=port,
-                device=device,
-                inference=inference,
-                weights=weights,
-                segmenter=segmenter,
-                report=_say_doing,
-                folders=tuple(folders),
-            )
-        except CartsError as error:
-            print(f"error: {visible(str(error))}", file=sys.stderr)
-            raise SystemExit(2) from error
-        end.ready()
-        browser = opened_in_browser(app.url) if open_browser else nullcontext()
-        try:
-            _say(f"Ready after {time.monotonic() - began:.1f} s. Open {app.url} in a browser; Ctrl-C ends.")
-            with browser:
-                end.wait()
-            _say("\nClosing.")
-        finally:
-            _close(app, lambda: app.project.incident)
+    _serve(
+        lambda: ViewerApp.open(
+            sequence_path,
+            project=project,
+            host=host,
+            port=port,
+            device=device,
+            inference=inference,
+            weights=weights,
+            segmenter=segmenter,
+            report=_say_doing,
+            folders=tuple(folders),
+        ),
+        lambda: f"Ready after {time.monotonic() - began:.1f} s.",
+        lambda app: app.project.incident,
+        open_browser=open_browser,
+    )
 
 
 def serve_site(
@@ -108,33 +100,58 @@ def serve_site(
     Raises:
         SystemExit: as `serve`.
     """
+
+    def opened() -> Site:
+        check_address(host, port)
+        return Site(
+            folders,
+            host=host,
+            port=port,
+            device=device,
+            inference=inference,
+            weights=weights,
+            segmenter=segmenter,
+            report=_say_doing,
+            batch=batch,
+        )
+
+    _serve(opened, lambda: "Ready.", lambda site: site.incident, open_browser=open_browser)
+
+
+def _serve(
+    opened: Callable[[], Served],
+    ready: Callable[[], str],
+    incident: Callable[[Served], str | None],
+    *,
+    open_browser: bool,
+) -> None:
+    """Open, serve, save and close.
+
+    Args:
+        opened: Opens it.
+        ready: What to say when it is open.
+        incident: Where corrections are kept instead, or why they are not; None where all is well.
+        open_browser: Open the page in the default browser.
+
+    Raises:
+        SystemExit: see `serve`.
+    """
     log_to_stderr()
     with EndRequest() as end:
         try:
-            check_address(host, port)
-            site = Site(
-                folders,
-                host=host,
-                port=port,
-                device=device,
-                inference=inference,
-                weights=weights,
-                segmenter=segmenter,
-                report=_say_doing,
-                batch=batch,
-            )
+            served = opened()
         except CartsError as error:
             print(f"error: {visible(str(error))}", file=sys.stderr)
             raise SystemExit(2) from error
         end.ready()
-        browser = opened_in_browser(site.url) if open_browser else nullcontext()
+        browser = opened_in_browser(served.url) if open_browser else nullcontext()
         try:
-            _say(f"Ready. Open {site.url} in a browser; Ctrl-C ends.")
+            _say(f"{ready()} Open {served.url} in a browser; Ctrl-C ends.")
             with browser:
                 end.wait()
             _say("\nClosing.")
         finally:
-            _close(site, lambda: site.incident)
+            _close(served, lambda: incident(served))
 
 
 def _close(served: ViewerApp | Site, incident: Callable[[], str | None]) -> None:

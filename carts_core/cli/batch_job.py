@@ -137,9 +137,9 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
     """The option that has every machine run the network alike, for steps that run it on a CPU."""
     given = {option.partition("=")[0] for option in job.options.get(step, ())}
-    if step in ("import", "export") or given & {"--inference", "--device"}:
+    if step in ("import", "export") or "--device" in given:
         return ()
-    return ("--inference", inference)
+    return ("--device", "cpu" if inference == "auto" else f"cpu:{inference}")
 
 
 _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}

@@ -52,7 +52,6 @@ class Bench:
             synthetic_source,
         )
         from ..lab.benchmark.stages import known_stages, measure_stages
-        from ..networks.extractor import FeatureExtractor
 
         console = Terminal()
         scope = QUICK if self.quick else FULL
@@ -61,9 +60,7 @@ class Bench:
         name = "quick" if self.quick else "full"
         folder = output_folder(self.output, "bench", name)
         seed = TEST_SEED if self.seed is None else self.seed
-        extractor = FeatureExtractor.load(
-            *self.network.weights, device=self.network.device, inference=self.network.inference
-        )
+        extractor = self.network.load()
         made = synthetic_source(scope, seed)
         sources = [made, synthetic_room_source(made, self.rooms, scope, seed), *family_sources(scope, seed)]
         if self.real is not None:

@@ -61,7 +61,6 @@ class Live:
     def run(self) -> None:
         """Follow until the stream ends or somebody ends it."""
         from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
-        from ..networks.extractor import FeatureExtractor
         from ..optimization import Backgrounds
         from ..project import Provenance
         from ..recording import Sequence
@@ -70,9 +69,7 @@ class Live:
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = tuple(Selection(camera=self.camera).camera_names(sequence.scene))
         domain = Selection(domain=(self.domain,) if self.domain else ()).domain_names(sequence)[0]
-        extractor = FeatureExtractor.load(
-            *self.network.weights, device=self.network.device, inference=self.network.inference
-        )
+        extractor = self.network.load()
         address = StreamAddress.parse(self.source, self.joints_port)
         known = Backgrounds.of(sequence, cameras, domain) if self.source == "replay" else None
         tracker = LiveTracker(sequence.scene, extractor, free=self.free, backgrounds=known, cameras=cameras)

@@ -14,10 +14,13 @@ if TYPE_CHECKING:
     from ..networks.extractor import FeatureExtractor
     from ..optimization import GivenMasks, MaskPredictor
     from ..optimization.measurement import Ignore
+    from ..project.target_masks import MaskLayer
     from ..recording import Frame, Sequence
 
-RECORDING, LAYERS = "recording", ("imported", "painted")
-"""Masks of the sequence file, and those of its project."""
+RECORDING = "recording"
+"""Masks of the sequence file."""
+LAYERS: dict[str, "MaskLayer"] = {"imported": "imported", "painted": "painted"}
+"""Masks of its project."""
 
 
 @dataclass(frozen=True)
@@ -94,20 +97,20 @@ class Observing(Network):
     parts and normals from the network, which serves frames without a mask alone."""
     masks: str = RECORDING
     """Which masks are fitted: `recording` for those of the sequence file, `imported` or `painted` for those of its
-    project (`carts import-masks`, `carts view`), or a file or folder of masks (docs: masks)."""
-    project: Path | None = None
-    """Project file of imported and painted masks; by default that beside the sequence."""
+    project (`carts import-masks`, `carts view`) or, as in `other.carts:painted`, of another one, or a file or folder of
+    masks (docs: masks)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.masks != RECORDING and self.observe == "network":
             raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave both out.")
-        if self.project is not None and self.masks not in LAYERS:
-            needed = " or ".join(LAYERS)
-            raise SettingsError(f"--project {self.project} needs --masks {needed}. Add it, or leave it out.")
-        if self.masks not in (RECORDING, *LAYERS) and not Path(self.masks).exists():
+        if self.masks in (RECORDING, *LAYERS):
+            return
+        named = self._layer[0] or Path(self.masks)
+        if not named.exists():
             raise SettingsError(
-                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, or a file or folder of masks."
+                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, those of another project as "
+                "in other.carts:painted, or a file or folder of masks."
             )
 
     def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
@@ -125,19 +128,29 @@ class Observing(Network):
             )
         if self.observe == "masks" and self.weights:
             raise SettingsError("--observe masks loads no network, but --weights was given. Leave one of them out.")
-        from ..networks.extractor import FeatureExtractor
         from ..optimization import MaskPredictor, NetworkPredictor
 
         given = self._given(sequence)
         masks, origin = (None, "mask") if given is None else (given.masks, given.origin)
         if self.observe == "masks":
-            only = MaskPredictor(None, masks, self.device, origin)
+            only = MaskPredictor(None, masks, self.processor, origin)
             return Observer(only, "", masked=True, given=given, every=True)
-        extractor = FeatureExtractor.load(*self.weights, device=self.device, inference=self.inference)
+        extractor = self.load()
         if self.observe == "both":
             both = MaskPredictor(NetworkPredictor(extractor), masks, origin=origin)
             return Observer(both, extractor.fingerprint, masked=True, given=given)
         return Observer(extractor, extractor.fingerprint, masked=False)
+
+    @property
+    def _layer(self) -> "tuple[Path | None, MaskLayer | None]":
+        """Project (None for the one beside the sequence) and its layer that are fitted; no layer where others are."""
+        from ..project.place import SUFFIX
+
+        project, _, name = self.masks.rpartition(":")
+        layer = LAYERS.get(name)
+        if layer is None or (project and not project.endswith(SUFFIX)):
+            return None, None
+        return Path(project) if project else None, layer
 
     def _given(self, sequence: "Sequence") -> "GivenMasks | None":
         """The masks to be fitted, where they are not those of the sequence file."""
@@ -146,11 +159,12 @@ class Observing(Network):
         from ..project import Project
         from ..project.target_masks import file_masks, project_masks
 
-        if self.masks not in ("imported", "painted"):
+        path, layer = self._layer
+        if layer is None:
             return file_masks(Path(self.masks), sequence)
-        with Project.open(sequence, self.project, read_only=True) as project:
+        with Project.open(sequence, path, read_only=True) as project:
             state = project.state
-        return project_masks(self.masks, state, sequence)
+        return project_masks(layer, state, sequence)
 
     @property
     def observed(self) -> dict[str, str]:

@@ -13,6 +13,7 @@ from ..settings.inference import Inference
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
+    from ..networks.extractor import FeatureExtractor
     from ..recording import Sequence
 
 ALL = "all"
@@ -112,6 +113,10 @@ class Perturbation:
             raise SettingsError(f"--seed is {self.seed}; allowed is 0 or more.")
 
 
+_ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}
+"""Devices that say who runs the surface network there."""
+
+
 @dataclass(frozen=True)
 class Network:
     """The networks and where they run."""
@@ -119,13 +124,33 @@ class Network:
     weights: tuple[Path, ...] = ()
     """Weights files; a network that none is given of is the shipped one."""
     device: str = "cpu"
-    """`cpu`, or a CUDA device such as `cuda` or `cuda:1`."""
-    inference: Inference = "auto"
-    """Who runs the surface network: `torch`, `onnx` (ONNX Runtime, on a CPU; the same to 1e-4), or whichever was faster
-    when it was measured on this machine, once."""
+    """`cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU the surface network is run by torch or ONNX Runtime
+    (the same to 1e-4), whichever was faster when it was measured here, once; `cpu:torch` and `cpu:onnx` name one."""
 
     def __post_init__(self) -> None:
-        check_device(self.device)
+        if self.device not in _ENGINES:
+            check_device(self.device)
+
+    @property
+    def processor(self) -> str:
+        """Device that pixels are on, as torch names it."""
+        return "cpu" if self.device in _ENGINES else self.device
+
+    @property
+    def inference(self) -> Inference:
+        """Who runs the surface network."""
+        return _ENGINES.get(self.device, "auto")
+
+    def load(self) -> "FeatureExtractor":
+        """The networks.
+
+        Raises:
+            WeightsError: a weights file cannot be used.
+            SettingsError: nobody here can run them as asked for.
+        """
+        from ..networks.extractor import FeatureExtractor
+
+        return FeatureExtractor.load(*self.weights, device=self.processor, inference=self.inference)
 
 
 def check_device(device: str) -> None:
@@ -142,7 +167,7 @@ def check_device(device: str) -> None:
     cards = torch.cuda.device_count()
     if kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards)):
         return
-    known = ", ".join(["cpu", *(f"cuda:{card}" for card in range(cards))])
+    known = ", ".join(["cpu", *_ENGINES, *(f"cuda:{card}" for card in range(cards))])
     raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")
 
 

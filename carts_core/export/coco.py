@@ -1,15 +1,59 @@
 """COCO instance segmentation: `images/`, and `annotations/instances_default.json` with a run-length mask per object."""
 
 import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from jaxtyping import Bool
+from numpy import ndarray
 
 from ..files import OutputPath, write_text
-from .dataset import Dataset
+from .dataset import Dataset, View
 from .monitor import Monitor
 from .rle import bounding_box, coco_rle
+
+Annotation = dict[str, Any]
 
 
 def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in COCO's format; masks lose nothing."""
+
+    def annotations(view: View) -> Iterable[Annotation]:
+        for category, mask in dataset.instances(view):
+            yield mask_annotation(view, category.id, mask)
+
+    categories = [{"id": c.id, "name": c.name, "supercategory": c.arm} for c in dataset.categories]
+    write_annotations(dataset, folder, monitor, "instances", categories, annotations)
+
+
+def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
+    """An object of a view, without its number; the box of one that is not in the image is empty."""
+    return {
+        "image_id": view.id,
+        "category_id": category_id,
+        "segmentation": coco_rle(mask),
+        "area": int(mask.sum()),
+        "bbox": list(bounding_box(mask)) if mask.any() else [0, 0, 0, 0],
+        "iscrowd": 0,
+    }
+
+
+def write_annotations(
+    dataset: Dataset,
+    folder: OutputPath,
+    monitor: Monitor,
+    kind: str,
+    categories: list[dict[str, Any]],
+    annotate: Callable[[View], Iterable[Annotation]],
+) -> None:
+    """Write images, and the file of annotations that CVAT and Datumaro look for under this name.
+
+    Args:
+        dataset, folder, monitor: what is written where, and who is told.
+        kind: `instances` or `person_keypoints`, as COCO names its files.
+        categories: as COCO has them.
+        annotate: the objects of a view, without their numbers.
+    """
     images, annotations = [], []
     for view in dataset.views(monitor):
         images.append(
@@ -23,19 +67,8 @@ def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
                 "source": view.frame.source,
             }
         )
-        for category, mask in dataset.instances(view):
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": view.id,
-                    "category_id": category.id,
-                    "segmentation": coco_rle(mask),
-                    "area": int(mask.sum()),
-                    "bbox": list(bounding_box(mask)),
-                    "iscrowd": 0,
-                }
-            )
-    categories = [{"id": c.id, "name": c.name, "supercategory": c.arm} for c in dataset.categories]
+        for annotation in annotate(view):
+            annotations.append({"id": len(annotations) + 1, **annotation})
     content = {
         "info": {"description": dataset.sequence.name},
         "licenses": [],
@@ -43,4 +76,4 @@ def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
         "annotations": annotations,
         "categories": categories,
     }
-    write_text(folder / "annotations" / "instances_default.json", json.dumps(content, ensure_ascii=False))
+    write_text(folder / "annotations" / f"{kind}_default.json", json.dumps(content, ensure_ascii=False))

@@ -1,16 +1,16 @@
 """COCO keypoints: `images/`, and `annotations/person_keypoints_default.json` with the keypoints of every arm."""
 
-import json
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ..files import OutputPath, write_text
+from ..files import OutputPath
 from ..model.keypoints import Keypoint, keypoints, project_keypoints
+from .coco import Annotation, mask_annotation, write_annotations
 from .dataset import Category, Dataset, View
 from .monitor import Monitor
-from .rle import bounding_box, coco_rle
 
 _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
 """COCO's words for a keypoint: not labelled, labelled but not visible, labelled and visible."""
@@ -19,32 +19,14 @@ _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
 def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the keypoints of every arm in COCO's format, with the arm's mask and box; always a category per arm."""
     points = {arm.name: keypoints(arm) for arm in dataset.scene.arms}
-    images, annotations = [], []
-    for view in dataset.views(monitor):
-        images.append(
-            {
-                "id": view.id,
-                "file_name": dataset.write_image(view, folder / "images"),
-                "width": view.camera.width,
-                "height": view.camera.height,
-                "frame": view.frame.frame_id,
-                "camera": view.camera.name,
-                "source": view.frame.source,
-            }
-        )
+
+    def annotations(view: View) -> Iterable[Annotation]:
         for category in dataset.arms:
-            annotation = _annotation(dataset, view, category, points[category.arm])
-            if annotation is not None:
-                annotations.append({"id": len(annotations) + 1, **annotation})
-    content = {
-        "info": {"description": dataset.sequence.name},
-        "licenses": [],
-        "images": images,
-        "annotations": annotations,
-        "categories": [_category(category, points[category.arm]) for category in dataset.arms],
-    }
-    # The name under which CVAT and Datumaro look for keypoints, whoever has them.
-    write_text(folder / "annotations" / "person_keypoints_default.json", json.dumps(content, ensure_ascii=False))
+            yield from _annotations(dataset, view, category, points[category.arm])
+
+    categories = [_category(category, points[category.arm]) for category in dataset.arms]
+    # "person" whoever has the keypoints: CVAT and Datumaro look for no other name.
+    write_annotations(dataset, folder, monitor, "person_keypoints", categories, annotations)
 
 
 def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any]:
@@ -62,12 +44,11 @@ def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any
     }
 
 
-def _annotation(
+def _annotations(
     dataset: Dataset, view: View, category: Category, points: tuple[Keypoint, ...]
-) -> dict[str, Any] | None:
-    """An arm in a view; None where neither a pixel nor a keypoint of it is in the image."""
-    arms = dataset.label_image(view, "arms")
-    mask = arms == category.id
+) -> Iterable[Annotation]:
+    """An arm in a view; none where neither a pixel nor a keypoint of it is in the image."""
+    mask = dataset.label_image(view, "arms") == category.id
     pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
     values: list[float] = []
     for u, v in pixels:
@@ -77,15 +58,5 @@ def _annotation(
             continue
         values += [round(float(u), 3), round(float(v), 3), _VISIBLE if mask[int(v), int(u)] else _HIDDEN]
     labelled = sum(flag > 0 for flag in values[2::3])
-    if not labelled and not mask.any():
-        return None
-    return {
-        "image_id": view.id,
-        "category_id": category.id,
-        "keypoints": values,
-        "num_keypoints": labelled,
-        "segmentation": coco_rle(mask),
-        "area": int(mask.sum()),
-        "bbox": list(bounding_box(mask)) if mask.any() else [0, 0, 0, 0],
-        "iscrowd": 0,
-    }
+    if labelled or mask.any():
+        yield {**mask_annotation(view, category.id, mask), "keypoints": values, "num_keypoints": labelled}

@@ -78,7 +78,10 @@ def _missing(device: torch.device) -> str | None:
 
 def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
     if wanted == "onnx":
-        raise SettingsError(f"--inference onnx is not possible: {fault}. Give auto or torch.")
+        raise SettingsError(
+            f"ONNX Runtime is not possible: {fault}. Give --device cpu or cpu:torch; in Python inference='auto' or "
+            "'torch'."
+        )
     return "torch", None
 
 

@@ -108,8 +108,8 @@ class IgnoreRegion(Layer):
         return self.pixels() == _IGNORED
 
 
-class PartLabels(Layer):
-    """What a person painted a pixel as: the number of a class (`carts_core.model.parts.PartClass`), 0 for none."""
+class LabelLayer(Layer):
+    """A number per pixel, 0 for none."""
 
     @classmethod
     def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
@@ -118,28 +118,22 @@ class PartLabels(Layer):
         Raises:
             ProjectError: they are no picture of 8 bits.
         """
-        return cls(_png(_of_8_bits(labels)))
+        labels = np.asarray(labels)
+        if labels.ndim != 2 or labels.dtype != np.uint8:
+            raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
+        return cls(_png(labels))
 
     def labels(self) -> UInt8[np.ndarray, "height width"]:
-        """Class of every pixel, not to be written to."""
+        """Number of every pixel, not to be written to."""
         return self.pixels()
 
 
-class ImportedMask(Layer):
-    """What others marked in a frame: the number of a label (`ImportedLabels`) per pixel, 0 where nothing is marked."""
+class PartLabels(LabelLayer):
+    """What a person painted a pixel as: the number of a class (`carts_core.model.parts.PartClass`)."""
 
-    @classmethod
-    def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
-        """The layer of these labels.
 
-        Raises:
-            ProjectError: they are no picture of 8 bits.
-        """
-        return cls(_png(_of_8_bits(labels)))
-
-    def labels(self) -> UInt8[np.ndarray, "height width"]:
-        """Label of every pixel, not to be written to."""
-        return self.pixels()
+class ImportedMask(LabelLayer):
+    """What others marked in a frame: the number of a label (`ImportedLabels`) per pixel."""
 
     def mask(self) -> Bool[np.ndarray, "height width"]:
         """Where anything is marked."""
@@ -155,13 +149,6 @@ def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height wid
     image = image.astype(np.uint8, copy=False)
     image.flags.writeable = False
     return image
-
-
-def _of_8_bits(labels: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    labels = np.asarray(labels)
-    if labels.ndim != 2 or labels.dtype != np.uint8:
-        raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
-    return labels
 
 
 def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:

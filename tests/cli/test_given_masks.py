@@ -165,7 +165,8 @@ def test_what_does_not_go_together_or_is_not_there_is_refused(
 ) -> None:
     command, masks = ("evaluate", str(sequence)), ("--observe", "masks")
     assert "--masks painted needs --observe masks or both" in refusal(capsys, *command, "--masks", "painted")
-    assert "needs --masks imported or painted" in refusal(capsys, *command, *masks, "--project", "x.carts")
+    absent = f"{tmp_path / 'x.carts'}:painted"
+    assert f"--masks {absent} is missing" in refusal(capsys, *command, *masks, "--masks", absent)
     missing = str(tmp_path / "missing")
     assert f"--masks {missing} is missing. Give recording, imported, painted" in refusal(
         capsys, *command, *masks, "--masks", missing

@@ -49,7 +49,6 @@ def test_failures_come_first_and_a_frame_opens_with_what_was_found(batch: Path, 
         expect(rows).to_have_count(2)
         expect(rows.first).to_contain_text("domain 'foggy' is not in")
         expect(page.locator(".card img").first).to_be_visible()
-        page.screenshot(path="/tmp/batch_page.png")
         page.locator(".card", has_text="frame 002").get_by_role("button", name="Open").click()
         app = eventually(lambda: site.app, lambda app: app is not None, 60)
         assert app is not None

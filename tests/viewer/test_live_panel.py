@@ -48,10 +48,8 @@ def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open
     assert not tab.state.project.position
     dice = eventually(lambda: tab.state.scores and tab.state.scores.dice, bool)
     assert dice is not None and dice > 0.9
-    tab.page.screenshot(path="/tmp/live_on.png")
     tab.button("Stop")
     expect(tab.page.get_by_text("Recorded: carts view")).to_be_visible(timeout=30_000)
-    tab.page.screenshot(path="/tmp/live_off.png")
     assert not tab.state.streaming and tab.state.frame.frame_id == app.tabs.first.controller.state.frame.frame_id
     (recorded,) = app.project.path.parent.glob("*_live_*/sequence.toml")
     assert len(Sequence.open(recorded)) > 2

@@ -28,6 +28,7 @@ _MEASURED = (
     "lab/benchmark/baseline.py",
     "lab/benchmark/frame.py",
     "lab/benchmark/occlusion.py",
+    "lab/benchmark/temporal.py",
     "lab/benchmark/together.py",
     "lab/benchmark/wrong_inputs.py",
 )

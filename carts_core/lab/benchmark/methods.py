@@ -56,6 +56,7 @@ METHODS = {
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
     "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
     "sequence": Method("ours, sequence mode", _ours, together=True),
+    "temporal": Method("TC-CaRTS, its temporal pipeline", DescentSolver.paper, together=True),
     "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
 _NETWORKS: dict[BaselineName, str] = {

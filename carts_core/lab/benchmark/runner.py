@@ -13,6 +13,7 @@ from ...networks.extractor import FeatureExtractor
 from ...optimization import Backgrounds, FreeParameters, MaskPredictor
 from ...recording import Frame
 from ...rendering import Renderer
+from ...settings import DescentSolver
 from ...wording import counted
 from ..baselines.weights import TrainedBaseline
 from .baseline import segment_rendered, segment_with
@@ -24,6 +25,7 @@ from .occlusion import OCCLUSION, occlude
 from .scope import Run, Scope
 from .sources import Recording, Source
 from .store import ResultsFile
+from .temporal import correct_forwards
 from .together import calibrated_scene, correct_together
 from .wrong_inputs import WRONG, misled
 
@@ -126,6 +128,10 @@ class SourceBench:
             return [self._measure_alone(runs[0], scope, extractor)]
         recording, renderer = self._open()
         truths = {run.frame: self._truth(recording.frame(run.frame, cameras=[self._source.camera])) for run in runs}
+        settings = METHODS[runs[0].method].settings
+        first = settings(scope.steps(runs[0])) if settings else None
+        if isinstance(first, DescentSolver):
+            return correct_forwards(runs, recording, extractor, truths, renderer, first)
         return correct_together(runs, recording, extractor, truths, renderer)
 
     def _measure_alone(self, run: Run, scope: Scope, extractor: FeatureExtractor) -> Measurement:

@@ -26,13 +26,15 @@ from carts_core.lab.benchmark import (
     synthetic_room_source,
     write_report,
 )
+from carts_core.lab.benchmark.further_tables import sequence_table
 from carts_core.lab.benchmark.runner import SourceBench
+from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
 
 QUIET = Console(quiet=True)
-RUNS = 57
+RUNS = 61
 """30 of the main table, 6 of the surface network alone, 2 with an error at the start, 3 with something wrong, 6 with
-occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode."""
+occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode, 4 of TC-CaRTS."""
 
 
 @pytest.fixture
@@ -269,3 +271,18 @@ def test_the_shipped_sequences_seed_is_refused(capsys: pytest.CaptureFixture[str
     with pytest.raises(SystemExit) as stop:
         main(["bench", "--quick", "--seed", "7", "--report-only"])
     assert stop.value.code == BAD_INPUT and "--seed 7 is the shipped sequence's" in capsys.readouterr().err
+
+
+def test_the_temporal_pipeline_starts_each_frame_at_the_previous_correction(
+    tiny_benchmark: Callable[..., Benchmark],
+) -> None:
+    benchmark = tiny_benchmark()
+    runs = [Run("synthetic", "regular", frame, "temporal", 1.0) for frame in (0, 1)]
+    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
+    benchmark.run(QUIET)
+    first, second = benchmark.measurements()
+    assert [first.stopped, second.stopped] == ["cold", "warm"]
+    assert first.start and second.start, "both are put off by the same error"
+    assert first.start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) == second.start.joint_mae_deg
+    table = sequence_table(Measurements(benchmark.measurements()))
+    assert table is not None and "TC-CaRTS" in table.rows[0][3].text
