@@ -58,6 +58,7 @@ class LiveRun:
             self.error = error
         finally:
             self._stream.close()
+            self._tracker.close()
 
     def _show(self, tracked: Tracked) -> None:
         with self._changing:

@@ -72,11 +72,14 @@ class Live:
         extractor = self.network.load()
         address = StreamAddress.parse(self.source, self.joints_port)
         known = Backgrounds.of(sequence, cameras, domain) if self.source == "replay" else None
-        tracker = LiveTracker(sequence.scene, extractor, free=self.free, backgrounds=known, cameras=cameras)
+        tracker = LiveTracker(
+            sequence.scene, extractor, free=self.free, backgrounds=known, cameras=cameras, concurrent=True
+        )
         results = Results(sequence.scene.with_cameras(cameras), masks=self.masks)
         with ExitStack() as held:
             stream = open_stream(address, sequence, cameras, domain, rate=self.rate, loops=self.loops)
             held.callback(stream.close)
+            held.callback(tracker.close)
             if stream.server is not None:
                 console.print(f"listening on 127.0.0.1:{stream.server.port}")
             lines = self._lines(held)

@@ -5,6 +5,7 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -69,6 +70,21 @@ class LiveEstimate:
     """Spent on it [s]."""
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """So much effort with one frame."""
+
+    effort: Effort
+    time: float
+    """When the frame was taken [s]."""
+    state: Gaussian
+    """Parts of the error as they are known without this frame."""
+    gap: float
+    """Since the frame that this is known from [s]."""
+    expected: Gaussian
+    """Correction that follows."""
+
+
 class LiveTracker:
     """Follows the arms of a scene. One frame at a time; frames may be left out, and times need not be even.
 
@@ -81,6 +97,8 @@ class LiveTracker:
         free: what is unknown.
         backgrounds: of the cameras; what looks like an arm in them is taken for none.
         cameras: names of the cameras that take part, all by default.
+        concurrent: whether a frame that takes more effort gets it on a thread of its own, while those after it are
+            called doubtful or lost; otherwise its result comes that late. `close` ends the thread.
 
     Attributes:
         verdict: on the last frame; lost before the first one.
@@ -97,6 +115,7 @@ class LiveTracker:
         free: FreeParameters | None = None,
         backgrounds: Backgrounds | None = None,
         cameras: Sequence[str] | None = None,
+        concurrent: bool = False,
     ) -> None:
         self.settings, self.live, self.verdict = settings or SurfaceSolver(), live or LiveSettings(), LiveVerdict.LOST
         self._scene, self._predictor = scene.with_cameras(cameras), predictor_of(networks)
@@ -114,6 +133,13 @@ class LiveTracker:
         """When the last good frame was taken [s]."""
         self._searched = -math.inf
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
+        self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
+        self._recovery: tuple[_Attempt, Future[Measurement]] | None = None
+
+    def close(self) -> None:
+        """End the thread once it is done with its frame."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
 
     def track(self, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> LiveEstimate:
         """The estimate of a frame that is newer than those before.
@@ -130,21 +156,15 @@ class LiveTracker:
         variables = self._variables(frame, camera_poses or {})
         self._moving = bool(camera_poses or frame.mounts)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
-        state, gap = errors.initial(), math.inf
-        if self._filtered is not None:
-            gap = max(now - self._seen, 1e-3)
-            state = errors.predicted(self._filtered, gap)
-        expected = errors.correction(state)
-        effort, measurement = self._measured(frame, variables, expected, now)
-        if self._bad(measurement) or (effort is not Effort.SEARCH and _contradicts(measurement, expected)):
-            self.verdict = self._missed(now)
-            correction, measurement = expected, measurement.left_out()
-        else:
-            if effort is Effort.SEARCH:
-                state, gap = errors.initial(), math.inf
-            self._take(errors, state, measurement, gap, now)
+        recovered = self._take_recovered(errors)
+        attempt, measurement = self._measured(frame, variables, errors, now)
+        if self._fits(attempt, measurement):
+            self._take(errors, attempt, measurement)
             self.verdict = LiveVerdict.GOOD
-            correction = combined(errors.correction(state), measurement.information)
+            correction = combined(errors.correction(attempt.state), measurement.information)
+        else:
+            self.verdict = self._missed(now)
+            correction, measurement = self._known(errors, now).expected, measurement.left_out()
         prior = errors.correction(errors.initial())
         visit = Visit(frame.frame_id, variables, measurement, Origin.WARM, 0.0)
         found = visit.estimate(self._scene, frame.index, correction, prior)
@@ -152,7 +172,7 @@ class LiveTracker:
             frame.frame_id,
             now,
             self.verdict,
-            effort,
+            recovered or attempt.effort,
             measurement.loss,
             found.state,
             found.joint_positions,
@@ -160,23 +180,68 @@ class LiveTracker:
             time.perf_counter() - began,
         )
 
+    def _known(self, errors: ErrorModel, now: float, effort: Effort = Effort.SMALL) -> _Attempt:
+        """What is known of a frame before it is looked at; a search assumes nothing."""
+        state, gap = errors.initial(), math.inf
+        if self._filtered is not None and effort is not Effort.SEARCH:
+            gap = max(now - self._seen, 1e-3)
+            state = errors.predicted(self._filtered, gap)
+        return _Attempt(effort, now, state, gap, errors.correction(state))
+
     def _measured(
-        self, frame: Frame, variables: Variables, expected: Gaussian, now: float
-    ) -> tuple[Effort, Measurement]:
-        """With no more effort than it takes."""
+        self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
+    ) -> tuple[_Attempt, Measurement]:
+        """With no more effort than it takes, and no more than the thread that calls is to have."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
-        if self._filtered is not None:
-            found = small.warm(frame, variables, expected, expected.mean)
-            if not (self._bad(found) or _contradicts(found, expected)):
-                return Effort.SMALL, found
-            if self.verdict is not LiveVerdict.LOST:
-                return Effort.FULL, full.warm(frame, variables, expected, expected.mean)
-            if now - self._searched < self.live.search_seconds:
-                return Effort.SMALL, found
-        self._searched = now
-        errors = self._error_model(variables)
-        prior = errors.correction(errors.initial())
-        return Effort.SEARCH, small.cold(frame, variables, prior)
+        found = None
+        if self._filtered is not None or self._pool is not None:
+            attempt = self._known(errors, now)
+            found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
+            if self._fits(*found):
+                return found
+        effort = self._further(now)
+        if found and (effort is Effort.SMALL or self._recovery):
+            return found
+        attempt = self._known(errors, now, effort)
+
+        def more() -> Measurement:
+            if effort is Effort.SEARCH:
+                return small.cold(frame, variables, attempt.expected)
+            return full.warm(frame, variables, attempt.expected, attempt.expected.mean)
+
+        if effort is Effort.SEARCH:
+            self._searched = now
+        if self._pool is None or found is None:
+            return attempt, more()
+        self._recovery = attempt, self._pool.submit(more)
+        return found
+
+    def _further(self, now: float) -> Effort:
+        """What is tried with a frame that did not fit."""
+        if self._filtered is not None and self.verdict is not LiveVerdict.LOST:
+            return Effort.FULL
+        early = self._filtered is not None and now - self._searched < self.live.search_seconds
+        return Effort.SMALL if early else Effort.SEARCH
+
+    def _take_recovered(self, errors: ErrorModel) -> Effort | None:
+        """Use what came of more effort with an earlier frame, unless a later one has fitted since; the effort if so."""
+        if self._recovery is None or not self._recovery[1].done():
+            return None
+        attempt, measurement = self._recovery[0], self._recovery[1].result()
+        self._recovery = None
+        if attempt.time <= self._seen or not self._fits(attempt, measurement):
+            return None
+        self._take(errors, attempt, measurement)
+        return attempt.effort
+
+    def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
+        """Whether what was measured can be relied on; where nothing was known, only a search can."""
+        if self._bad(measurement):
+            return False
+        if attempt.effort is Effort.SEARCH:
+            return True
+        contradiction = measurement.information.mahalanobis(attempt.expected)
+        return self._filtered is not None and contradiction <= _CONTRADICTS
 
     def _bad(self, measurement: Measurement) -> bool:
         usual = statistics.median(self._losses) if self._losses else math.inf
@@ -186,11 +251,11 @@ class LiveTracker:
         gone = self._filtered is None or now - self._seen > self.live.lost_seconds
         return LiveVerdict.LOST if gone else LiveVerdict.DOUBTFUL
 
-    def _take(self, errors: ErrorModel, state: Gaussian, measurement: Measurement, gap: float, now: float) -> None:
+    def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
         """What a good frame says, for those after it; frames that follow each other fast say much the same."""
-        share = math.tanh(0.5 * gap / self._model.correlation_seconds)
-        self._filtered = errors.updated(state, measurement.information.scaled(share))
-        self._seen = now
+        share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
+        self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
+        self._seen = attempt.time
         self._losses.append(measurement.loss)
 
     def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> FrameSolver:
@@ -208,7 +273,3 @@ class LiveTracker:
             priors = self._model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
             self._errors = ErrorModel(self._model, variables.expected(*priors).cpu().double().numpy())
         return self._errors
-
-
-def _contradicts(measurement: Measurement, expected: Gaussian) -> bool:
-    return measurement.information.mahalanobis(expected) > _CONTRADICTS

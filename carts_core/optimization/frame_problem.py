@@ -1,6 +1,7 @@
 """One frame as an optimization problem: its images, the unknowns, a prior, and what was observed last."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -32,6 +33,10 @@ from .verdict import Evidence, evidence
 
 _SHOWN_BLUR = 1.6
 """Iterates that are displayed are compared under a blur of at most this [px of the working image]."""
+
+
+_BESIDE = ThreadPoolExecutor(2, "edges")
+"""Does what needs the images alone while the network runs."""
 
 
 class FrameProblem:
@@ -82,12 +87,15 @@ class FrameProblem:
         self._images: dict[float, FrameImages] = {}
         self._replaced: bool | None = None
         self._evidence: tuple[Tensor, Evidence] | None = None
-        self._edges: EdgeFactor | None = None
+        self._edges: Future[EdgeFactor] | None = None
         self._factors: dict[tuple[float, float], SurfaceFactor] = {}
         self._observation: Observation | None = None
         self.observations = 0
         self.proposed: dict[str, Bool[np.ndarray, "h w"]] = {}
         self.images(first_observe(settings.stages).scale)
+        if any(isinstance(stage, AlignEdges) for stage in settings.stages):
+            # Edges of the image are found while the network runs.
+            self._edges = self._edges_beside()
 
     @property
     def start(self) -> Float[Tensor, " n"]:
@@ -266,13 +274,17 @@ class FrameProblem:
 
     def _edge_factor(self) -> EdgeFactor:
         if self._edges is None:
-            self._edges = EdgeFactor(
-                self.scene,
-                self._observed,
-                self.variables,
-                self._ignore,
-                working_width=self.settings.working_width,
-                dehaze=self.settings.dehaze,
-                device=self.predictor.device,
-            )
-        return self._edges
+            self._edges = self._edges_beside()
+        return self._edges.result()
+
+    def _edges_beside(self) -> Future[EdgeFactor]:
+        return _BESIDE.submit(
+            EdgeFactor,
+            self.scene,
+            self._observed,
+            self.variables,
+            self._ignore,
+            working_width=self.settings.working_width,
+            dehaze=self.settings.dehaze,
+            device=self.predictor.device,
+        )

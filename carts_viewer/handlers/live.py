@@ -151,7 +151,7 @@ class LiveHandler:
             known = Backgrounds.of(sequence, cameras, state.domain) if replayed else None
             free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
             scene = scene_at(session.scene, session.measured(state.frame))
-            tracker = LiveTracker(scene, extractor, free=free, backgrounds=known, cameras=cameras)
+            tracker = LiveTracker(scene, extractor, free=free, backgrounds=known, cameras=cameras, concurrent=True)
             made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
             recorder = None if folder is None else Recorder(sequence, cameras, folder, made_by)
         except BaseException:

@@ -1,18 +1,25 @@
 """The tracker follows an arm, says when it has lost it, and finds it again."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Items
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
 from carts_core.live import Effort, LiveTracker, LiveVerdict
 from carts_core.model.scene import SceneState
 from carts_core.optimization import ImagePredictor
+from carts_core.optimization.measurement import FrameSolver, Measurement
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 
@@ -30,10 +37,17 @@ class Seeing(ImagePredictor):
     def __init__(self, sequence: Sequence) -> None:
         self._renderer = Renderer(sequence.scene, width=640, height=512)
         self.hidden, self.maps = False, torch.empty(0)
+        self._seen: dict[float, Seeing] = {}
 
-    def look(self, truth: SceneState) -> None:
-        """The arm has moved."""
+    def look(self, truth: SceneState, seconds: float | None = None) -> None:
+        """The arm has moved. A frame of that time shows this, whenever it is looked at."""
         self.maps = self._renderer.surface(truth).maps
+        if seconds is not None:
+            self._seen[seconds] = copy(self)
+
+    def for_frame(self, frame: Frame, cameras: Items[str]) -> "Seeing":
+        """What there was to be seen then."""
+        return self if frame.timestamp is None else self._seen.get(frame.timestamp, self)
 
     def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
         """The truth in a window."""
@@ -44,12 +58,12 @@ class Seeing(ImagePredictor):
 class Stream:
     """An arm that sways, at so many frames a second, and a tracker that follows it."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, concurrent: bool = False) -> None:
         self.sequence = Sequence.open(path)
         self.predictor = Seeing(self.sequence)
         self.renderer = Renderer(self.sequence.scene, width=640, height=512)
         self.camera = Renderer(self.sequence.scene)
-        self.tracker = LiveTracker(self.sequence.scene, self.predictor)
+        self.tracker = LiveTracker(self.sequence.scene, self.predictor, concurrent=concurrent)
         self.count, self.slip = 0, 0.0
 
     def picture(self) -> np.ndarray:
@@ -75,8 +89,8 @@ class Stream:
         truth = {name: values.copy() for name, values in frame.truth.items()}
         truth["PSM1"][:2] += self.slip
         self.truth = self.sequence.scene.state(truth)
-        self.predictor.look(self.truth)
         self.time = getattr(self, "time", 0.0) + seconds
+        self.predictor.look(self.truth, self.time)
         measured = {name: values.copy() for name, values in frame.measured.items()}
         images = {"left": self.picture()}
         found = self.tracker.track(replace(frame, images=images, measured=measured, timestamp=self.time))
@@ -148,3 +162,62 @@ def test_before_anything_is_seen_the_verdict_is_lost_and_values_are_as_measured(
     frame: Frame = stream.sequence.frame(stream.count % 2)
     assert verdict is LiveVerdict.LOST and effort is Effort.SEARCH
     np.testing.assert_allclose(stream.estimate.joint_positions["PSM1"], frame.measured["PSM1"], atol=1e-6)
+
+
+@pytest.fixture
+def concurrent(tiny_sequence: Callable[..., Path]) -> Iterator[Stream]:
+    stream = Stream(tiny_sequence(frames=2, width=160, height=128), concurrent=True)
+    yield stream
+    stream.tracker.close()
+
+
+def test_a_search_beside_the_stream_keeps_no_frame_waiting(concurrent: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
+    searching, go_on = Event(), Event()
+    cold = FrameSolver.cold
+
+    def slow(*arguments: Any) -> Measurement:
+        searching.set()
+        assert go_on.wait(60)
+        return cold(*arguments)
+
+    monkeypatch.setattr(FrameSolver, "cold", slow)
+    first = [concurrent.next() for _ in range(3)]
+    assert searching.wait(60), "the search has begun"
+    assert [verdict for verdict, _, _ in first] == [LiveVerdict.LOST] * 3, "what was measured is not relied on"
+    assert [effort for _, effort, _ in first] == [Effort.SMALL] * 3
+    go_on.set()
+    found = concurrent.next()
+    while found[0] is not LiveVerdict.GOOD and concurrent.count < 200:
+        time.sleep(0.05)
+        found = concurrent.next(0.001)
+    assert found[0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
+
+
+def test_an_arm_that_jumps_is_found_again_beside_the_stream(concurrent: Stream) -> None:
+    def until(verdict: LiveVerdict) -> Effort:
+        for _ in range(200):
+            found = concurrent.next(0.02)
+            if found[0] is verdict:
+                return found[1]
+            time.sleep(0.02)
+        pytest.fail(f"never {verdict}")
+
+    assert until(LiveVerdict.GOOD) is Effort.SEARCH
+    concurrent.predictor.hidden = True
+    until(LiveVerdict.LOST)
+    concurrent.predictor.hidden, concurrent.slip = False, float(np.deg2rad(4.0))
+    until(LiveVerdict.GOOD)
+    after = [concurrent.next() for _ in range(10)]
+    assert after[-1][0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
+
+
+def test_what_goes_wrong_in_a_search_beside_the_stream_is_raised(
+    concurrent: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> Measurement:
+        raise SettingsError("no such weights")
+
+    monkeypatch.setattr(FrameSolver, "cold", broken)
+    with pytest.raises(SettingsError, match="no such weights"):
+        for _ in range(200):
+            concurrent.next()
