@@ -65,7 +65,7 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("G", "Clear the review", intents.SetReview(ReviewState.UNTOUCHED), "shift"),
         Shortcut("Y", "Next unreviewed frame", intents.ShowUnreviewed()),
         Shortcut("Y", "Previous unreviewed frame", intents.ShowUnreviewed(-1), "shift"),
-        Shortcut("L", "Next worst frame that is not settled", intents.ShowWorse()),
+        Shortcut("L", "Next worst frame that is neither accepted nor rejected", intents.ShowWorse()),
         Shortcut("L", "Previous worst frame", intents.ShowWorse(-1), "shift"),
         Shortcut("O", f"Nudge the joint by {FINE:g}° or mm", intents.Nudge(FINE)),
         Shortcut("I", f"Nudge the joint by -{FINE:g}° or mm", intents.Nudge(-FINE)),

@@ -78,7 +78,7 @@ def contour(arm_ids: ArmIds, opacity: float) -> Rgba:
     """The outline of each arm's visible part, along its outermost pixels, in its colour."""
     colors, count = _palette(arm_ids)
     picture = np.full((*arm_ids.shape, 4), colors[0], np.uint8)
-    thickness = max(1, round(max(arm_ids.shape) / 320))
+    thickness = max(1, round(max(arm_ids.shape) / 640))
     for arm in range(count):
         lines, _ = cv2.findContours((arm_ids == arm).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(picture, lines, -1, tuple(int(value) for value in colors[arm + 1]), thickness)

@@ -36,8 +36,9 @@ class FitPanel:
             self._text.content = live_text(state.live)
             return
         running = state.run.phase is Phase.RUNNING or state.solving
-        self._check.disabled = running
-        self._check.visible = state.verdict is None
+        # It stays where it is, so that nothing below it moves under the pointer.
+        self._check.visible = True
+        self._check.disabled = running or state.verdict is not None
         self._text.content = fit_text(state.verdict, running=running, scores=_scores(state, self._cameras))
 
 

@@ -56,7 +56,8 @@ HINTS = {
     "Reject": "Mark this frame as unusable; exports leave it out if you say so (J)",
     "Note": "Anything worth remembering about this frame; saved when you leave the field",
     "Previous worst": "Go to the frame that fits next better than this one (Shift+L)",
-    "Next worst": "Go to the frame that fits worst of those that are not settled (L)",
+    "Next worst": "Go to the frame that fits worst of those that are neither accepted nor rejected; frames that nobody "
+    "has solved or checked come last, in order (L)",
     "Next unreviewed": "Go to the next frame that nobody has judged (Y)",
     "Solve between": "Fit the frames between the kept ones around this frame together (Shift+K)",
     "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames stay as they are",
