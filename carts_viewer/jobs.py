@@ -55,6 +55,12 @@ class Job:
         """Whether nothing more will come of it."""
         return self.state not in (JobState.WAITING, JobState.RUNNING)
 
+    @property
+    def frames(self) -> range | None:
+        """The part of the sequence that it is about; None for all of it."""
+        ends = self.options.get("range")
+        return None if ends is None else range(int(ends[0]), int(ends[1]) + 1)
+
     def seconds_left(self, now: float) -> float | None:
         """How long it will go on if it goes on like that [s]; None where nobody knows."""
         if self.state is not JobState.RUNNING or not self.done or not self.total:

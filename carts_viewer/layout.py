@@ -82,8 +82,8 @@ class Layout:
         with right.add_tab("Optimize"):
             panels += [
                 OptimizePanel(page, session, state, emit),
-                CurvesPanel(gui),
                 SettingsPanel(page, state, emit),
+                CurvesPanel(gui),
                 FreePanel(page, session, state, emit),
             ]
         with right.add_tab("Review"):

@@ -9,7 +9,7 @@
   function element() {
     if (!box?.isConnected) {
       box = document.createElement("main");
-      document.body.append(box);
+      document.body.append(box, themeButton());
       box.addEventListener("click", (event) => {
         const chosen = event.target.closest("button[data-do]");
         if (chosen && !chosen.disabled) say(chosen.dataset.do, chosen.dataset.value ?? "");
@@ -30,6 +30,14 @@
       }
     }
     return box;
+  }
+
+  function themeButton() {
+    const button = document.createElement("button");
+    Object.assign(button, { className: "carts-theme", title: "Light or dark", textContent: "◐" });
+    button.setAttribute("aria-label", button.title);
+    button.addEventListener("click", () => window.carts.toggleTheme());
+    return button;
   }
 
   const say = (name, value) => window.carts.report("chosen", JSON.stringify([name, value]));

@@ -33,6 +33,7 @@
     const mark = element(group, "g", { class: `carts-point${chosen ? " chosen" : ""}${near ? " near" : ""}` });
     element(mark, "circle", { cx: x, cy: y, r: 7, class: "edge" });
     element(mark, "circle", { cx: x, cy: y, r: 7 });
+    if (line > y + 20) element(mark, "path", { d: `M${x + 3} ${y + 7}L${x + 11} ${line - 5}` });
     element(mark, "text", { x: x + 12, y: line }, label.replace(/ joint$/, ""));
   }
 
@@ -61,9 +62,13 @@
     }
     let lowest = -1e4; // of the names so far, which must not lie over one another
     const at = ([, u, v]) => [place.left + u * place.width, place.top + v * place.height];
+    const rings = camera.points.map(at);
     for (const point of [...camera.points].sort((one, other) => one[2] - other[2])) {
       const [x, y] = at(point);
       lowest = Math.max(y + 4, lowest + 12);
+      const right = x + 12 + 6 * point[0].length;
+      const covered = ([u, v]) => u + 8 > x + 12 && u - 8 < right && v + 8 > lowest - 9 && v - 8 < lowest + 3;
+      for (let tries = 0; tries < 8 && rings.some(covered); tries += 1) lowest += 6;
       drawPoint(group, point[0], x, y, lowest, point[0] === page.chosen);
     }
     for (const pin of camera.pins) drawPin(group, pin[0], ...at(pin));

@@ -94,8 +94,13 @@
     };
   }
 
+  // What lies over the lower part of a small screen.
+  const CONTROLS = "body.carts-small.carts-controls .mantine-Paper-root[style*='position: fixed'], body.carts-small .carts-document-side";
+
   /** Height of what lies over the lower end of the canvas [CSS px]. */
   function bottomBars() {
+    const controls = document.querySelector(CONTROLS);
+    if (controls) return innerHeight - controls.getBoundingClientRect().top;
     const strip = document.querySelector(".carts-strip");
     return strip ? strip.offsetHeight + (parseFloat(getComputedStyle(strip).bottom) || 0) : 0;
   }
@@ -288,6 +293,7 @@
   function drawBar() {
     if (!bar) return;
     const press = (name, on) => bar.querySelector(`[data-do=${name}]`).setAttribute("aria-pressed", String(on));
+    bar.toggleAttribute("data-endoscope", view.endoscope);
     press("endoscope", view.endoscope);
     press("scene", !view.endoscope);
     bar.querySelector(".carts-zoom").style.display = view.endoscope ? "" : "none";

@@ -9,9 +9,17 @@
 
   // ---- Theme ------------------------------------------------------------------------------------------------------
 
-  function chooseTheme(name) {
-    localStorage.setItem("carts-theme", name);
-    ask(`theme ${name}`);
+  // Documents over the page take their colours from this class, everything else from viser's theme.
+  const dress = () => document.documentElement.classList.toggle("carts-light", wanted() === "light");
+  dress();
+
+  function toggleTheme() {
+    const root = document.documentElement;
+    const documented = root.classList.contains("carts-documented");
+    const light = documented ? wanted() === "light" : root.dataset.mantineColorScheme === "light";
+    localStorage.setItem("carts-theme", light ? "dark" : "light");
+    dress();
+    if (!documented) ask(`theme ${wanted()}`);
   }
 
   // ---- Who this tab is, and where -----------------------------------------------------------------------------------
@@ -139,7 +147,7 @@
       const row = ([key, text]) => `<tr><td><kbd>${key}</kbd></td><td>${text}</td></tr>`;
       const table = ([name, rows]) => `<section><h3>${name}</h3><table>${rows.map(row).join("")}</table></section>`;
       sheet.innerHTML =
-        `<header><b>Keys</b> Press ? again, or Escape, to go on.<button data-do="tour">Take the tour</button>` +
+        `<header><b>Keys</b><span>Press ? again, or Escape, to go on.</span><button data-do="tour">Take the tour</button>` +
         `<button aria-label="Close">×</button></header>` +
         `<div class="carts-columns">${groups.map(table).join("")}</div>`;
       sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
@@ -231,7 +239,6 @@
     /** A server that was started since this page was loaded knows nothing of our widgets. */
     meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
     showSheet: () => showSheet(true),
-    toggleTheme: () =>
-      chooseTheme(document.documentElement.dataset.mantineColorScheme === "light" ? "dark" : "light"),
+    toggleTheme,
   });
 })();

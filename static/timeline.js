@@ -39,7 +39,7 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Begin the range at this frame: what is played, solved and optimized. Key: (">[&nbsp;In</button>
+        <button data-do="first" title="Begin the range at this frame: what is played, solved, optimized and exported. Key: (">[&nbsp;In</button>
         <button data-do="last" title="End the range at this frame. Key: )">Out&nbsp;]</button>
         <button data-do="whole" title="No range: the whole sequence">×</button>
         <span class="carts-range"></span>
@@ -54,7 +54,7 @@
     }
     canvas.addEventListener("pointerdown", press);
     canvas.addEventListener("pointermove", move);
-    canvas.addEventListener("pointerup", () => { dragging = null; });
+    canvas.addEventListener("pointerup", () => { dragging = null; tellRange(); });
     canvas.addEventListener("pointerleave", () => { hover = null; dirty = true; });
     canvas.addEventListener("wheel", zoom, { passive: false });
     canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
@@ -123,8 +123,15 @@
   let rangeTimer = null;
   function mark(first, last) {
     range = [Math.min(first, last), Math.max(first, last)];
+    rangeTimer ??= setTimeout(tellRange, 40);
+  }
+
+  /** Say what the range is now, if that was not said: at once when it is let go of, or it would undo what comes next. */
+  function tellRange() {
+    if (rangeTimer === null) return;
     clearTimeout(rangeTimer);
-    rangeTimer = setTimeout(() => window.carts.report("asked", `range ${range[0]} ${range[1]}`), 40);
+    rangeTimer = null;
+    window.carts.report("asked", `range ${range[0]} ${range[1]}`);
   }
 
   function move(event) {

@@ -16,8 +16,11 @@
     ["Review", "Review", "Accept (G) goes on to the next frame. Here are also keyframes, Solve between, search and history."],
     ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Everything is saved at once; Undo takes back anything."],
+    [".carts-review-bar", "Review", "The verdict, and what you say of the frame: accepting goes on to the next one."],
+    [".carts-review-bar [data-do=controls]", "All controls", "Everything else is behind this button, in tabs: fit, review, values, jobs, export, help."],
     [".carts-bar [data-do=help]", "More", "The sheet of keys is here, and under ?. Every control says what it does when the pointer rests on it."],
   ];
+  let steps = []; // those that are about something in view, which is less on a small screen
   let place = -1;
   let frame = null;
   let card = null;
@@ -44,8 +47,10 @@
   /** Frame what this step is about, and put the card beside it, inside the window. */
   function draw() {
     if (place < 0) return;
-    const [name, title, text] = STEPS[place];
-    const box = target(name)?.getBoundingClientRect();
+    const [name, title, text] = steps[place];
+    const about = target(name);
+    about?.scrollIntoView({ block: "center" }); // a panel may have been scrolled past it
+    const box = about?.getBoundingClientRect();
     frame.style.display = box ? "" : "none";
     if (box) {
       const [left, top] = [Math.max(box.left - 4, 2), Math.max(box.top - 4, 2)];
@@ -54,9 +59,9 @@
         height: `${Math.min(box.bottom + 4, innerHeight - 2) - top}px`,
       });
     }
-    card.innerHTML = `<b>${title}</b><p>${text}</p><footer><span>${place + 1} of ${STEPS.length}</span>
+    card.innerHTML = `<b>${title}</b><p>${text}</p><footer><span>${place + 1} of ${steps.length}</span>
       <button data-do="leave">Leave</button><button data-do="back"${place ? "" : " disabled"}>Back</button>
-      <button data-do="next" class="main">${place + 1 < STEPS.length ? "Next" : "Done"}</button></footer>`;
+      <button data-do="next" class="main">${place + 1 < steps.length ? "Next" : "Done"}</button></footer>`;
     const actions = { leave: end, back: () => go(place - 1), next: () => go(place + 1) };
     for (const button of card.querySelectorAll("button")) button.onclick = actions[button.dataset.do];
     const around = box ?? { left: innerWidth / 2, right: innerWidth / 2, top: innerHeight / 2, bottom: innerHeight / 2 };
@@ -71,7 +76,7 @@
   }
 
   function go(step) {
-    if (step >= STEPS.length) { end(); return; }
+    if (step >= steps.length) { end(); return; }
     place = Math.max(step, 0);
     draw();
   }
@@ -80,6 +85,7 @@
     localStorage.setItem(SEEN, "begun");
     document.querySelector(".carts-offer")?.remove();
     if (!card) build();
+    steps = STEPS.filter(([name]) => target(name));
     document.body.classList.add("carts-touring");
     go(0);
   }

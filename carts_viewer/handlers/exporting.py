@@ -147,10 +147,11 @@ class ExportingHandler:
         """What makes the dataset as the project is now, frame by frame, and how many frames it will have."""
         state, session = self._context.state, self._session
         view = session.editor.view
-        chosen = frames_in(view, FRAME_CHOICES[intent.frames])
+        chosen = frames_within(view, intent.frames, intent.range)
         if not chosen:
+            where = "" if intent.range is None else ", in the timeline's range"
             raise SettingsError(
-                f"No frame is in this choice ({intent.frames.lower()}). Review frames, or choose others."
+                f"No frame is in this choice ({intent.frames.lower()}{where}). Review frames, or choose others."
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = scene_at(session.scene, state.pose.scene).with_cameras(cameras)
@@ -167,12 +168,20 @@ class ExportingHandler:
         project, export_state = self._session.editor.project, self._context.state.export
         if project.writable and export_state is not None:
             settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images}
+            if intent.range is not None:
+                settings["range"] = list(intent.range)
             project.log_export(intent.format, path, export_state.frames, settings)
             self._context.change(project=self._session.editor.view)
 
     def _report(self, **changes: object) -> None:
         if self._context.state.export is not None:
             self._context.change(export=replace(self._context.state.export, **changes))
+
+
+def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:
+    """Indices of the frames of one of `FRAME_CHOICES`, of a range with both its ends or of the whole sequence."""
+    first, last = part or (0, len(project.identity.frame_ids) - 1)
+    return [index for index in frames_in(project, FRAME_CHOICES[frames]) if first <= index <= last]
 
 
 def shown_mask(context: Context) -> tuple[str, bytes]:

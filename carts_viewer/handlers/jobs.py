@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Generator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import singledispatchmethod
 from typing import Any
 
@@ -83,14 +83,14 @@ class JobsHandler:
         options = {**asdict(intent), "at": state.index}
         title = "Solve all frames" if intent.whole else "Solve between keyframes"
         if intent.whole and state.range is not None:
-            first, last = (self._context.session.sequence.frame_ids[index] for index in state.range)
-            title, options["range"] = f"Solve frames {first} to {last}", list(state.range)
+            title, options["range"] = f"Solve frames {self._from_to(state.range)}", list(state.range)
         self._queue("solve", title, options)
 
     @handle.register
     def _(self, intent: intents.Export) -> None:
         label = FORMATS[intent.format].label if intent.format in FORMATS else str(intent.format)
-        self._queue("export", f"Export {intent.frames.lower()} as {label}", asdict(intent))
+        part = "" if intent.range is None else f", frames {self._from_to(intent.range)}"
+        self._queue("export", f"Export {intent.frames.lower()} as {label}{part}", asdict(intent))
 
     @handle.register
     def _(self, intent: intents.OptimizeFrames) -> None:
@@ -189,11 +189,9 @@ class JobsHandler:
             asker.choose(self._context)
         try:
             if job.kind == "solve":
-                part = job.options.get("range")
-                part = None if part is None else range(int(part[0]), int(part[1]) + 1)
-                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)), part)
+                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)), job.frames)
             elif job.kind == "export":
-                names = ("format", "frames", "parts", "images", "shown_camera")
+                names = {field.name for field in fields(intents.Export)} & set(job.options)
                 self._exporting.handle(intents.Export(**{name: job.options[name] for name in names}))
             else:
                 self._open_run.end("Stopped: a job was started")
@@ -290,6 +288,9 @@ class JobsHandler:
         if not frames:
             raise CartsError("There is no such frame. Choose others.")
         return frames
+
+    def _from_to(self, ends: tuple[int, int]) -> str:
+        return " to ".join(self._context.session.sequence.frame_ids[index] for index in ends)
 
     @property
     def _choices(self) -> ViewState:

@@ -31,6 +31,8 @@ class Export(Exporting):
     """Write the images beside their labels."""
     shown_camera: bool = False
     """Only the camera that is shown, not all."""
+    range: tuple[int, int] | None = None
+    """First and last frame, both exported; None for the whole sequence."""
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,10 @@
 import viser
 
 from carts_core.export import FORMATS
-from carts_core.project import ProjectState, ReviewState, frames_in
+from carts_core.project import ProjectState
 from carts_viewer import intents
 from carts_viewer.export_warnings import export_warnings
-from carts_viewer.handlers.exporting import FRAME_CHOICES
+from carts_viewer.handlers.exporting import FRAME_CHOICES, frames_within
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -33,9 +33,11 @@ class ExportPanel:
         self._formats = {known.label: name for name, known in FORMATS.items()}
         self._counted: ProjectState | None = None
         self._chosen = ""
+        self._range: tuple[int, int] | None = None
         with gui.add_folder("Export frames"):
             self._format = gui.add_dropdown("Format", list(self._formats))
             self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
+            self._within = gui.add_checkbox("Only the range", True, visible=False)
             self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
             self._parts = gui.add_dropdown("Category per", list(_PARTS))
             self._images = gui.add_checkbox("With images", True)
@@ -52,7 +54,7 @@ class ExportPanel:
         on_click(self._export, lambda _: self._intent(), emit)
         on_click(self._cancel, lambda _: intents.CancelExport(), emit)
         on_click(self._download, intents.Download, emit)
-        for widget in (self._format, self._frames, self._cameras):
+        for widget in (self._format, self._frames, self._within, self._cameras):
             on_input(widget, lambda _: intents.Refresh(), emit)
 
     def show(self, state: ViewState) -> None:
@@ -60,6 +62,8 @@ class ExportPanel:
         name = self._formats.get(self._format.value)
         self._parts.visible = name not in _WITHOUT_PARTS
         self._images.visible = name not in _WITHOUT_IMAGES
+        self._within.visible = state.range is not None
+        self._range = state.range if self._within.value else None
         self._show_count(state)
         export = state.export
         running = export is not None and export.path is None
@@ -86,14 +90,16 @@ class ExportPanel:
             _PARTS.get(self._parts.value, self._parts.value),  # type: ignore[arg-type]
             bool(self._images.value),
             self._cameras.value == "Shown one",
+            self._range,
         )
 
     def _show_count(self, state: ViewState) -> None:
-        chosen = f"{self._frames.value} {self._cameras.value} {state.camera}"
+        chosen = f"{self._frames.value} {self._cameras.value} {state.camera} {self._range}"
         if state.unsaved or (state.project is self._counted and chosen == self._chosen):
             return
         self._counted, self._chosen = state.project, chosen
-        frames = frames_in(state.project, FRAME_CHOICES.get(self._frames.value, frozenset[ReviewState]()))
+        known = self._frames.value in FRAME_CHOICES
+        frames = frames_within(state.project, self._frames.value, self._range) if known else []
         cameras = [state.camera] if self._cameras.value == "Shown one" else self._camera_names
         notes = "".join(f"<br>⚠ {escaped(line)}" for line in export_warnings(state.project, frames, cameras))
         total = len(state.project.identity.frame_ids)

@@ -46,9 +46,10 @@ class FindPanel:
             before = gui.add_button("Previous", icon=viser.Icon.CHEVRON_LEFT, color="gray")
             after = gui.add_button("Next", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
             clear = gui.add_button("Clear", color="gray", hint="Forget these conditions")
-            page.row(before, after, clear)
+            page.row(before, after)
             self._bulk = [gui.add_button(name, color="gray") for name in _BULK]
-            page.row(*self._bulk)
+            page.row(*self._bulk[:2])
+            page.row(self._bulk[2], clear)
         for name, widget in self._widgets.items():
             on_input(widget, lambda value, name=name: intents.SetFilter(name, value), emit)
         on_click(before, lambda _: intents.ShowFound(-1), emit)

@@ -93,6 +93,7 @@ HINTS = {
     # Export
     "Format": "What other tools will read",
     "Frames": "Which frames are written, by their review state",
+    "Only the range": "Of these, only frames in the timeline's range",
     "Category per": "What gets a class of its own",
     "With images": "Write the images beside their labels",
     "Export": "Write into a new folder beside the project, as a job",

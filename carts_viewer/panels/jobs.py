@@ -66,7 +66,7 @@ class JobsPanel:
         """Bring the list up to date; the newest job is chosen when it comes."""
         self._show_networks(state)
         jobs = tuple(reversed(state.jobs))
-        numbers = {f"{job.number}. {job.title}": job.number for job in jobs}
+        numbers = {f"{job.number}. {job.kind.capitalize()}": job.number for job in jobs}
         if numbers != self._numbers:
             newer = jobs and max(numbers.values()) > max(self._numbers.values(), default=0)
             self._numbers = numbers

@@ -213,7 +213,7 @@ class RecordingPlace:
         what = "" if recording is None else f"{recording.kind}, {len(recording.frame_ids)} frames"
         return (
             f"{_steps(Step.CHECK)}<h1>{escaped(self._draft.name)}</h1><p class='quiet-text'><code>"
-            f"{escaped(self._draft.source)}</code> {escaped(what)}</p><div class='bar'>{bar}</div>{self._alert()}"
+            f"{escaped(self._draft.source)}</code> · {escaped(what)}</p><div class='bar'>{bar}</div>{self._alert()}"
             f"{check_form(self._draft, found, self._pictures, self._delay)}"
         )
 

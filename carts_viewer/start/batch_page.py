@@ -137,7 +137,9 @@ class BatchPage:
 def _row(entry: KnownJob) -> str:
     frames = entry.findings.frames if entry.findings else ()
     counts = Counter(frame.verdict for frame in frames)
-    numbers = "".join(f"<td>{counts[verdict] if frames else '–'}</td>" for verdict in _VERDICTS)
+    numbers = "".join(
+        f'<td data-label="{verdict.capitalize()}">{counts[verdict] if frames else "–"}</td>' for verdict in _VERDICTS
+    )
     error = f"<br><small>{escaped(entry.error)}</small>" if entry.error else ""
     open_it = button("review", "Open", entry.job.name) if entry.findings else ""
     return (

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cut_off import hardly_legible
 from playwright.sync_api import Browser, expect
 from viewer_canvas import eventually
 
@@ -55,6 +56,28 @@ def test_failures_come_first_and_a_frame_opens_with_what_was_found(batch: Path, 
         eventually(lambda: app.state.index, lambda index: index == 1, 60)
         assert app.state.verdict is not None and app.state.pose.source.value == "optimizer"
         assert app.project.path.parent == batch / "jobs" / read_jobs(batch)[0].name
+        page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("window", [(1280, 800), (390, 844)])
+def test_jobs_and_pictures_are_legible_at_any_size_light_and_dark(
+    batch: Path, browser: Browser, window: tuple[int, int]
+) -> None:
+    with Site([batch.parent], port=0, batch=batch) as site:
+        page = browser.new_page(viewport={"width": window[0], "height": window[1]})
+        page.goto(site.url)
+        name = page.locator(".jobs td").first
+        expect(page.locator(".card img").first).to_be_visible()
+        for colour in ("rgb(20, 24, 27)", "rgb(248, 250, 252)", "rgb(20, 24, 27)"):
+            assert page.locator("main").evaluate("one => getComputedStyle(one).backgroundColor") == colour
+            assert hardly_legible(page, 4.5) == []
+            page.get_by_role("button", name="Light or dark").click()
+        # No text is shortened, and none is a column of single letters.
+        cut = "one => one.scrollWidth > one.clientWidth + 1"
+        assert not any(text.evaluate(cut) for text in page.locator(".card b, .card small, .jobs td").all())
+        box = name.bounding_box()
+        assert box is not None and box["width"] > 150 and box["height"] < 150
         page.close()
 
 

@@ -82,6 +82,20 @@ def test_only_frames_of_the_chosen_review_state_and_camera_are_written(desk: Des
         desk.do(intents.Export("masks", "Needs work"))
 
 
+def test_only_frames_of_the_timelines_range_are_written(desk: Desk) -> None:
+    desk.do(intents.ShowFrame(0), intents.SetReview(ReviewState.ACCEPTED))
+    path = exported(desk, intents.Export("masks", "All", shown_camera=True, range=(1, 2)))
+    assert sorted(file.name for file in (path / "binary").iterdir()) == ["left_002.png", "left_003.png"]
+    assert desk.state.jobs[-1].title == "Export all as PNG masks, frames 002 to 003"
+    # Both choices count, and a job that is repeated is about the same frames.
+    with pytest.raises(SettingsError, match=r"accepted, in the timeline's range"):
+        desk.do(intents.Export("csv", "Accepted", range=(1, 2)))
+    desk.do(intents.RepeatJob(1))
+    export = desk.finish().export
+    assert export is not None and export.path not in (None, path)
+    assert sorted(file.name for file in (export.path / "binary").iterdir())[0] == "left_002.png"  # type: ignore[operator]
+
+
 def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: Desk) -> None:
     rendered = desk.renderer.arm_ids(desk.state.pose.scene, "left") >= 0
     added, removed = np.zeros_like(rendered), rendered.copy()

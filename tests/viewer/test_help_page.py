@@ -78,3 +78,23 @@ def test_the_tour_is_offered_once_goes_over_the_page_and_can_be_left_at_any_time
     other.wait_until_ready()
     other.page.wait_for_timeout(2500)
     expect(other.page.locator(".carts-offer")).to_have_count(0)
+
+
+@pytest.mark.parametrize("window", [(1280, 800), (390, 844)])
+def test_all_that_the_tour_speaks_of_is_in_view_whatever_was_unfolded_before(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
+) -> None:
+    tab = open_tab(open_viewer(width=160, height=120), window)
+    if window[0] > 600:
+        tab.page.get_by_text("Paint", exact=True).click()
+        expect(tab.page.get_by_role("button", name="Polygon", exact=True)).to_be_visible()
+    tab.page.evaluate("carts.startTour()")
+    card, frame = tab.page.get_by_role("dialog", name="Tour"), tab.page.locator(".carts-tour-frame")
+    steps = int(card.locator("span").inner_text().split(" of ")[1])
+    assert steps == (9 if window[0] > 600 else 4)
+    for _ in range(steps):
+        box = frame.bounding_box()
+        assert box is not None and box["y"] >= 0 and box["y"] + box["height"] <= window[1]
+        assert box["height"] > 10, card.inner_text()
+        card.locator("[data-do=next]").click()
+    expect(card).to_have_count(0)

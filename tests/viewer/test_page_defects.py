@@ -158,6 +158,22 @@ def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab
     expect(tab.page.locator("html[data-mantine-color-scheme=light]")).to_have_count(1)
 
 
+_SHOW_CLOSE_POINTS = """() => {
+    const points = [['psm1 jaw 1 tip', 0.4, 0.4], ['psm1 jaw 2 tip', 0.48, 0.43], ['psm1 wrist yaw joint', 0.44, 0.46]];
+    const cameras = [{ ...carts.shown().cameras[0], points }];
+    document.dispatchEvent(new CustomEvent('carts-page', { detail: { ...carts.shown(), cameras } }));
+}"""
+
+_NAMES_UNDER_RINGS = """() => {
+    const box = (one) => one.getBoundingClientRect();
+    const rings = [...document.querySelectorAll('.carts-point circle.edge')].map(box);
+    const over = (ring, name) =>
+        ring.left < name.right && ring.right > name.left && ring.top < name.bottom - 2 && ring.bottom > name.top + 2;
+    const names = [...document.querySelectorAll('.carts-point text')];
+    return names.filter((name) => rings.some((ring) => over(ring, box(name)))).map((name) => name.textContent);
+}"""
+
+
 def test_a_phone_shows_what_reading_and_reviewing_needs(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
@@ -175,6 +191,10 @@ def test_a_phone_shows_what_reading_and_reviewing_needs(
     tab.page.get_by_role("button", name="All controls").click()
     expect(tab.page.get_by_role("button", name="Undo", exact=True)).to_be_visible()
     tab.page.get_by_role("button", name="All controls").click()
+    # Keypoints that are close to one another do not lie over each other's names.
+    tab.page.evaluate(_SHOW_CLOSE_POINTS)
+    expect(tab.page.locator(".carts-point")).to_have_count(3)
+    assert tab.page.evaluate(_NAMES_UNDER_RINGS) == []
     accept.click()
     eventually(lambda: app.state.project.review(0).state, lambda state: state == "accepted")
     expect(tab.page.locator(".carts-review-line")).to_contain_text("Frame 002")

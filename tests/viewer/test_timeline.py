@@ -144,6 +144,13 @@ def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     app.wait_until_shown()
     tab.page.keyboard.press("(")
     eventually(lambda: app.state.range, lambda frames: frames == (23, 26))
+    # It is what is exported, unless somebody says otherwise.
+    tab.page.get_by_role("tab", name="Export", exact=True).click()
+    expect(tab.page.get_by_text("4 of 60 frames")).to_be_visible(timeout=20_000)
+    tab.button("Export")
+    eventually(lambda: app.state.export and app.state.export.frames, lambda frames: frames == 4)
+    tab.page.get_by_label("Only the range").uncheck()
+    expect(tab.page.get_by_text("60 of 60 frames")).to_be_visible()
     tab.page.locator(".carts-strip [data-do=whole]").click()
     eventually(lambda: app.state.range, lambda frames: frames is None)
 
