@@ -136,4 +136,5 @@ class Editor:
 
     def _lay_draft(self) -> None:
         saved = self.project.state
-        self._view = saved, saved.after(Step(saved.position + 1, self._name, time.time()), self._edits)
+        edits = {**self._edits, **saved.changed(self._edits)}
+        self._view = saved, saved.after(Step(saved.position + 1, self._name, time.time()), edits)

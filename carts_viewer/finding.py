@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 
-from carts_core.project import Key, ProjectState, by_hand
+from carts_core.project import Key, ProjectState, ReviewState, Source, by_hand
+from carts_core.project.values import UNREVIEWED
 
 ANY = "Any"
 NOT_CHECKED = "not checked"
+UNJUDGED = "unreviewed"
+"""Of frames that nobody has judged, whatever made their joint positions."""
 BY_HAND = "moved by hand"
+SOLVED = "solved with other frames"
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class FrameFilter:
     """What frames are looked for; all conditions hold."""
 
     review: str = ANY
-    """A review state, or `BY_HAND`."""
+    """What `review_name` says, or `UNJUDGED`."""
     fit: str = ANY
     """A verdict, or `NOT_CHECKED`."""
     dice: float = 1.0
@@ -30,6 +34,22 @@ class FrameFilter:
         return self == FrameFilter()
 
 
+def review_name(project: ProjectState, index: int) -> str:
+    """What people read about a frame: how it was judged or, where nobody has, what made its joint positions."""
+    record = project.records.get(index)
+    if by_hand(project, index):
+        return BY_HAND
+    state = project.review(index).state
+    solved = state is ReviewState.OPTIMIZED and record is not None and Source.PROPAGATED in record.sources
+    return SOLVED if solved else str(state)
+
+
+def copied(project: ProjectState, index: int) -> bool:
+    """Whether joint positions of a frame are another frame's correction; what was solved has settings."""
+    made = [correction.provenance for correction in project.joints(index).values()]
+    return any(one.source is Source.PROPAGATED and one.settings is None for one in made)
+
+
 def found(project: ProjectState, wanted: FrameFilter) -> list[int]:
     """Indices of the frames that are looked for, in order."""
     return [index for index in range(len(project.identity.frame_ids)) if matches(project, index, wanted)]
@@ -38,8 +58,8 @@ def found(project: ProjectState, wanted: FrameFilter) -> list[int]:
 def matches(project: ProjectState, index: int, wanted: FrameFilter) -> bool:
     """Whether a frame is one of those that are looked for."""
     review = project.review(index)
-    name = BY_HAND if by_hand(project, index) else str(review.state)
-    if wanted.review not in (ANY, name) or wanted.note.casefold() not in review.note.casefold():
+    names = (ANY, review_name(project, index), *((UNJUDGED,) if review.state in UNREVIEWED else ()))
+    if wanted.review not in names or wanted.note.casefold() not in review.note.casefold():
         return False
     if wanted.fit != ANY:
         verdict = project.verdict(index)

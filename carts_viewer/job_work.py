@@ -12,7 +12,7 @@ from carts_core.recording import spread
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_viewer.context import Context
 from carts_viewer.running import OptimizerFactory, scene_at
-from carts_viewer.solved import Comparison, reviewed
+from carts_viewer.solved import Comparison
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
             yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: not taken, it would be worse ({remark})")
             continue
         context.save()
-        review = reviewed(index, session.editor.view.review(index))
-        changes = {**edits, **review, Key.verdict(index): fit.verdict}
+        changes = {**edits, Key.verdict(index): fit.verdict}
         session.editor.apply(f"Optimize, frame {name}", changes, {index: Figures(fit.loss, fit.dice)})
         context.refresh()
         taken += 1

@@ -4,13 +4,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from carts_core.project import by_hand
 from carts_viewer import intents
+from carts_viewer.finding import review_name
 from carts_viewer.joint_range import Reach
 from carts_viewer.layers import Layer
 from carts_viewer.marks import keypoints_in_image, labelled_keypoints
 from carts_viewer.panels.fit import quality
-from carts_viewer.panels.review import BY_HAND
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -68,7 +67,7 @@ class PageState:
             "name": state.name,
             "domain": state.domain,
             "label": state.frame.frame_id,
-            "review": BY_HAND if by_hand(state.project, state.index) else str(state.review.state),
+            "review": review_name(state.project, state.index),
             "fit": None if state.verdict is None else state.verdict.verdict,
             "range": state.range,
             "playing": state.playing,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from carts_core.optimization import FrameEstimate, FreeParameters
-from carts_core.project import Edits, Figures, Key, ProjectState, Provenance, Review, ReviewState, Source
+from carts_core.project import Edits, Figures, Key, ProjectState, Provenance, Source
 from carts_core.recording import Frame
 from carts_viewer.active_run import ActiveRun
 from carts_viewer.fit_check import Fit, FitCheck
@@ -140,10 +140,3 @@ def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
     """What was solved of a frame and not compared, because somebody stopped it."""
     edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
     return Outcome(edits, Figures(estimate.loss), "not compared with how it was, because solving was stopped")
-
-
-def reviewed(index: int, review: Review) -> Edits:
-    """Marks a frame as optimized that nobody has said anything about."""
-    if review.state is not ReviewState.UNTOUCHED:
-        return {}
-    return {Key.review(index): Review(ReviewState.OPTIMIZED, review.note)}

@@ -4,9 +4,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from carts_core.project import FitVerdict, ProjectState, ReviewState, Source, by_hand
+from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
 from carts_core.project.fit_verdict import VERDICTS
 from carts_core.project.state import Record
+from carts_viewer.finding import BY_HAND, SOLVED, review_name
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.traces import Traces
@@ -18,8 +19,9 @@ _REVIEWS = (
     ReviewState.NEEDS_WORK,
     ReviewState.ACCEPTED,
     ReviewState.REJECTED,
+    BY_HAND,
+    SOLVED,
 )
-_BY_HAND = len(_REVIEWS)
 _SOURCES = (Source.HAND, Source.OPTIMIZER, Source.PROPAGATED)
 _FULL = 0.2
 """1 - Dice, and probability of failure, that fill the height of a bar [1]."""
@@ -108,7 +110,7 @@ def code(project: ProjectState, frame: int) -> int:
     record = project.records.get(frame)
     if record is None:
         return 0
-    review = _BY_HAND if by_hand(project, frame) else _REVIEWS.index(project.review(frame).state)
+    review = _REVIEWS.index(review_name(project, frame))
     verdict, figures = project.verdict(frame), project.figures(frame)
     source = next((number for number, source in enumerate(_SOURCES, start=1) if source in record.sources), 0)
     dice = None if figures is None else figures.dice

@@ -4,7 +4,6 @@
   "use strict";
 
   const PAUSE = 33; // between two messages [ms]
-  const HELD_BACK = 150; // as in page.js: the word that the link was let go of comes after all that moves it [ms]
   const isPicture = (event) => window.carts?.view.endoscope && event.target === window.__viserMutable?.canvas;
   let held = null;
 
@@ -13,6 +12,8 @@
     held.waiting = false;
     window.carts.report("dragged", [held.gesture, ...held.from, ...held.to, held.camera].join(" "));
   }
+
+  setInterval(send, 2000); // whoever rests with the button down is still dragging
 
   function cursor(name) {
     const canvas = window.__viserMutable?.canvas;
@@ -41,7 +42,7 @@
     send();
     held = null;
     cursor("");
-    setTimeout(() => window.carts.report("released"), HELD_BACK);
+    window.carts.released();
   }, { capture: true });
   for (const kind of ["keydown", "keyup"]) {
     window.addEventListener(kind, (event) => {

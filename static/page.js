@@ -332,10 +332,14 @@
     let pointing = null; // index of the camera in whose image something is dragged
     let place = null;
     let pressed = null; // where the picture was pressed, and nothing else began
+    let latest = null; // where something is dragged to
+    // Whoever rests for long with the button down is still dragging; an edit that nobody goes on with would be saved.
+    setInterval(() => { if (pointing !== null && latest) point(latest); }, 2000);
     /** Say where in the image the pointer is, at most 30 times a second, the last place always. */
     const point = (event) => {
       const found = imageAt(event, pointing);
       if (!found) return;
+      latest = event;
       if (!place) setTimeout(() => { report("pointed", place.join(" ")); place = null; }, 33);
       place = [found[1], found[2], found[0]];
     };
@@ -369,7 +373,7 @@
       if (pointing !== null) { grabbed = true; letGo(); }
       // A click on another camera's image chooses that camera.
       if (pressed && Math.hypot(event.clientX - pressed[1], event.clientY - pressed[2]) < 4) activate(pressed[0]);
-      last = pressed = pointing = null;
+      last = pressed = pointing = latest = null;
     }, { capture: true });
     window.addEventListener("click", (event) => {
       const target = event.target instanceof Element ? event.target : null;
@@ -408,11 +412,20 @@
   const HELD_BACK = 150; // viser holds the last value of a slider back by up to 50 ms; the report must come after it
   const isControl = (event) => event.target instanceof Element && event.target.closest("[role=slider], input");
   let grabbed = false;
-  const letGo = () => { if (grabbed) { grabbed = false; setTimeout(() => report("released"), HELD_BACK); } };
+  let pressing = false; // whether a button of the mouse is down
+  // A field that a drag takes the focus from is let go of with the drag: the word would end the drag half way.
+  const letGo = () => {
+    if (!grabbed) return;
+    grabbed = false;
+    setTimeout(() => { if (pressing) grabbed = true; else report("released"); }, HELD_BACK);
+  };
   window.addEventListener("pointerdown", (event) => {
+    pressing = true;
     grabbed ||= event.target instanceof Element && event.target.closest(".mantine-Slider-root") !== null;
   }, { capture: true });
-  window.addEventListener("pointerup", letGo, { capture: true });
+  for (const kind of ["pointerup", "pointercancel"]) {
+    window.addEventListener(kind, () => { pressing = false; letGo(); }, { capture: true });
+  }
   // With the keyboard, a slider is let go of with its key and a field with Enter.
   window.addEventListener("keyup", (event) => {
     const slider = event.target instanceof Element && event.target.closest("[role=slider]");
@@ -507,6 +520,7 @@
     showEndoscope, showScene,
     toggleView: () => (view.endoscope ? showScene() : showEndoscope()),
     zoomAt, imageOnScreen, report, switchedOn,
+    released: () => { grabbed = true; letGo(); },
     drawnOverlay: () => drawnTexture,
   };
 })();

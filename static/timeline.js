@@ -3,7 +3,7 @@
 (() => {
   "use strict";
 
-  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15"]; // the last one: moved by hand
+  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#60a5fa"]; // the last ones: moved by hand, solved
   const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
   const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
@@ -253,7 +253,7 @@
   function say() {
     const frame = hover ?? here;
     const code = codes[frame] ?? 0;
-    const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand"][code & 7];
+    const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved with other frames"][code & 7];
     const fit = ["", " · good", " · doubtful", " · failed"][(code >> 3) & 3];
     const value = curveHigh() ? window.carts.lanes.valueAt(frame) : "";
     readout.textContent = `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;

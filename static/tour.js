@@ -98,18 +98,17 @@
     document.body.classList.remove("carts-touring");
   }
 
-  /** Once in a browser, when there is something to show. */
+  /** Until it is answered, in every visit; when there is something to show. */
   function offer() {
-    if (localStorage.getItem(SEEN) || !document.querySelector(".carts-strip") || document.querySelector(".carts-offer")) return;
-    localStorage.setItem(SEEN, "offered");
+    const answered = !["offered", null].includes(localStorage.getItem(SEEN)); // older versions have kept that it was offered
+    if (answered || !document.querySelector(".carts-strip") || document.querySelector(".carts-offer")) return;
     const note = document.createElement("div");
     note.className = "carts-note carts-offer";
     note.setAttribute("role", "status");
     note.innerHTML = `New here? <button data-do="start">Take the tour</button><button data-do="close" aria-label="No tour">×</button>`;
     note.querySelector("[data-do=start]").onclick = start;
-    note.querySelector("[data-do=close]").onclick = () => note.remove();
+    note.querySelector("[data-do=close]").onclick = () => { localStorage.setItem(SEEN, "declined"); note.remove(); };
     document.body.append(note);
-    setTimeout(() => note.remove(), 20_000);
   }
 
   document.addEventListener("carts-page", () => setTimeout(offer, 1500), { once: true });

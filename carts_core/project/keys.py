@@ -55,6 +55,8 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.IMPORTED_KEYPOINTS: ImportedKeypoints,
     Kind.IMPORTED_LABELS: ImportedLabels,
 }
+CALIBRATION = frozenset({Kind.BASE_FRAME, Kind.EXTRINSICS, Kind.INTRINSICS, Kind.TIME_OFFSET})
+"""Kinds of what holds for all frames, and on which depends where their arms are."""
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
 _IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}

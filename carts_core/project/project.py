@@ -107,7 +107,7 @@ class Project:
 
         Args:
             name: for the history, say "Drag PSM1".
-            edits: what changes; values that are equal to the present ones are left out.
+            edits: what changes; see `ProjectState.changed` for what is left out and added.
             figures: frame -> figures of the frame with these edits; kept even if nothing else differs.
 
         Returns:

@@ -5,10 +5,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable
 
 from .state import ProjectState
-from .values import Figures, ReviewState, Source
-
-UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
-"""States in which nobody has judged the frame yet."""
+from .values import UNREVIEWED, Figures, ReviewState, Source
 
 
 def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> list[int]:

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
-from .keys import WHOLE_PROJECT, Edits, Key, Kind, check_edit
-from .values import Figures, JointCorrection, Review, ReviewState, Source
+from .keys import CALIBRATION, WHOLE_PROJECT, Edits, Key, Kind, check_edit
+from .values import UNREVIEWED, Figures, JointCorrection, Review, ReviewState, Source
 
 V = TypeVar("V")
 
@@ -59,13 +59,23 @@ class Record:
     # Computed once per record, and records outlive states: whoever asks for all frames again asks for few anew.
     @cached_property
     def review(self) -> Review:
-        """Review state and note; untouched at first."""
-        return next(self._values(Kind.REVIEW), Review())
+        """Review state and note. Of a frame that nobody has judged, the state follows what made its joint positions."""
+        said = next(self._values(Kind.REVIEW), Review())
+        if said.state not in UNREVIEWED:
+            return said
+        return replace(said, state=ReviewState.OPTIMIZED if self._optimized else ReviewState.UNTOUCHED)
 
     @cached_property
     def sources(self) -> frozenset[Source]:
         """Who made the corrected joint positions."""
         return frozenset(correction.provenance.source for correction in self._values(Kind.JOINTS))
+
+    @cached_property
+    def _optimized(self) -> bool:
+        """Whether its joint positions are those of a run, on it alone or with other frames; a copy has no settings."""
+        made = [correction.provenance for correction in self._values(Kind.JOINTS)]
+        by_hand = any(one.source is Source.HAND for one in made)
+        return not by_hand and any(one.settings is not None for one in made)
 
     @cached_property
     def is_keyframe(self) -> bool:
@@ -84,6 +94,9 @@ class Record:
 _EMPTY = Record({}, {})
 _MARKS = (Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT, Kind.IMPORTED_KEYPOINTS, Kind.IMPORTED_LABELS)
 """Kinds that say something about frames and do not change how arms fit."""
+_ACCEPTED = ReviewState.ACCEPTED
+_ACCEPTED_WITH = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.PART_LABELS, *CALIBRATION}
+"""Kinds of what somebody who accepts a frame has seen; where one changes, the frame must be accepted again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +118,11 @@ class ProjectState:
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """The edits without those that change nothing; a verdict on another pose is another one, whatever it says."""
+        """The edits without those that change nothing; a verdict on another pose is another one, whatever it says.
+
+        An accepted frame that becomes another one is not accepted any more, unless an edit says what its review is.
+        That belongs to the same step, so undo accepts it again.
+        """
         changed = {key: value for key, value in edits.items() if self.get(key) != value}
         moved = {key.frame for key in changed if key.kind not in _MARKS}
         for key, value in edits.items():
@@ -115,7 +132,16 @@ class ProjectState:
                 and (key.frame in moved or self.verdict(key.frame) != value)
             ):
                 changed[key] = value
-        return changed
+        return {**changed, **{key: review for key, review in self._withdrawn(changed).items() if key not in edits}}
+
+    def _withdrawn(self, changed: Edits) -> dict[Key[Any], Any]:
+        """Of accepted frames that these changes make other ones: a review that does not accept them any more."""
+        frames = {key.frame for key in changed if key.kind in _ACCEPTED_WITH}
+        if WHOLE_PROJECT in frames:
+            frames = set(self.records) - {WHOLE_PROJECT}
+        reviews = {frame: self.review(frame) for frame in frames}
+        open_ones = {i: replace(r, state=ReviewState.UNTOUCHED) for i, r in reviews.items() if r.state is _ACCEPTED}
+        return {Key.review(i): None if review == Review() else review for i, review in open_ones.items()}
 
     def values(self, kind: Kind) -> dict[Key[Any], Any]:
         """All values of one kind."""
@@ -128,7 +154,7 @@ class ProjectState:
         return {arm: correction for arm, correction in found.items() if correction is not None}
 
     def review(self, frame: int) -> Review:
-        """Review state and note of a frame; untouched at first."""
+        """Review state and note of a frame; see `Record.review`."""
         return self._record(frame).review
 
     def verdict(self, frame: int) -> FitVerdict | None:

@@ -195,6 +195,10 @@ class ReviewState(StrEnum):
     REJECTED = "rejected"
 
 
+UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
+"""States in which nobody has judged the frame yet."""
+
+
 @dataclass(frozen=True)
 class Review(JsonValue):
     """Review state of a frame and a note about it.

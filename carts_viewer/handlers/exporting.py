@@ -14,6 +14,7 @@ from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, Parts, exp
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.model.scene import SceneState
 from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
+from carts_core.project.values import UNREVIEWED
 from carts_viewer import intents
 from carts_viewer.archive import zipped
 from carts_viewer.checks import unknown
@@ -30,6 +31,7 @@ FRAME_CHOICES = {
     "Accepted": frozenset({ReviewState.ACCEPTED}),
     "Accepted and optimized": frozenset({ReviewState.ACCEPTED, ReviewState.OPTIMIZED}),
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
+    "Unreviewed": UNREVIEWED,
 }
 """What people can choose: review states of the frames that are exported."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")

@@ -6,7 +6,7 @@ from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.optimization import Iterate
-from carts_core.project import Edits, FitVerdict, Key, Review, ReviewState
+from carts_core.project import Edits, FitVerdict, Key
 from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
@@ -279,9 +279,6 @@ class OptimizingHandler:
         """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
         state = self._context.state
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
-        review = self._session.editor.project.state.review(state.index)
-        if review.state is ReviewState.UNTOUCHED:
-            edits[Key.review(state.index)] = Review(ReviewState.OPTIMIZED, review.note)
         # An earlier verdict was on another pose.
         edits[Key.verdict(state.index)] = verdict
         maps = Maps(iterate, run.cameras)

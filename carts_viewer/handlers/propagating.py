@@ -15,7 +15,7 @@ from carts_viewer.context import Context, OpenRun
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.sequence_run import SequenceRun
 from carts_viewer.solve_state import ListedFrame, SolveState
-from carts_viewer.solved import Comparison, Outcome, reviewed, unchecked
+from carts_viewer.solved import Comparison, Outcome, unchecked
 
 
 class PropagatingHandler:
@@ -170,7 +170,6 @@ class PropagatingHandler:
         figures: dict[int, Figures] = {}
         listed: list[ListedFrame] = []
         self._held = {}
-        now = self._session.editor.view
         for index, estimate in run.estimates().items():
             if not self._solved(estimate):
                 continue
@@ -178,7 +177,7 @@ class PropagatingHandler:
             if outcome.held:
                 self._held[index] = outcome
             else:
-                edits.update({**outcome.edits, **reviewed(index, now.review(index))})
+                edits.update(outcome.edits)
                 figures[index] = outcome.figures
             if outcome.remark is not None:
                 listed.append(ListedFrame(index, outcome.remark, not outcome.held))
@@ -204,7 +203,7 @@ class PropagatingHandler:
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         for index, outcome in taken.items():
-            edits.update({**outcome.edits, **reviewed(index, now.review(index))})
+            edits.update(outcome.edits)
             del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
         self._session.editor.apply(f"Take {len(taken)} solved frames", edits, figures)

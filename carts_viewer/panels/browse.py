@@ -6,6 +6,7 @@ import viser
 
 from carts_core.project import Source
 from carts_viewer import intents
+from carts_viewer.finding import SOLVED, copied
 from carts_viewer.handlers.browsing import SPEEDS
 from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
@@ -16,7 +17,7 @@ _SOURCES = {
     Source.MEASURED: "joints as measured",
     Source.HAND: "joints moved by hand",
     Source.OPTIMIZER: "joints optimized",
-    Source.PROPAGATED: "joints from other frames",
+    Source.PROPAGATED: f"joints {SOLVED}",
 }
 
 
@@ -82,12 +83,18 @@ class BrowsePanel:
         self._play.icon = viser.Icon.PLAYER_STOP if state.playing else viser.Icon.PLAYER_PLAY
         self._caption.content = f'<p class="carts-caption">{self._describe(state)}</p>'
 
+    @staticmethod
+    def _source(state: ViewState) -> str:
+        if state.pose.source is Source.PROPAGATED and copied(state.project, state.index):
+            return "joints copied from another frame"
+        return _SOURCES[state.pose.source]
+
     def _describe(self, state: ViewState) -> str:
         """The frame in words: its name, where its joints come from, and how well they fit the truth."""
         shown = f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})"
         parts = [
             f"Live frame <b>{escaped(state.frame.frame_id)}</b>" if state.streaming else shown,
-            _SOURCES[state.pose.source],
+            self._source(state),
         ]
         if state.frame.timestamp is not None:
             parts.append(_time(state.frame.timestamp, self._began))

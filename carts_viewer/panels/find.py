@@ -5,7 +5,7 @@ import viser
 from carts_core.project import ProjectState, ReviewState
 from carts_core.project.fit_verdict import VERDICTS
 from carts_viewer import intents
-from carts_viewer.finding import ANY, BY_HAND, NOT_CHECKED, FrameFilter, found
+from carts_viewer.finding import ANY, BY_HAND, NOT_CHECKED, SOLVED, UNJUDGED, FrameFilter, found
 from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -25,7 +25,7 @@ class FindPanel:
         self._known: tuple[ProjectState | None, FrameFilter] = (None, FrameFilter())
         with gui.add_folder("Find", expand_by_default=False):
             self._widgets = {
-                "review": gui.add_dropdown("Review", [ANY, *map(str, ReviewState), BY_HAND]),
+                "review": gui.add_dropdown("Review", [ANY, UNJUDGED, *map(str, ReviewState), BY_HAND, SOLVED]),
                 "fit": gui.add_dropdown(
                     "Fit",
                     [ANY, *VERDICTS, NOT_CHECKED],

@@ -4,8 +4,9 @@ from collections import Counter
 
 import viser
 
-from carts_core.project import Kind, ProjectState, ReviewState, by_hand
+from carts_core.project import ProjectState, ReviewState
 from carts_viewer import intents
+from carts_viewer.finding import BY_HAND, SOLVED, review_name
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -17,10 +18,6 @@ STATE_COLORS = {
     ReviewState.ACCEPTED: "#2dd4a7",
     ReviewState.REJECTED: "#ef4444",
 }
-
-
-BY_HAND = "moved by hand"
-"""What people read for a frame that was moved and not judged."""
 
 
 class ReviewPanel:
@@ -62,7 +59,7 @@ class ReviewPanel:
         """Bring the widgets up to date."""
         review = state.review
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
-        name = BY_HAND if by_hand(state.project, state.index) else review.state
+        name = review_name(state.project, state.index)
         self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{name}</b>{keyframe}</p>'
         if not self._waits(intents.SetNote):
             write(self._note, review.note)
@@ -71,13 +68,10 @@ class ReviewPanel:
             self._count(state.project)
 
     def _count(self, project: ProjectState) -> None:
-        reviews = project.values(Kind.REVIEW).values()
-        counts = Counter(review.state for review in reviews)
-        counts[ReviewState.UNTOUCHED] += len(project.identity.frame_ids) - len(reviews)
-        hand = sum(by_hand(project, index) for index in project.records)
-        counts[ReviewState.UNTOUCHED] -= hand
+        counts = Counter(review_name(project, index) for index in range(len(project.identity.frame_ids)))
         shown = [(_dot(name), counts[name], str(name)) for name in ReviewState]
-        shown.insert(1, (_dot(ReviewState.UNTOUCHED), hand, BY_HAND))
+        shown[1:1] = [(_dot(ReviewState.UNTOUCHED), counts[BY_HAND], BY_HAND)]
+        shown[3:3] = [(_dot(ReviewState.OPTIMIZED), counts[SOLVED], SOLVED)]
         known = " ".join(f'<span class="carts-key">{dot}{count} {name}</span>' for dot, count, name in shown if count)
         self._counts.content = f'<p class="carts-caption">{known}</p>'
 

@@ -3,6 +3,7 @@
 import viser
 
 from carts_core.project import ProjectState, Source
+from carts_viewer.finding import BY_HAND, SOLVED
 from carts_viewer.panels.review import STATE_COLORS
 from carts_viewer.state import ViewState
 
@@ -17,7 +18,7 @@ _LEAST = 3.0
 SOURCE_COLORS = {Source.HAND: "#facc15", Source.OPTIMIZER: "#60a5fa", Source.PROPAGATED: "#e879f9"}
 """Of the line below the bars: who made a frame's joint positions."""
 _EXPLAINED = "All frames: the higher a bar, the worse the fit. Click to go there."
-_LEGEND = {"by hand": Source.HAND, "optimized": Source.OPTIMIZER, "solved together": Source.PROPAGATED}
+_LEGEND = {BY_HAND: Source.HAND, "optimized": Source.OPTIMIZER, SOLVED: Source.PROPAGATED}
 
 
 class TimelinePanel:

@@ -84,6 +84,7 @@ class ProjectModel:
         """One gesture."""
         before = self.snapshots[self.position]
         after = {key: value for key, value in {**before, **edits}.items() if value is not None}
+        after = {key: value for key, value in self._withdrawn(before, after, edits).items() if value is not None}
         if after == before:
             self.record_figures(figures or {})
             return
@@ -92,6 +93,18 @@ class ProjectModel:
         self.figures = {key: value for key, value in self.figures.items() if key[1] <= self.position}
         self.position += 1
         self.record_figures(figures or {})
+
+    @staticmethod
+    def _withdrawn(before: Mapping[Key, Any], after: Mapping[Key, Any], edits: Mapping[Key, Any]) -> dict[Key, Any]:
+        """The state after an edit, without the acceptance of frames that it has changed."""
+        seen = (Kind.JOINTS, Kind.MASK_CORRECTION, Kind.BASE_FRAME, Kind.EXTRINSICS, Kind.INTRINSICS)
+        changed = {key.frame for key in {*before, *after} if before.get(key) != after.get(key) and key.kind in seen}
+        result = dict(after)
+        for frame in FRAMES if -1 in changed else changed:
+            review = after.get(Key.review(frame))
+            if review is not None and review.state is ReviewState.ACCEPTED and Key.review(frame) not in edits:
+                result[Key.review(frame)] = Review(note=review.note) if review.note else None
+        return result
 
     def go_to(self, position: int) -> None:
         """Undo or redo, as far as there is something."""

@@ -63,9 +63,13 @@ class AppModel:
             self.position += 1
 
     def changed(self, **changes) -> tuple[FrameModel, ...]:
-        """The frames, with another shown one."""
+        """The frames, with another shown one; it is not accepted any more if its joints are others."""
         frames = list(self.frames)
-        frames[self.index] = replace(frames[self.index], **changes)
+        before = frames[self.index]
+        after = replace(before, **changes)
+        if after.joints != before.joints and before.review is ReviewState.ACCEPTED:
+            after = replace(after, review=ReviewState.UNTOUCHED)
+        frames[self.index] = after
         return tuple(frames)
 
     def do(self, **changes) -> None:
@@ -150,7 +154,7 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
                 self.desk.do(intents.CopyCorrection(step))
                 self.model.do(joints=tuple(copied), copied=True)
 
-        @rule(state=st.sampled_from(list(ReviewState)))
+        @rule(state=st.sampled_from([state for state in ReviewState if state is not ReviewState.OPTIMIZED]))
         def review(self, state: ReviewState) -> None:
             self.desk.do(intents.SetReview(state))
             self.model.do(review=state)

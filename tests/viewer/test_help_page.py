@@ -47,6 +47,10 @@ def test_the_tour_is_offered_once_goes_over_the_page_and_can_be_left_at_any_time
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     tab = open_tab(open_viewer(width=160, height=120), new=True)
+    # It stays until it is answered, in the next visit, too.
+    expect(tab.page.locator(".carts-offer")).to_be_visible()
+    tab.page.reload()
+    tab.wait_until_ready()
     tab.page.get_by_role("button", name="Take the tour").click()
     card, frame = tab.page.get_by_role("dialog", name="Tour"), tab.page.locator(".carts-tour-frame")
     seen = []

@@ -85,7 +85,7 @@ def test_the_page_says_what_is_so(open_viewer: Callable[..., ViewerApp], open_ta
     app.wait_until_shown()
     tab.page.keyboard.press("o")
     tab.page.get_by_text("Review", exact=True).first.click()
-    expect(tab.page.get_by_text("1 moved by hand")).to_be_visible()
+    expect(tab.page.get_by_text("2 moved by hand")).to_be_visible()
     # Nothing is saved by a server that does not answer.
     expect(tab.page.locator(".carts-saved span")).to_be_visible()
     app.page.close()

@@ -28,9 +28,9 @@ class Model:
     dice: random.Random
     index: int
     values: dict[tuple[int, str], Any] = field(default_factory=dict)
-    done: list[tuple[int, str, object, object]] = field(default_factory=list)
-    """Frame, what, before, after."""
-    undone: list[tuple[int, str, object, object]] = field(default_factory=list)
+    done: list[tuple[int, dict[str, tuple[object, object]]]] = field(default_factory=list)
+    """Frame, and what of it was how before and after."""
+    undone: list[tuple[int, dict[str, tuple[object, object]]]] = field(default_factory=list)
 
     def act(self) -> None:
         """Do something at random, in the viewer and here."""
@@ -60,9 +60,11 @@ class Model:
             value = self.dice.choice([review for review in REVIEWS if review is not known])
             self.place.put(intents.SetReview(value))
         self.place.put(intents.Released())
-        before = self.values.get((self.index, kind))
-        self.values[self.index, kind] = value
-        self.done.append((self.index, kind, before, value))
+        step = {kind: (self.values.get((self.index, kind)), value)}
+        if kind == "joint" and self.values.get((self.index, "review")) is ReviewState.ACCEPTED:
+            step["review"] = (ReviewState.ACCEPTED, None)
+        self.values.update({(self.index, name): after for name, (_, after) in step.items()})
+        self.done.append((self.index, step))
         self.undone.clear()
 
     def _move(self, source: list, target: list, *, before: bool) -> None:
@@ -70,8 +72,8 @@ class Model:
             return
         step = source.pop()
         target.append(step)
-        self.index, kind = step[:2]
-        self.values[self.index, kind] = step[2] if before else step[3]
+        self.index = step[0]
+        self.values.update({(self.index, name): pair[0 if before else 1] for name, pair in step[1].items()})
 
     def check(self, app: ViewerApp, measured: np.ndarray) -> None:
         """Fail unless this person's tab and frames are as they should be."""
