@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection, Sequence
 from functools import lru_cache
 
-from carts_core.project import ProjectState
+from carts_core.project import ProjectState, ReviewState
 
 _NAMED = 6
 """Frames that are named."""
@@ -19,6 +19,9 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
         cameras: whose images and masks are exported.
     """
     found: list[str] = []
+    open_ones = sum(project.review(index).state is not ReviewState.ACCEPTED for index in frames)
+    if open_ones:
+        found.append(f"{open_ones} of {len(frames)} frames {'is' if open_ones == 1 else 'are'} not accepted")
     for verdict, text in (("failed", "failed"), ("doubtful", "are doubtful")):
         those = [i for i in frames if (known := project.verdict(i)) is not None and known.verdict == verdict]
         found += _line(project, those, f"of these frames {text}")

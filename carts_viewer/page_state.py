@@ -71,6 +71,7 @@ class PageState:
             "fit": None if state.verdict is None else state.verdict.verdict,
             "range": state.range,
             "playing": state.playing,
+            "notice": state.notice,
             "settings": remembered(state),
         }
 

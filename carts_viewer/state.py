@@ -23,6 +23,10 @@ from carts_viewer.solve_state import SolveState
 from carts_viewer.strokes import Brush
 
 
+Frames = range
+"""Neighbouring frames, by index; `ViewState` has a field called `range`."""
+
+
 class Phase(StrEnum):
     """What the optimizer is doing."""
 
@@ -224,8 +228,16 @@ class ViewState:
     export: ExportState | None = None
     live: LiveState | None = None
     error: str | None = None
+    notice: str | None = None
+    """What somebody should read once, and which is no error."""
     imported: str = ""
     """What masks of others were imported last, for people."""
+
+    @property
+    def part(self) -> Frames:
+        """The frames that are worked on: those of the range, or the whole sequence."""
+        first, last = self.range or (0, len(self.project.identity.frame_ids) - 1)
+        return range(first, last + 1)
 
     @property
     def run_outdated(self) -> bool:

@@ -102,6 +102,7 @@
 
   function onPage({ detail }) {
     const first = latest === null;
+    if (detail.notice && detail.notice !== latest?.notice) tell(detail.notice);
     welcome = true;
     const before = remembered("carts-tab");
     if (first && before) setTimeout(() => chooseTabs(before.tabs), 400);

@@ -20,28 +20,31 @@ def by_hand(state: ProjectState, frame: int) -> bool:
     return record is not None and untouched and Source.HAND in record.sources
 
 
-def next_unreviewed(state: ProjectState, after: int, step: int = 1) -> int | None:
+def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: range | None = None) -> int | None:
     """The next frame that nobody has judged, coming round at the end; None if there is none.
 
     Args:
         state: of the project.
         after: index of the present frame, which comes last.
         step: 1 forwards, -1 backwards.
+        within: frames to stay in, of which the present one is one; None: all of them.
     """
-    frames = len(state.identity.frame_ids)
-    around = ((after + step * offset) % frames for offset in range(1, frames + 1))
+    frames = within or range(len(state.identity.frame_ids))
+    place = after - frames.start
+    around = (frames[(place + step * offset) % len(frames)] for offset in range(1, len(frames) + 1))
     return next((index for index in around if state.review(index).state in UNREVIEWED), None)
 
 
-def between_kept(state: ProjectState, frame: int) -> range:
+def between_kept(state: ProjectState, frame: int, within: range | None = None) -> range:
     """From the kept frame before this one to the kept frame after it, both included; see `ProjectState.kept_frames`.
 
-    Where there is none, the sequence's first or last frame takes its place.
+    Where there is none, the sequence's first or last frame takes its place, or that of `within` if the frame is there.
     """
-    kept = state.kept_frames
+    frames = range(len(state.identity.frame_ids)) if within is None or frame not in within else within
+    kept = [index for index in state.kept_frames if index in frames]
     before, after = bisect_left(kept, frame), bisect_right(kept, frame)
-    first = kept[before - 1] if before else 0
-    last = kept[after] if after < len(kept) else len(state.identity.frame_ids) - 1
+    first = kept[before - 1] if before else frames[0]
+    last = kept[after] if after < len(kept) else frames[-1]
     return range(first, last + 1)
 
 

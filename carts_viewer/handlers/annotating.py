@@ -107,10 +107,18 @@ class AnnotatingHandler:
 
     @handle.register
     def _(self, intent: intents.AcceptAndNext) -> None:
+        self._context.change(notice=None)
         self._review(ReviewState.ACCEPTED)
+        state = self._context.state
+        within = state.part if state.index in state.part else None
+        index = next_unreviewed(state.project, state.index, within=within)
+        if index is not None:
+            self._go(index)
+            return
         # Whoever accepts the last frame is done, which is no error.
-        if next_unreviewed(self._context.state.project, self._context.state.index) is not None:
-            self.handle(intents.ShowUnreviewed())
+        where = " of the range" if within is not None and state.range is not None else ""
+        count = len(within or range(len(self._session.sequence)))
+        self._context.change(notice=f"All {count} frames{where} are reviewed.")
 
     @handle.register
     def _(self, intent: intents.ShowUnreviewed) -> None:

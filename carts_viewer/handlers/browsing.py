@@ -78,7 +78,8 @@ class BrowsingHandler:
             self._open_run.forget()
             keypoints = replace(context.state.keypoints, pins=(), residuals=())
             context.change(run=RunState(), keypoints=keypoints)
-        context.change(index=index, domain=domain, camera=camera, frame=frame, scores=None, maps=None, error=None)
+        context.change(index=index, domain=domain, camera=camera, frame=frame, scores=None, maps=None)
+        context.change(error=None, notice=None)
         context.refresh()
 
     @handle.register

@@ -79,11 +79,11 @@ class JobsHandler:
 
     @handle.register
     def _(self, intent: intents.Solve) -> None:
-        state = self._choices
+        state, title = self._choices, "Solve all frames" if intent.whole else "Solve between keyframes"
         options = {**asdict(intent), "at": state.index}
-        title = "Solve all frames" if intent.whole else "Solve between keyframes"
-        if intent.whole and state.range is not None:
-            title, options["range"] = f"Solve frames {self._from_to(state.range)}", list(state.range)
+        if state.range is not None and (intent.whole or state.index in state.part):
+            options["range"] = list(state.range)
+            title = f"Solve {'' if intent.whole else 'between keyframes, '}frames {self._from_to(state.range)}"
         self._queue("solve", title, options)
 
     @handle.register

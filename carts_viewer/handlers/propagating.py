@@ -72,7 +72,7 @@ class PropagatingHandler:
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     def solve(self, whole: bool, at: int, part: range | None = None) -> None:
-        """Begin to solve all frames, or those of a part, or those between the kept frames around the frame `at`.
+        """Begin to solve all frames, or those between the kept frames around the frame `at`; of a part, if given.
 
         Raises:
             CartsError: there is nothing to solve, or it could not be saved.
@@ -85,15 +85,15 @@ class PropagatingHandler:
         self._open_run.end("Stopped: many frames are solved together")
         self._context.save()
         view = self._session.editor.view
-        if not (whole or view.kept_frames):
-            raise CartsError(
-                "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
-            )
         everything = range(len(self._session.sequence))
         if part is not None and (part.start not in everything or part.stop - 1 not in everything or not part):
             raise CartsError("The chosen range lies outside of the sequence. Choose another one in the timeline.")
-        frames = (part or everything) if whole else between_kept(view, at)
+        frames = (part or everything) if whole else between_kept(view, at, part)
         kept = [frame for frame in view.kept_frames if frame in frames]
+        if not (whole or kept):
+            raise CartsError(
+                "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
+            )
         if len(kept) == len(frames):
             raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")
         self._before = view

@@ -44,7 +44,7 @@ class SetNote(Annotation, Latest):
 
 @dataclass(frozen=True)
 class AcceptAndNext(Annotation):
-    """Accept the shown frame, then show the next one that nobody has judged."""
+    """Accept the shown frame, then show the next one that nobody has judged; within the range, where it lies there."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ class KeyframesPanel:
     def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
         gui = page.gui
         self._ids = session.sequence.frame_ids
-        self._seen: tuple[ProjectState | None, int] = (None, -1)
+        self._seen: tuple[ProjectState | None, int, tuple[int, int] | None] = (None, -1, None)
         self._solvable, self._plan = False, ""
         self._index = 0
         with gui.add_folder("Keyframes"):
@@ -57,7 +57,9 @@ class KeyframesPanel:
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
-        lines = [] if state.solving else [self._plan]
+        # What has just been solved without keyframes needs no advice about them.
+        planned = not state.solving and (bool(state.project.kept_frames) or state.solve is None)
+        lines = [self._plan] if planned else []
         if state.solve is not None:
             self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
             lines.append(f"<b>{escaped(state.solve.text)}</b>")
@@ -85,15 +87,19 @@ class KeyframesPanel:
 
     def _plan_ahead(self, state: ViewState) -> None:
         """Find out what "between" means here; while somebody is moving a joint, what it meant before."""
-        if self._seen == (state.project, state.index) or (state.unsaved and self._seen[1] == state.index):
+        seen = (state.project, state.index, state.range)
+        if self._seen == seen or (state.unsaved and self._seen[1:] == seen[1:]):
             return
-        self._seen = (state.project, state.index)
-        kept, frames = set(state.project.kept_frames), between_kept(state.project, state.index)
+        self._seen = seen
+        frames = between_kept(state.project, state.index, state.part)
+        kept = set(state.project.kept_frames)
+        if state.index in state.part:
+            kept &= set(state.part)
         count = sum(frame not in kept for frame in frames)
         self._solvable = bool(kept) and count > 0
         first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
-        self._plan = (
-            f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
-            if kept
-            else "No keyframe yet: correct a frame by hand, or solve all."
-        )
+        where = "in the range" if state.range is not None and state.index in state.part else "yet"
+        done = f"Nothing to solve from <b>{first}</b> to <b>{last}</b>: every frame is kept"
+        plan = f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
+        none = f"No frame is kept {where}: accept one or correct one by hand, or solve all of them."
+        self._plan = none if not kept else plan if count else done

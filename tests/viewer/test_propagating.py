@@ -90,6 +90,16 @@ def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk
     assert sources(desk) == [Source.HAND, None, None, Source.HAND, None]
 
 
+def test_between_keyframes_is_inside_the_range_where_the_frame_lies_in_one(desk: Desk) -> None:
+    desk.do(intents.SetRange((1, 3)), intents.ShowFrame(4), intents.SetReview(ReviewState.ACCEPTED))
+    with pytest.raises(CartsError, match="no keyframe yet"):
+        desk.do(intents.ShowFrame(2), intents.Solve())
+    desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.ACCEPTED), intents.ShowFrame(2), intents.Solve())
+    assert desk.state.solve is not None and desk.state.solve.frames == range(1, 4)
+    desk.finish()
+    assert sources(desk) == [None, None, Source.PROPAGATED, Source.PROPAGATED, None]
+
+
 def test_solving_all_keeps_accepted_frames_and_needs_no_keyframe(desk: Desk) -> None:
     measured = desk.session.sequence.measured["PSM1"]
     desk.do(intents.ShowFrame(2), intents.SetReview(ReviewState.ACCEPTED), intents.Solve(whole=True))

@@ -91,3 +91,13 @@ def test_unreviewed_means_the_same_in_find_in_exports_and_in_next_unreviewed(des
     states = FRAME_CHOICES["Unreviewed"]
     assert [index for index in range(3) if desk.saved.review(index).state in states] == [1, 2]
     assert [desk.do(intents.ShowUnreviewed()).index for _ in range(2)] == [2, 1]
+
+
+def test_accept_and_next_stays_in_the_range_and_says_when_it_is_done(desk: Desk) -> None:
+    desk.do(intents.SetRange((1, 2)), intents.ShowFrame(2))
+    assert desk.do(intents.AcceptAndNext()).index == 1 and desk.state.notice is None
+    assert desk.do(intents.AcceptAndNext()).index == 1
+    assert desk.state.notice == "All 2 frames of the range are reviewed." and desk.state.error is None
+    assert desk.do(intents.ShowFrame(0)).notice is None
+    # Outside of the range, and without one, it is about the whole sequence.
+    assert desk.do(intents.AcceptAndNext()).notice == "All 3 frames are reviewed."
