@@ -45,9 +45,9 @@ class FindPanel:
             self._list = gui.add_html("")
             before = gui.add_button("Previous", icon=viser.Icon.CHEVRON_LEFT, color="gray")
             after = gui.add_button("Next", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
-            clear = gui.add_button("Clear", color="gray", hint="Forget these conditions")
             page.row(before, after)
             self._bulk = [gui.add_button(name, color="gray") for name in _BULK]
+            clear = gui.add_button("Clear", color="gray", hint="Forget these conditions")
             page.row(*self._bulk[:2])
             page.row(self._bulk[2], clear)
         for name, widget in self._widgets.items():
