@@ -39,7 +39,7 @@ class SequenceRun:
         """How it goes, for people."""
         done, total = self._optimizer.progress
         if done == 0:
-            return "Estimating a few frames to choose where to begin"
+            return "Solving a few frames alone, for a first estimate of the error of all"
         if done == total:
             return f"All {total} frames estimated, revising those that disagree and judging the fit"
         seconds = self._optimizer.seconds_left

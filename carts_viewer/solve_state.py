@@ -22,8 +22,15 @@ class SolveState:
     """From the first to the last one, kept frames included."""
     done: int = 0
     """Frames that were visited."""
+    compared: int = 0
+    """Frames that were compared with how they were, which comes after that."""
     running: bool = True
     text: str = ""
     """How it goes, for people."""
     listed: tuple[ListedFrame, ...] = ()
     """Frames whose fit became worse, or is doubtful."""
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Steps that are done, and all of them: every frame is visited, and then compared."""
+        return self.done + self.compared, 2 * len(self.frames)

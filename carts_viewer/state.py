@@ -22,7 +22,6 @@ from carts_viewer.observing import Observed
 from carts_viewer.solve_state import SolveState
 from carts_viewer.strokes import Brush
 
-
 Frames = range
 """Neighbouring frames, by index; `ViewState` has a field called `range`."""
 

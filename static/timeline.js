@@ -15,6 +15,7 @@
   let strip = null;
   let canvas = null;
   let readout = null;
+  let tip = null; // says of the frame under the pointer what the readout says of the shown one
   let picker = null;
   let frames = 0;
   let ids = null;
@@ -29,6 +30,7 @@
   let dragging = null; // "scrub", "whole" or "range"
   let anchor = 0; // where a range was begun
   let hover = null;
+  let pointer = 0; // where it is over the canvas [px]
   let dirty = true;
   let wanted = null;
   let open = localStorage.getItem("carts-lanes") !== "closed";
@@ -48,6 +50,10 @@
         <output></output>
       </div>
       <canvas role="slider" tabindex="-1" aria-label="Timeline: drag to scrub, wheel to zoom, Shift and drag for a range"></canvas>`;
+    tip = document.createElement("div");
+    tip.className = "carts-tip";
+    tip.hidden = true;
+    strip.append(tip);
     [canvas, readout, picker] = ["canvas", "output", "select"].map((name) => strip.querySelector(name));
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
       strip.addEventListener(kind, (event) => event.stopPropagation());
@@ -136,6 +142,7 @@
 
   function move(event) {
     const inWhole = event.offsetY >= wholeAt();
+    pointer = event.offsetX;
     hover = clamped(inWhole && dragging !== "scrub" ? (event.offsetX / width()) * frames : frameAt(event.offsetX));
     dirty = true;
     canvas.style.cursor = event.offsetY < barsAt() && gripped(event.offsetX) !== null ? "ew-resize" : "";
@@ -250,13 +257,22 @@
     context.globalAlpha = 1;
   }
 
-  function say() {
-    const frame = hover ?? here;
+  /** What is known of a frame, in words. */
+  function described(frame) {
     const code = codes[frame] ?? 0;
     const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved with other frames"][code & 7];
     const fit = ["", " · good", " · doubtful", " · failed"][(code >> 3) & 3];
     const value = curveHigh() ? window.carts.lanes.valueAt(frame) : "";
-    readout.textContent = `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;
+    return `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;
+  }
+
+  function say() {
+    readout.textContent = described(here);
+    tip.hidden = hover === null;
+    if (hover !== null) {
+      tip.textContent = described(hover);
+      tip.style.left = `${Math.min(Math.max(pointer - tip.offsetWidth / 2, 4), width() - tip.offsetWidth - 4)}px`;
+    }
     strip.querySelector(".carts-range").textContent = range ? `${name(range[0])} – ${name(range[1])}` : "";
     strip.querySelector("[data-do=whole]").hidden = !range;
     strip.querySelector("[data-do=lanes]").textContent = open ? "▾" : "▴";

@@ -65,6 +65,7 @@ def write_annotations(
                 "frame": view.frame.frame_id,
                 "camera": view.camera.name,
                 "source": view.frame.source,
+                **({"painted": True} if view.painted else {}),
             }
         )
         for annotation in annotate(view):

@@ -46,6 +46,11 @@ class View:
     link_ids: Int[np.ndarray, "height width"]
     """Index of the visible link, counted through all arms, -1 for background."""
 
+    @property
+    def painted(self) -> bool:
+        """Whether somebody painted on what the camera shows, so that not all pixels are as the joints say."""
+        return self.camera.name in self.frame.masks or self.camera.name in self.frame.part_labels
+
 
 @dataclass(frozen=True)
 class Dataset:

@@ -219,7 +219,7 @@ class JobsHandler:
             if solve is None or not solve.running:
                 self._end(job, JobState.DONE, solve.text if solve else "")
             else:
-                self._report(job, Progress(solve.done, len(solve.frames), solve.text))
+                self._report(job, Progress(solve.progress[0] // 2, len(solve.frames), solve.text))
         elif job.kind == "export":
             export = state.export
             if export is None:

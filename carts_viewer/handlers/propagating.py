@@ -133,14 +133,14 @@ class PropagatingHandler:
                 self._check_calibration()
                 self._report(done=run.done, text=run.status())
                 yield
-            for index, estimate in run.estimates().items():
+            for number, (index, estimate) in enumerate(run.estimates().items(), start=1):
                 if run.cancelled:
                     break
                 if self._solved(estimate):
                     outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
                     self._context.change(busy=None)
                     self._check_calibration()
-                self._report(text=f"Comparing with how it was, frame {len(outcomes)} of {run.done}")
+                self._report(compared=number, text=f"Comparing with how it was, frame {number} of {run.done}")
                 yield
         finally:
             # An image that is missing in the end does not cost what was solved before it.

@@ -37,7 +37,7 @@ HINTS = {
     "Back to measured": "Forget all corrections of this frame's joints (M)",
     "All back to measured": "Forget all corrections of this frame's joints (M)",
     # Optimize
-    "Run": "Fit the arms to this frame's images from where they are (R)",
+    "Run": "Fit the arms to this frame's images from where they are; clicked keypoints do not pull on it (R)",
     "Pause": "Hold the run; Continue goes on with it (R)",
     "Step": "A single iteration (T)",
     "Reset": "Back to where the run began (X)",

@@ -61,7 +61,8 @@ class KeyframesPanel:
         planned = not state.solving and (bool(state.project.kept_frames) or state.solve is None)
         lines = [self._plan] if planned else []
         if state.solve is not None:
-            self._progress.value = 100.0 * state.solve.done / len(state.solve.frames)
+            done, total = state.solve.progress
+            self._progress.value = 100.0 * done / total
             lines.append(f"<b>{escaped(state.solve.text)}</b>")
         self._show_listed(state)
         self._text.content = f'<p class="carts-caption">{"<br>".join(lines)}</p>'

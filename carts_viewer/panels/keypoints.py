@@ -21,7 +21,8 @@ class KeypointsPanel:
         with gui.add_folder("Keypoints"):
             gui.add_html(
                 '<p class="carts-caption"><b>Shift+click</b> on the picture: the chosen keypoint is there. '
-                "<b>Shift+drag</b> takes it along.</p>"
+                "<b>Shift+drag</b> takes it along. The arm follows at once; a run starts there, and the clicks do not "
+                "pull on it.</p>"
             )
             options = [_NEAREST, *self._labels.values()]
             self._chosen = gui.add_dropdown("Keypoint", options)
@@ -39,8 +40,8 @@ class KeypointsPanel:
         write(self._shown, keypoints.shown)
         self._forget.visible = bool(keypoints.pins)
         rows = [
-            f"<tr><td>{escaped(self._labels[pin.keypoint])} <small>{escaped(pin.camera)}</small></td>"
-            f"<td>{residual:.1f} px</td></tr>"
+            f"<tr><td>{escaped(self._labels[pin.keypoint])} <small>({escaped(pin.camera)})</small></td>"
+            f"<td>{residual:.1f} px off</td></tr>"
             for pin, residual in zip(keypoints.pins, keypoints.residuals, strict=True)
         ]
         self._residuals.content = f'<table class="carts-values">{"".join(rows)}</table>'

@@ -48,7 +48,10 @@ class PaintPanel:
             self._targets = {target: gui.add_button(str(target)) for target in Target}
             page.row(*self._targets.values(), weights=(2, 3))
             self._class = gui.add_dropdown(
-                "Class", list(self._classes), hint="What the brush paints: any arm, or a part of one (layer Parts)"
+                "Class",
+                list(self._classes),
+                hint="What the brush paints: a part of an arm (layer Parts), or any arm: such pixels belong to the arm "
+                "that is nearest to them in the overlay, also in an export with a category per arm",
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")

@@ -109,6 +109,9 @@ def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: D
     for name, index, camera in (("right_001", 0, "right"), ("left_002", 1, "left")):
         pose = desk.session.pose(desk.session.sequence.frame(index, cameras=[])).scene
         assert np.array_equal(read_mask(folder / f"{name}.png"), desk.renderer.arm_ids(pose, camera) >= 0)
+    coco = exported(desk, intents.Export("coco", "All", images=False)) / "annotations" / "instances_default.json"
+    views = json.loads(coco.read_text())["images"]
+    assert [(view["frame"], view["camera"]) for view in views if view.get("painted")] == [("001", "left")]
     desk.do(intents.Refresh(), intents.ShowCamera("left"), intents.ExportMask(7))
     _, name, content = desk.delivered[-1]
     shown = decoded(content)

@@ -96,7 +96,12 @@ def test_between_keyframes_is_inside_the_range_where_the_frame_lies_in_one(desk:
         desk.do(intents.ShowFrame(2), intents.Solve())
     desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.ACCEPTED), intents.ShowFrame(2), intents.Solve())
     assert desk.state.solve is not None and desk.state.solve.frames == range(1, 4)
-    desk.finish()
+    seen = []
+    while desk.state.solve.running:
+        desk.advance()
+        seen.append(desk.state.solve.progress)
+    # The bar is full when all is done, and not when frames are still compared.
+    assert seen == sorted(seen) and {(3, 6), (4, 6), (5, 6), (6, 6)} <= set(seen)
     assert sources(desk) == [None, None, Source.PROPAGATED, Source.PROPAGATED, None]
 
 

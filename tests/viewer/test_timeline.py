@@ -121,11 +121,12 @@ def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     # A curve: chosen in the page, asked for in view alone, with its value where the pointer is.
     tab.page.get_by_label("Curve", exact=True).select_option(index=4)
     tab.page.wait_for_function("carts.lanes.curve()?.edges.length == 9 && carts.lanes.curve().edges[0] == 20")
-    box = strip.bounding_box()
-    assert box is not None
+    assert (box := strip.bounding_box()) is not None
     tab.page.mouse.move(box["x"] + box["width"] * 1.5 / 8, box["y"] + 30)
-    yaw = float(np.degrees(app.sequence.measured["PSM1"][21, 0]))
-    expect(tab.page.locator(".carts-strip output")).to_contain_text(f"{float(f'{yaw:.5g}')} °")
+    yaw = float(f"{np.degrees(app.sequence.measured['PSM1'][21, 0]):.5g}")
+    expect(tab.page.locator(".carts-tip")).to_contain_text(f"{yaw} °")
+    # The shown frame's own status stays where it is.
+    expect(tab.page.locator(".carts-strip output")).to_contain_text(f"{app.state.frame.frame_id} of 60")
     # Shift and drag mark a range, whose ends can be dragged on; × takes it away.
     tab.page.keyboard.down("Shift")
     tab.page.mouse.down()
