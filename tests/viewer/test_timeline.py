@@ -92,6 +92,25 @@ def test_a_range_is_marked_frame_by_frame_and_the_whole_sequence_is_none(desk: D
 
 
 @pytest.mark.browser
+def test_the_status_is_that_of_the_shown_frame_and_a_label_at_the_pointer_has_the_other_one(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_viewer(frames=8, width=160, height=120))
+    status, tip = tab.page.locator(".carts-strip output"), tab.page.locator(".carts-tip")
+    expect(status).to_contain_text("001 of 8 · untouched")
+    expect(tip).to_be_hidden()
+    box = tab.page.locator(".carts-strip canvas").bounding_box()
+    assert box is not None
+    tab.page.mouse.move(box["x"] + box["width"] * 5.5 / 8, box["y"] + 30)
+    expect(tip).to_have_text("006 of 8 · untouched")
+    expect(status).to_contain_text("001 of 8 · untouched")
+    label = tip.bounding_box()
+    assert label is not None and abs(label["x"] + label["width"] / 2 - box["x"] - box["width"] * 5.5 / 8) < 2
+    tab.page.mouse.move(box["x"] + 200, box["y"] - 200)
+    expect(tip).to_be_hidden()
+
+
+@pytest.mark.browser
 def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
@@ -121,12 +140,11 @@ def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     # A curve: chosen in the page, asked for in view alone, with its value where the pointer is.
     tab.page.get_by_label("Curve", exact=True).select_option(index=4)
     tab.page.wait_for_function("carts.lanes.curve()?.edges.length == 9 && carts.lanes.curve().edges[0] == 20")
-    assert (box := strip.bounding_box()) is not None
+    box = strip.bounding_box()
+    assert box is not None
     tab.page.mouse.move(box["x"] + box["width"] * 1.5 / 8, box["y"] + 30)
-    yaw = float(f"{np.degrees(app.sequence.measured['PSM1'][21, 0]):.5g}")
-    expect(tab.page.locator(".carts-tip")).to_contain_text(f"{yaw} °")
-    # The shown frame's own status stays where it is.
-    expect(tab.page.locator(".carts-strip output")).to_contain_text(f"{app.state.frame.frame_id} of 60")
+    yaw = app.sequence.measured["PSM1"][21, 0]
+    expect(tab.page.locator(".carts-tip")).to_contain_text(f"{float(f'{np.degrees(yaw):.5g}')} °")
     # Shift and drag mark a range, whose ends can be dragged on; × takes it away.
     tab.page.keyboard.down("Shift")
     tab.page.mouse.down()
