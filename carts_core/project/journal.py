@@ -165,6 +165,15 @@ def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tup
     return script
 
 
+def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Script:
+    """Keep a value as one of a step that is done, in place of what that step set."""
+    script, row = Script(), (key.kind.value, int(key.frame), str(key.name), entry.step)
+    found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
+    script.take_out(memory.execute(found, row))
+    script.insert("changes", [(*row, entry.value.encode())])
+    return script
+
+
 def add_export(record: ExportRecord) -> Script:
     """Add a line to the log of exports."""
     script = Script()

@@ -12,6 +12,7 @@ from ..errors import ProjectError
 from ..wording import counted
 from . import database, journal, opening
 from .changes import Action, Change, Listener, Listeners
+from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
 from .place import default_path
@@ -58,10 +59,7 @@ class Project:
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
         """The project of a sequence, begun if there is none; by default at `default_path`.
 
-        While another process has it open for writing, it opens read-only; see `writable` and `read_only_reason`.
-
-        Raises:
-            ProjectError: see the class.
+        While another process has it open for writing, it opens read-only; see `writable`. Errors as of the class.
         """
         if path is None:
             path = default_path(Path(sequence.path))
@@ -142,11 +140,7 @@ class Project:
             return self.go_to(max(self.state.position - 1, 0))
 
     def redo(self) -> Change | None:
-        """Do the step again that was undone last; None if there is none.
-
-        Raises:
-            ProjectError: it could not be saved.
-        """
+        """Do the step again that was undone last; None if there is none. Errors as `undo`."""
         with self._edit:
             return self.go_to(min(self.state.position + 1, len(self.state.steps)))
 
@@ -216,6 +210,16 @@ class Project:
                 store.commit(journal.add_figures(store.memory, journal.Script(), known))
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
+    def record_verdict(self, frame: int, verdict: FitVerdict) -> None:
+        """Save what the image says of a frame as it is now; as with figures, this is no step. Errors as there."""
+        key = Key.verdict(frame)
+        with self._edit:
+            check_edit(self.state.identity, key, verdict)
+            entry = self.state.remark(key, verdict)
+            store = self._writer()
+            store.commit(journal.add_remark(store.memory, key, entry))
+            self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
+
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
         """Save that an export was finished. Not a step of undo.
 
@@ -234,11 +238,7 @@ class Project:
             self._saved(replace(self.state, exports=(*self.state.exports, record)), "export")
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener` after each save, in order, on the thread that saves; it should hand on and return.
-
-        Returns:
-            A function that ends this.
-        """
+        """Call `listener` after each save, in order, on the thread that saves, until what this returns is called."""
         return self._listeners.add(listener)
 
     def close(self) -> None:

@@ -162,6 +162,11 @@ class ProjectState:
         entry = self._record(frame).entries.get(Key.verdict(frame))
         return None if entry is None or entry.step < self.revision(frame) else entry.value
 
+    def remark(self, key: Key[V], value: V) -> Entry:
+        """A value that belongs to the step that has made its frame what it is, so that it comes and goes with it."""
+        known = self._record(key.frame).entries.get(key)
+        return Entry(max(self.revision(key.frame), 0 if known is None else known.step), value)
+
     def is_keyframe(self, frame: int) -> bool:
         """Whether propagation must keep the frame: a person said so, or made its joint positions and said nothing."""
         return self._record(frame).is_keyframe

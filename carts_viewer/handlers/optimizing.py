@@ -272,7 +272,13 @@ class OptimizingHandler:
         state = self._context.state
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
-        self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
+        if self._session.editor.project.writable:
+            # It says something about the frame and changes nothing, so there is nothing to undo.
+            self._context.save()
+            self._session.editor.project.record_verdict(state.index, found.verdict)
+            self._context.refresh()
+        else:
+            self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
         self._context.change(busy=None)
 
     def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:

@@ -29,6 +29,30 @@ def test_a_verdict_holds_until_the_pose_changes_and_comes_back_with_undo(project
         assert again.state.verdict(0) == GOOD and again.state.verdict(1) is None
 
 
+def test_a_check_is_no_step_and_its_verdict_comes_and_goes_with_the_pose(project: Project, project_path: Path) -> None:
+    project.record_verdict(0, GOOD)
+    project.apply("Move", {Key.joints(0, "PSM1"): _joints(0.1)})
+    assert project.state.verdict(0) is None
+    project.record_verdict(0, GOOD)
+    project.record_verdict(0, FAILED)
+    project.apply("Accept", {Key.review(0): Review(ReviewState.ACCEPTED)})
+    assert project.state.verdict(0) == FAILED and len(project.history()) == 2
+    project.go_to(0)
+    assert project.state.verdict(0) == GOOD
+    project.go_to(2)
+    assert project.state.verdict(0) == FAILED
+    project.close()
+    with Project(IDENTITY, project_path) as again:
+        assert again.writable and again.incident is None and again.state.verdict(0) == FAILED
+        again.go_to(0)
+        assert again.state.verdict(0) == GOOD
+        again.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.3), Key.verdict(0): GOOD})
+        again.record_verdict(0, FAILED)
+        assert again.state.verdict(0) == FAILED
+    with Project(IDENTITY, project_path) as again:
+        assert again.incident is None and again.state.verdict(0) == FAILED and len(again.history()) == 1
+
+
 def test_the_same_verdict_on_another_pose_holds_too(project: Project) -> None:
     for value in (0.1, 0.2):
         project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(value), Key.verdict(0): FAILED})

@@ -56,6 +56,7 @@ def test_a_check_says_what_every_camera_sees_and_moves_nothing(desk: Desk) -> No
     state = desk.do(intents.Assess())
     assert state.verdict is not None and [name for name, _ in state.verdict.cameras] == ["left", "right"]
     assert desk.joint() == before and state.pose.source is Source.MEASURED
+    assert not desk.saved.steps and not state.unsaved and desk.saved.verdict(0) == state.verdict
     # It is of this pose alone, and a run says it anew.
     assert desk.do(intents.SetJoint("PSM1", 0, 0.1), intents.Released()).verdict is None
     desk.do(intents.Run())
