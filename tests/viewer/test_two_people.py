@@ -60,7 +60,7 @@ class Model:
             value = self.dice.choice([review for review in REVIEWS if review is not known])
             self.place.put(intents.SetReview(value))
         self.place.put(intents.Released())
-        step = {kind: (self.values.get((self.index, kind)), value)}
+        step: dict[str, tuple[object, object]] = {kind: (self.values.get((self.index, kind)), value)}
         if kind == "joint" and self.values.get((self.index, "review")) is ReviewState.ACCEPTED:
             step["review"] = (ReviewState.ACCEPTED, None)
         self.values.update({(self.index, name): after for name, (_, after) in step.items()})
