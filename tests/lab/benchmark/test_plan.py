@@ -32,7 +32,7 @@ def test_no_run_is_planned_twice_and_the_main_table_is_complete(scope) -> None:
 
 def test_frame_comes_after_frame_so_that_a_stopped_benchmark_has_some_of_everything() -> None:
     runs = plan(FULL, BOTH)
-    alone = [run for run in runs if run.method != "sequence"]
+    alone = [run for run in runs if run.method not in ("sequence", "temporal")]
     assert runs[: len(alone)] == alone
     by_all = [run for run in alone if (run.source, run.frame) in (("synthetic", 0), ("synthetic", 2), ("real", 5))]
     assert runs[: len(by_all)] == by_all
@@ -49,10 +49,14 @@ def test_the_full_scope_has_every_error_in_every_domain() -> None:
 
 def test_frames_on_which_not_all_methods_are_evaluated_come_late_and_know_the_default_solver_alone() -> None:
     runs = plan(FULL, BOTH)
-    further = [run for run in runs if (run.source, run.frame) == ("synthetic", 1) and run.method != "sequence"]
+    further = [
+        run
+        for run in runs
+        if (run.source, run.frame) == ("synthetic", 1) and run.method not in ("sequence", "temporal")
+    ]
     assert set(further) == {Run("synthetic", domain, 1, "ours", e) for domain in DOMAINS for e in (1.0, 2.0, 3.0, 5.0)}
     first = min(map(runs.index, further))
-    assert all(run.method in ("ours", "calibrated", "sequence") for run in runs[first:])
+    assert all(run.method in ("ours", "calibrated", "sequence", "temporal") for run in runs[first:])
     calibrated = [run.frame for run in runs if (run.source, run.method) == ("real", "calibrated")]
     assert calibrated == [5, 0, 1] and Run("real", "regular", 0, "ours") not in runs
     assert not [run for run in plan(QUICK, BOTH[:1]) if run.frame == 1 and run.method == "ours"]

@@ -156,7 +156,11 @@ def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_fram
     assert [row[4] for row in occlusion] == ["70.0", "90.0", "96.0", "96.0"]
     assert [row[4] for row in camera] == ["80.0", "90.0", "97.0", "98.0"]
     assert [row[4] for row in calibration] == ["80.0", "90.0", "95.0", "98.0"]
-    assert sequence[0][2:4] == ["as measured", "5"] and sequence[0][-3:] == ["2", "92.0 ± 2.0", "95.0 ± 0.0"]
+    assert sequence[0][2:5] == ["as measured", "ours, sequence mode", "5"] and sequence[0][-3:] == [
+        "2",
+        "92.0 ± 2.0",
+        "95.0 ± 0.0",
+    ]
     assert not any(table(Measurements(_measurements())) for table in (occlusion_table, camera_table, sequence_table))
 
 
