@@ -22,7 +22,7 @@ from ..imaging.window import Window
 from ..model.scene import Scene
 from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..recording import MeanBackground
-from .inputs import pixel_weights, stacked_images
+from .inputs import pixel_weights, smoothed, stacked_images
 from .predictor import FramePredictor
 
 _PATCH = 3
@@ -40,8 +40,8 @@ _FOREIGN = 0.06
 _DECEPTIVE = 0.08
 """Share of a background with false positives from which the network gets images without that background [1]."""
 
-_NEUTRAL = 0.75, 0.55, 0.45
-"""What is put in the place of such a background, RGB: tissue without features."""
+_SMOOTH = 12.0
+"""Deviation of the blur of what is put in the place of such a background [px of the working image]."""
 
 _FITS, _SAMPLES = 4, 4
 """Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
@@ -109,11 +109,20 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
 
 
 def without_background(
-    images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"]
+    images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"], scale: float
 ) -> Float[Tensor, "cameras 3 h w"]:
-    """What has changed in images, before a background without features."""
-    neutral = torch.tensor(_NEUTRAL, device=images.device)[:, None, None]
-    return changed * images + (1.0 - changed) * neutral
+    """What has changed in images, before a blurred background without features.
+
+    The blurred background goes on smoothly where it is not known, so that what is there has no outline.
+
+    Args:
+        images: RGB in [0, 1].
+        changed: how surely each pixel differs from the background, in [0, 1].
+        scale: times the working size [1].
+    """
+    same = 1.0 - changed
+    mixed = smoothed(torch.cat([images * same, same], 1), _SMOOTH * scale)
+    return changed * images + same * mixed[:, :3] / mixed[:, 3:].clamp(min=1e-3)
 
 
 class Recording(Protocol):

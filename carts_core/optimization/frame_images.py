@@ -82,7 +82,7 @@ class FrameImages:
             background = backgrounds.at(scene, size, dehaze, predictor)
             changed = background.changed(stacked, size[0] / unit)
             if background.deceptive if replaced is None else replaced:
-                stacked, through = without_background(stacked, changed), torch.ones_like(through)
+                stacked, through = without_background(stacked, changed, size[0] / unit), torch.ones_like(through)
             else:
                 explained = background.seen * (1.0 - changed)
         return FrameImages(

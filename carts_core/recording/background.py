@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ..errors import SequenceError
 from ..model.scene import Scene, SceneState
@@ -22,6 +22,12 @@ _LARGEST_ERROR = 3
 
 _STAYS = 0.4
 """Share of an arm's silhouette that is covered throughout a recording, from which it hardly moves [1]."""
+
+_FEWEST = 5
+"""Views that a pixel has to be the median of, for their agreement to say something [1]."""
+
+_AGREE = 3.0, 4.0
+"""How many times the image's usual deviation views of the empty scene may differ by, and grey levels beside that."""
 
 _COVERED = 256
 _ROWS_AT_ONCE = 64
@@ -58,7 +64,8 @@ def background_of_recording(
 ) -> MeanBackground:
     """The mean background of a recording: see `estimate_background`.
 
-    A pixel of it is known where most of the views that it is the median of have the arms far away.
+    A pixel of it is known where most of the views that it is the median of have the arms far away, and where many
+    views agree: an arm that is really there, kinematics being off, moves, and is not lit twice the same.
 
     Args:
         scene: with that camera and others.
@@ -77,7 +84,9 @@ def background_of_recording(
     covers = [widen(silhouette) for silhouette in arms]
     clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
     used = len(arms) - np.sum(covers, axis=0)
-    estimate = estimate_background((image(place), cover) for place, cover in enumerate(covers))
+    estimate, deviation = _median((image(place), cover) for place, cover in enumerate(covers))
+    estimate = _filled(estimate, used == 0)
+    agree = (used >= _FEWEST) & (deviation <= _AGREE[0] * np.median(deviation[used > 0]) + _AGREE[1])
     always, usually = (used == 0).sum(), np.mean([cover.sum() for cover in covers])
     problem = None
     if always > _STAYS * usually:
@@ -86,7 +95,7 @@ def background_of_recording(
             "what looks like an arm in the background cannot be distinguished from one. A `background` image in the "
             "sequence file, taken without arms, helps."
         )
-    return MeanBackground(estimate, 2 * clear > used, problem)
+    return MeanBackground(estimate, (2 * clear > used) | agree, problem)
 
 
 def estimate_background(
@@ -102,6 +111,21 @@ def estimate_background(
     Raises:
         SequenceError: the whole image is covered in every view.
     """
+    views = list(views)
+    seen = sum((~cover).astype(int) for _, cover in views)
+    return _filled(_median(views)[0], seen == 0)
+
+
+def _median(
+    views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
+) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
+    """Median of every pixel over the views in which it is not covered, and the median deviation from it [grey levels].
+
+    Both are 0 where a pixel is covered in every view.
+
+    Raises:
+        SequenceError: the whole image is covered in every view.
+    """
     images, covers = (np.stack(arrays) for arrays in zip(*views, strict=True))
     seen = (~covers).sum(0)
     if not seen.any():
@@ -109,20 +133,33 @@ def estimate_background(
             "the background cannot be estimated: the arms, as measured, cover every pixel of every frame. "
             "Check T_camera_world and the units of the joints, or give a `background` image."
         )
-    result = np.empty(images.shape[1:], np.uint8)
-    # Covered values are sorted behind all others, so the median of the rest is in the middle of the first `seen`.
+    median, deviation = np.empty(images.shape[1:], np.uint8), np.empty(images.shape[1:3], np.float32)
     for top in range(0, images.shape[1], _ROWS_AT_ONCE):
         rows = slice(top, top + _ROWS_AT_ONCE)
-        values = np.where(covers[:, rows, :, None], np.uint16(_COVERED), images[:, rows])
-        values.sort(axis=0)
-        middle = np.maximum(seen[rows] - 1, 0)[None, :, :, None] / 2
-        low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]
-        high = np.take_along_axis(values, np.ceil(middle).astype(np.intp), 0)[0]
-        result[rows] = np.minimum((low + high + 1) // 2, 255).astype(np.uint8)
-    hole = seen == 0
+        covered, count = covers[:, rows, :, None], seen[rows]
+        middle = _middle(np.where(covered, _COVERED, images[:, rows].astype(np.int16)), count)
+        apart = np.abs(images[:, rows] - middle).max(-1)
+        median[rows] = middle
+        deviation[rows] = _middle(np.where(covered[..., 0], _COVERED, apart), count)
+    return median, deviation
+
+
+def _middle(values: Int[np.ndarray, "views ..."], count: Int[np.ndarray, "rows columns"]) -> Int[np.ndarray, "..."]:
+    """Median over the `count` smallest values at every pixel, rounded up; 0 where there are none."""
+    values = np.sort(values, axis=0)
+    middle = np.maximum(count - 1, 0).reshape(1, *count.shape, *(1,) * (values.ndim - 3)) / 2
+    low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]
+    high = np.take_along_axis(values, np.ceil(middle).astype(np.intp), 0)[0]
+    return np.where(count.reshape(middle.shape[1:]) > 0, (low + high + 1) // 2, 0)
+
+
+def _filled(
+    image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """`image` with what is never seen filled in from around it."""
     # Next to what is always covered the arm itself may show, where it is off by more than the margin.
     rim = widen(hole)
-    return fill(result, hole if rim.all() else rim)
+    return fill(image, hole if rim.all() else rim)
 
 
 def fill(

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SequenceError
-from carts_core.recording.background import estimate_background, fill, spread, widen
+from carts_core.recording import Sequence
+from carts_core.recording.background import background_of_recording, estimate_background, fill, spread, widen
+from carts_core.resources import sample_sequence
 
 RNG = np.random.default_rng(5)
 SCENE = RNG.integers(30, 220, (60, 80, 3)).astype(np.uint8)
@@ -69,3 +71,19 @@ def test_frames_are_spread_from_the_first_to_the_last():
     assert spread(1) == [0]
     chosen = spread(1000)
     assert (len(chosen), chosen[0], chosen[-1]) == (30, 0, 999)
+
+
+def test_where_arms_are_near_it_is_known_only_if_views_agree():
+    sequence = Sequence.open(sample_sequence())
+    camera = sequence.scene.cameras[0]
+    frames = range(len(sequence))
+    states = [sequence.scene.state({arm: rows[index] for arm, rows in sequence.measured.items()}) for index in frames]
+    shades = np.random.default_rng(0).integers(50, 130, len(states))
+
+    def view(place: int) -> np.ndarray:
+        image = np.full((camera.height, camera.width, 3), 90, np.uint8)
+        image[:, 400:] = shades[place]
+        return image
+
+    known = background_of_recording(sequence.scene, camera.name, states, view).known
+    assert known[:, :400].mean() > 0.99 and known[:, 400:].mean() < 0.9
