@@ -9,7 +9,7 @@ from typing import Any
 from carts_core.errors import CartsError
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult, StopReason
+from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
 from carts_core.recording import Sequence, spread
 from carts_core.settings.inference import Inference
 
@@ -102,9 +102,10 @@ class CalibrationJob:
                 optimizer.cancel()
         if last is None:
             return Progress("", 0.0, error="The calibration made no step.", ended=True)
-        if optimizer.stop_reason is StopReason.CANCELLED:
+        # Whoever stops it as it ends does not want its result either.
+        result = None if self._cancelled.is_set() else optimizer.result()
+        if result is None or self._cancelled.is_set():
             return Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
-        result = optimizer.result()
         return Progress("Calibrated", 1.0, result.scene, result, ended=True)
 
 

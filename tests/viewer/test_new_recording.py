@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +21,10 @@ from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.recording import Sequence
+from carts_core.recording.background import spread
 from carts_core.rendering import Renderer
+from carts_viewer.recording import calibrating
+from carts_viewer.recording.calibrating import CalibrationJob
 from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.site import Site
 
@@ -66,7 +70,10 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
 
 
 def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_place(
-    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
+    tiny_sequence: Callable[..., Path],
+    tmp_path: Path,
+    visit: Callable[[Path], Visitor],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = Sequence.open(tiny_sequence(frames=8, cameras=("left", "right"), width=320, height=240))
     assert made.truth is not None
@@ -94,6 +101,10 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Go on with day 3")
     visitor.reads("Click the shaft edge")
     click_what_is_asked_for(visitor, made.scene, true, 0.5)
+    # It does not end before it is stopped, however slow the browser is.
+    stopped, cancel = threading.Event(), CalibrationJob.cancel
+    monkeypatch.setattr(CalibrationJob, "cancel", lambda job: (cancel(job), stopped.set()))
+    monkeypatch.setattr(calibrating, "spread", lambda *known: (stopped.wait(60), spread(*known))[1])
     visitor.press("Calibrate")
     visitor.press("Stop")
     visitor.reads("Stopped; the calibration from your points is as it was.", 120)
