@@ -13,6 +13,7 @@ from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
 from .counterfactual import Backgrounds as Backgrounds
+from .evidence import Evidence as Evidence
 from .factors import Factor as Factor
 from .factors import Linearization as Linearization
 from .familiarity import Familiarity as Familiarity
@@ -33,7 +34,6 @@ from .sequence import SequenceOptimizer as SequenceOptimizer
 from .sequence_estimate import FrameEstimate as FrameEstimate
 from .sequence_estimate import Origin as Origin
 from .verdict import Assessment as Assessment
-from .verdict import Evidence as Evidence
 from .verdict import Verdict as Verdict
 from .verdict_of_many import SequenceAssessment as SequenceAssessment
 

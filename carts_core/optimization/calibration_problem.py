@@ -21,12 +21,12 @@ from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
 from .elimination import Eliminated, eliminate
 from .evaluation import Evaluation
+from .evidence import Evidence
 from .factors import Prior
 from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
 from .silhouettes import search_silhouettes
 from .variables import Variables
-from .verdict import Evidence
 
 Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]
 """Per frame: camera name -> pixels that show an occluder."""
@@ -204,7 +204,9 @@ class CalibrationProblem:
 
         deviation = self.variables.spread(stage.joints_deg, stage.frames_deg, distance)
         found, _ = search_silhouettes(distances, deviation, self.variables.clamp, stage)
-        self.prior = replace(self.prior, mean=found)
+        # What was searched is known no better than that; what was not, as before.
+        wide = torch.where(deviation > 0, deviation, self.prior.marginal_precision.rsqrt().to(deviation))
+        self.prior = replace(Prior.around_start(wide.to(found) ** -2), mean=found)
         return found
 
     def _some(self, count: int) -> list[_FramePart]:

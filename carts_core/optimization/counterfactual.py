@@ -37,6 +37,9 @@ _CONTRAST = 0.04, 0.10
 _FOREIGN = 0.06
 """Median difference from which a background is not that of the image [1]."""
 
+_UNTELLING = 0.15
+"""Where only such a difference counts in full, as in moving smoke, arms need not differ that much [1]."""
+
 _DECEPTIVE = 0.08
 """Share of a background with false positives from which the network gets images without that background [1]."""
 
@@ -45,6 +48,17 @@ _SMOOTH = 12.0
 
 _FITS, _SAMPLES = 4, 4
 """Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What differs between images and the empty background."""
+
+    surely: Float[Tensor, "cameras 1 h w"]
+    """How surely each pixel differs, in [0, 1]; 1 where the background is not known."""
+    telling: Float[Tensor, "cameras 1 h w"]
+    """How far a pixel that does not differ shows no arm, in [0, 1]: 0 where the background is not known, in images of
+    another scene, and where smoke differs as much as an arm would."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +77,8 @@ class Background:
         """Whether the network has many false positives there."""
         return float(self.seen.mean()) > _DECEPTIVE
 
-    def changed(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> Float[Tensor, "cameras 1 h w"]:
-        """How surely each pixel of images, RGB in [0, 1], differs from the background under their light, in [0, 1].
+    def compared(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> "Change":
+        """Images, RGB in [0, 1], beside the background under their light.
 
         What is not known to be background counts as different.
 
@@ -72,21 +86,26 @@ class Background:
             images: of the same cameras.
             scale: times the working size [1].
         """
-        found = [self._changed(background, image, scale) for background, image in zip(self.images, images, strict=True)]
-        return 1.0 - self.known * (1.0 - torch.stack(found))
+        found = [
+            self._compared(background, image, scale) for background, image in zip(self.images, images, strict=True)
+        ]
+        surely = torch.stack([changed for changed, _ in found])
+        telling = torch.tensor([clear for _, clear in found], device=surely.device)[:, None, None, None]
+        return Change(1.0 - self.known * (1.0 - surely), self.known * telling)
 
-    def _changed(self, background: Tensor, image: Tensor, scale: float) -> Float[Tensor, "1 h w"]:
-        """How surely each pixel differs from the background under the image's light, in [0, 1]."""
+    def _compared(self, background: Tensor, image: Tensor, scale: float) -> tuple[Float[Tensor, "1 h w"], bool]:
+        """How surely each pixel differs from the background under the image's light, in [0, 1], and whether an arm
+        would."""
         difference = (image - _lit_as(background, image)).abs().amax(0, keepdim=True)
         side = 2 * round(_PATCH * scale / 2) + 1
         difference = functional.avg_pool2d(difference, side, stride=1, padding=side // 2, count_include_pad=False)
         usual = float(difference.median())
         if usual > _FOREIGN:
-            return torch.ones_like(difference)
+            return torch.ones_like(difference), False
         deviation = 1.4826 * float((difference - usual).abs().median())
         low = max(usual + _NOISE[0] * deviation, _CONTRAST[0])
         width = max(_NOISE[1] * deviation, _CONTRAST[1] - _CONTRAST[0])
-        return ((difference - low) / width).clamp(0.0, 1.0)
+        return ((difference - low) / width).clamp(0.0, 1.0), low + width < _UNTELLING
 
 
 def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:

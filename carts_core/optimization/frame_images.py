@@ -11,7 +11,7 @@ from torch import Tensor
 from ..imaging.haze import certainty, dehazed, transmission
 from ..model.scene import Scene
 from ..rendering import Renderer
-from .counterfactual import Backgrounds, without_background
+from .counterfactual import Backgrounds, Change, without_background
 from .inputs import pixel_weights, stacked_images, working_size
 from .predictor import FramePredictor
 
@@ -32,15 +32,15 @@ class FrameImages:
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
     """Share of the predicted coverage that is predicted in the empty background, too [1]; None where not known."""
-    changed: Float[Tensor, "cameras 1 h w"] | None
-    """How surely each pixel differs from the empty background [1]; None where that is not known."""
+    change: Change | None
+    """What differs from the empty background; None where that is not known."""
     renderer: Renderer
     """Of the whole image."""
 
     @property
     def replaced(self) -> bool:
         """Whether the empty background was replaced in the images."""
-        return self.changed is not None and self.explained is None
+        return self.change is not None and self.explained is None
 
     @staticmethod
     def of(
@@ -77,14 +77,14 @@ class FrameImages:
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
         # Given masks know through haze, and before any background, where arms are.
         through = transmission(stacked, dehaze if predictor.knows_parts else 0.0)
-        explained, changed = None, None
+        explained, change = None, None
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, dehaze, predictor)
-            changed = background.changed(stacked, size[0] / unit)
+            change = background.compared(stacked, size[0] / unit)
             if background.deceptive if replaced is None else replaced:
-                stacked, through = without_background(stacked, changed, size[0] / unit), torch.ones_like(through)
+                stacked, through = without_background(stacked, change.surely, size[0] / unit), torch.ones_like(through)
             else:
-                explained = background.seen * (1.0 - changed)
+                explained = background.seen * (1.0 - change.surely)
         return FrameImages(
             scale=size[0] / unit,
             size=size,
@@ -93,6 +93,6 @@ class FrameImages:
             # Smoke misleads the network by more than noise does: docs/experiments.
             certainty=torch.ones_like(through) if predictor.masked else certainty(through).square(),
             explained=explained,
-            changed=changed,
+            change=change,
             renderer=Renderer(scene, width=size[0], height=size[1], device=predictor.device),
         )

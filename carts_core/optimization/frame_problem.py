@@ -19,6 +19,7 @@ from ..threads import total
 from .counterfactual import Backgrounds
 from .edge_alignment import align_edges
 from .evaluation import Evaluation
+from .evidence import Evidence, evidence
 from .factors import Factor, Linearization, Prior
 from .factors.edges import EdgeFactor
 from .factors.surface import SurfaceFactor
@@ -29,7 +30,6 @@ from .observation import Observation, observe
 from .predictor import FramePredictor
 from .silhouettes import SilhouetteComparison, search_silhouettes
 from .variables import Variables
-from .verdict import Evidence, evidence
 
 _SHOWN_BLUR = 1.6
 """Iterates that are displayed are compared under a blur of at most this [px of the working image]."""

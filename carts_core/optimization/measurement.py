@@ -16,13 +16,13 @@ from ..settings.stages import FINEST, Stage, first_observe
 from .counterfactual import Backgrounds
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation
+from .evidence import Evidence
 from .factors import Linearization, Prior
 from .fit import Fit
 from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
 from .stages import run_stages
 from .variables import Variables
-from .verdict import Evidence
 
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 

@@ -11,9 +11,9 @@ from ..files import OutputPath
 from ..fingerprints import fingerprint
 from ..recording import Frame
 from .error_model import Gaussian, Information
+from .evidence import Evidence
 from .measurement import FrameSolver, Measurement
 from .variables import Variables
-from .verdict import Evidence
 
 
 def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:

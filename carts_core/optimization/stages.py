@@ -153,8 +153,8 @@ def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
     fit.start_over(problem.start)
     yield from run_stages(stage.then, fit)
     after = problem.evidence_at(fit.offsets)
-    assert after.overlap_with_change is not None
-    better = after.overlap_with_change > before.overlap_with_change and assess(after).verdict is not Verdict.FAILED
+    overlap = after.overlap_with_change or 0.0
+    better = overlap > before.overlap_with_change and assess(after).verdict is not Verdict.FAILED
     if not better:
         problem.treat_background_otherwise()
         problem.observation = observation

@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from .verdict import Assessment, Evidence, Verdict, assess
+from .evidence import Evidence
+from .verdict import Assessment, Verdict, assess
 
 _MANY, _MOST = 0.1, 0.5
 """Share of frames not to be relied on from which a sequence is doubtful, and share of failed ones from which it has
@@ -62,12 +63,12 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
 
 
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
-    """The verdict on a calibration, from the mean evidence of its frames, with joints as measured.
+    """The verdict on a calibration, from the median evidence of its frames, with joints as measured.
 
     Args:
         frames: the evidence of each; at least one.
     """
-    found = assess(mean_evidence(frames))
+    found = assess(median_evidence(frames))
     if found.verdict is Verdict.GOOD:
         return replace(found, reason="The images support the calibration.")
     reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")
@@ -75,12 +76,12 @@ def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     return replace(found, reason=reason, remedy=found.remedy if found.nothing_there else _CALIBRATION_REMEDY)
 
 
-def mean_evidence(frames: Sequence[Evidence]) -> Evidence:
-    """Mean over frames; what one of them does not know is left out."""
+def median_evidence(frames: Sequence[Evidence]) -> Evidence:
+    """Median over frames, so that a few broken ones decide nothing; what one of them does not know is left out."""
     values = {}
     for field in fields(Evidence):
         known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
-        values[field.name] = float(np.mean(known)) if len(known) == len(frames) else None
+        values[field.name] = float(np.median(known)) if len(known) == len(frames) else None
     return Evidence(**values | {"masked": all(frame.masked for frame in frames)})
 
 

@@ -124,7 +124,7 @@ def test_noise_does_not_count_as_a_change() -> None:
     background = Background(room, torch.ones_like(room[:, :1]), torch.ones_like(room[:, :1]))
     noisy = room + 0.03 * torch.randn(room.shape, generator=generator)
     noisy[..., 40:60, 40:80] = 1 - room[..., 40:60, 40:80]
-    changed = background.changed(noisy, 1.0)[0, 0]
+    changed = background.compared(noisy, 1.0).surely[0, 0]
     assert changed[43:57, 43:77].mean() > 0.7
     changed[36:64, 36:84] = 0
     assert changed.mean() < 0.01

@@ -8,7 +8,7 @@ from evidence import CONVINCING
 from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_counts
 from carts_core.optimization import Assessment, StopReason, Verdict
 from carts_core.optimization.verdict import assess
-from carts_core.optimization.verdict_of_many import assess_calibration, assess_sequence, mean_evidence, worse_in
+from carts_core.optimization.verdict_of_many import assess_calibration, assess_sequence, median_evidence, worse_in
 
 RIGHT = replace(CONVINCING, changed=None, overlap_with_change=None)
 WRONG = replace(RIGHT, loss=0.2, residual=0.8, agreement=0.4, unconditioned=0.1, predicted=0.1)
@@ -41,12 +41,12 @@ def test_an_arm_that_has_left_the_image_makes_a_fit_fail_however_well_the_others
     assert found.verdict is Verdict.FAILED and "left the image" in found.reason and found.remedy
 
 
-def test_a_calibration_is_judged_by_the_mean_of_its_frames() -> None:
+def test_a_calibration_is_judged_by_the_median_of_its_frames() -> None:
     good, failed = assess_calibration([RIGHT] * 5), assess_calibration([WRONG] * 5)
     assert good.verdict is Verdict.GOOD and good.reason == "The images support the calibration."
     assert failed.verdict is Verdict.FAILED and "calibration" in failed.reason and "--observe masks" in failed.remedy
     assert "kept as it was" in (calibration_hint(failed, StopReason.FAILED) or "")
-    assert mean_evidence([RIGHT, WRONG]).agreement == pytest.approx(0.675)
+    assert median_evidence([RIGHT, WRONG]).agreement == pytest.approx(0.675)
 
 
 def test_what_is_worse_beyond_chance_is_named() -> None:

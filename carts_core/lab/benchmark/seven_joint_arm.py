@@ -26,8 +26,8 @@ _RADII = (0.075, 0.07, 0.065, 0.06, 0.055, 0.05, 0.04)
 _COLOURS = ((0.85, 0.85, 0.83), (0.9, 0.45, 0.1))
 _LIMIT = 2.9
 _SIZE, _FOCAL = (640, 480), 620.0
-_SAMPLES = 2
-"""Rays per pixel and axis."""
+_SAMPLES = 3
+"""Rays per pixel and axis; odd, so that a mask of pixels that are covered by half is neither wide nor narrow."""
 
 _HIDDEN = 0.25
 """Largest brightness that a side turned from the light has [1]."""

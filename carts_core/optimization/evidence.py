@@ -1,0 +1,171 @@
+"""What images say for and against a fit, without any truth; nothing here knows how it was made."""
+
+from dataclasses import asdict, dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..imaging.window import Window
+from ..model.scene import SceneState
+from ..model.surface import COVERAGE, SURFACE_CHANNELS
+from .failure import ArmEvidence, log_odds_of_failure
+from .frame_images import FrameImages
+from .losses import attention
+from .predictor import FramePredictor
+
+_MARGIN, _NEAR = 16, 8
+"""What the network is shown beyond the arms, and how far from them predictions count [px of the working image]."""
+
+_SHOWN, _TOLD = 2e-3, 0.3
+"""Share of the images from which an arm is judged by itself, and share of an arm where change has to tell something
+for its change to count [1]."""
+
+OUT_OF_VIEW = 5e-4
+"""Share of the images below which no arm is in view [1]."""
+
+
+@dataclass(frozen=True)
+class Evidence(ArmEvidence):
+    """What images say of a fit, without any truth: of the whole, and of the arm that speaks most against it."""
+
+    area: float
+    """Of the rendered arms, as a share of the images [1]."""
+    start_area: float
+    """The same at the start [1]."""
+    loss: float
+    """Of the surface factor: its cost per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
+    predicted: float
+    """Share of the rendered arms that the network predicts, conditioned on nothing [1]."""
+    changed: float | None
+    """Share of the rendered arms that differs from the mean background; None where that is not known [1]."""
+    still_in_view: float = 1.0
+    """Of the arms in view at the start, the smallest share that one of them still has of its area then [1]."""
+    elsewhere: float = 0.0
+    """Where an arm is out of view: what is predicted far from the others and differs from the mean background, as a
+    share of the images [1]."""
+    masked: bool = False
+    """Whether what is called predicted are given masks, which count in the whole image."""
+
+
+@torch.no_grad()
+def evidence(
+    images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
+) -> Evidence:
+    """What images say for and against a fit; runs the predictor twice.
+
+    Args:
+        images: of the cameras that take part.
+        start, end: before and after the optimization.
+        predictor: of surface maps.
+        loss: of the fit.
+    """
+    before, maps = (images.renderer.surface_maps(state) for state in (start, end))
+    covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
+    margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
+    window = Window.around(covered.sum(1), margin, predictor.stride, images.size)
+    conditioned, alone = (
+        predictor.predict(images.images, given, window)[:, COVERAGE].sum(1, keepdim=True)
+        for given in (maps, torch.zeros_like(maps))
+    )
+    rendered, weight = window.of(covered), window.of(images.weight)
+    change = None
+    if images.change is not None:
+        change = window.of(images.change.telling), window.of(images.change.surely)
+    found = [
+        _of_arm(here, rendered, conditioned, alone, change)
+        for here in _places(images, end, window, weight, whole=predictor.masked)
+    ]
+    worst = max(found, key=lambda arm: log_odds_of_failure(loss, arm, predictor.masked))
+    rendered = rendered * weight
+    return Evidence(
+        **asdict(worst),
+        area=float(covered.mean()),
+        start_area=float(was.mean()),
+        loss=loss,
+        predicted=_share(alone, rendered),
+        changed=_share_of_told(rendered, change),
+        still_in_view=_still_in_view(images, start, end),
+        elsewhere=_elsewhere(images, end, predictor),
+        masked=predictor.masked,
+    )
+
+
+def _elsewhere(images: FrameImages, state: SceneState, predictor: FramePredictor) -> float:
+    """See `Evidence.elsewhere`."""
+    labels = torch.from_numpy(images.renderer.segment(state)).to(images.weight.device)[:, None]
+    if predictor.masked or all(bool((labels == arm).any()) for arm in range(len(state.joint_positions))):
+        return 0.0
+    nothing = images.images.new_zeros(len(labels), SURFACE_CHANNELS, *labels.shape[-2:])
+    seen = predictor.predict(images.images, nothing, Window(0, 0, *images.size))[:, COVERAGE].sum(1, keepdim=True)
+    if images.change is not None:
+        seen = seen * images.change.surely
+    far = 1.0 - attention((labels >= 0).to(seen), round(_MARGIN * images.scale))
+    return float((seen * far * images.weight).mean())
+
+
+def _places(
+    images: FrameImages, state: SceneState, window: Window, weight: Float[Tensor, "cameras 1 h w"], *, whole: bool
+) -> list[Float[Tensor, "cameras 1 h w"]]:
+    """Weights of the pixels at and around each arm that is in view, as the only arm there; all pixels if `whole`."""
+    labels = window.of(torch.from_numpy(images.renderer.segment(state)).to(weight.device))[:, None]
+    arms = [labels == arm for arm in range(len(state.joint_positions))]
+    shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * images.renderer.width * images.renderer.height]
+    if whole or len(shown) < 2:
+        silhouette = (labels >= 0).to(weight)
+        return [weight if whole else _around(silhouette, images.scale) * weight]
+    anyone = labels >= 0
+    return [_around(arm.to(weight), images.scale) * weight * (arm | ~anyone) for arm in shown]
+
+
+def _around(silhouette: Float[Tensor, "cameras 1 h w"], scale: float) -> Float[Tensor, "cameras 1 h w"]:
+    return attention(silhouette, round(_NEAR * scale))
+
+
+def _of_arm(
+    here: Tensor, rendered: Tensor, conditioned: Tensor, alone: Tensor, change: tuple[Tensor, Tensor] | None
+) -> ArmEvidence:
+    """What maps say where `here` weighs them.
+
+    Args:
+        here: weight of each pixel.
+        rendered, conditioned, alone: coverage, as rendered and as predicted with and without a condition.
+        change: how far a pixel tells of change, and what has changed.
+    """
+    rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
+    overlap = None
+    if change is not None and _share(change[0], rendered) > _TOLD:
+        overlap = _overlap(rendered * change[0], change[1] * change[0] * here)
+    return ArmEvidence(
+        residual=float(2.0 * (rendered - conditioned).square().sum() / (rendered + conditioned).sum().clamp(min=1.0)),
+        agreement=_overlap(rendered, conditioned),
+        unconditioned=_overlap(rendered, alone),
+        overlap_with_change=overlap,
+    )
+
+
+def _share_of_told(rendered: Tensor, change: tuple[Tensor, Tensor] | None) -> float | None:
+    """See `Evidence.changed`."""
+    if change is None or _share(change[0], rendered) <= _TOLD:
+        return None
+    return _share(change[1], rendered * change[0])
+
+
+def _still_in_view(images: FrameImages, start: SceneState, end: SceneState) -> float:
+    """See `Evidence.still_in_view`."""
+    before, after = (images.renderer.segment(state) for state in (start, end))
+    shares = [1.0]
+    for arm in range(len(start.joint_positions)):
+        if (was := int((before == arm).sum())) >= OUT_OF_VIEW * before.size:
+            shares.append(int((after == arm).sum()) / was)
+    return min(shares)
+
+
+def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:
+    """Soft Dice of two maps in [0, 1]; 0 where both are empty."""
+    return float(2.0 * torch.minimum(one, other).sum() / (one.sum() + other.sum()).clamp(min=1e-6))
+
+
+def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1 h w"]) -> float:
+    """Share of a map in [0, 1] that another one has too; 0 of an empty one."""
+    return float((part * whole).sum() / whole.sum().clamp(min=1e-6))
