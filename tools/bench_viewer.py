@@ -1,4 +1,5 @@
-"""Measures the viewer: from a moved slider to its overlay, from a key to the next frame, and whether memory stays flat.
+"""Measures the viewer: from its start to the first overlay, from a moved slider to its overlay, from a key to the next
+frame, and whether memory stays flat.
 
     python -m tools.bench_viewer [SEQUENCE]
 
@@ -20,6 +21,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.scene_view import OVERLAY
+from tools.bench_start import print_starts
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
@@ -173,6 +175,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, nargs="*", default=())
     parser.add_argument("--iterations", type=int, default=_ITERATIONS)
     arguments = parser.parse_args()
+    print_starts(arguments.sequence)
     with (
         tempfile.TemporaryDirectory() as folder,
         ViewerApp.open(

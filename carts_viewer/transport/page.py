@@ -29,7 +29,7 @@ from carts_viewer.transport.index import TITLE, index_of_viser
 from carts_viewer.transport.media import MEDIA, Media
 from carts_viewer.transport.outgoing import queue_safely
 from carts_viewer.transport.tab_page import call
-from carts_viewer.transport.viser_private import element_id, on_sent, run_script, value_of
+from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, run_script, value_of
 
 OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -90,6 +90,7 @@ class Page:
         """Answers what is asked for below `/thumbnail/`; None while no recording is shown."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
+        list_icons_once()
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())

@@ -4,11 +4,31 @@ Nothing else reaches into them but `outgoing.py`, which replaces viser's message
 version, tests/viewer/test_transport.py names every attribute that is used, and the browser tests drive them all.
 """
 
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
+from zipfile import ZipFile
 
 import viser
+from viser import _gui_api, _gui_handles
+from viser._icons import ICONS_DIR
 from viser._messages import RunJavascriptMessage
+
+
+def list_icons_once() -> None:
+    """Have viser list its archive of icons once, and not again for every icon, which takes 0.5 s for a tab's page."""
+    _gui_api.svg_from_icon = _gui_handles.svg_from_icon = _icon  # pyright: ignore[reportPrivateImportUsage]
+
+
+@functools.cache
+def _icon(name: str) -> str:
+    """The SVG of an icon."""
+    return _icons().read(f"{name}.svg").decode()
+
+
+@functools.cache
+def _icons() -> ZipFile:
+    return ZipFile(ICONS_DIR / "tabler-icons.zip")
 
 
 def element_id(handle: Any) -> str:

@@ -14,6 +14,9 @@ PACKAGE = Path(carts_viewer.__file__).parent
 TOOLS = PACKAGE.parent / "tools"
 USED = {
     "transport/viser_private.py": {
+        "viser._gui_api",
+        "viser._gui_handles",
+        "viser._icons",
         "viser._messages",
         "_impl",
         "_gui_input_handle_from_uuid",
@@ -26,6 +29,7 @@ USED = {
 """Every private name of theirs, by the module that uses it. Look at each when viser is updated."""
 REPLACED = {
     "transport/outgoing.py": {"_infra.AsyncMessageBuffer"},
+    "transport/viser_private.py": {"_gui_api.svg_from_icon", "_gui_handles.svg_from_icon"},
     "transport/gate.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
