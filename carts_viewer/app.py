@@ -204,7 +204,7 @@ class ViewerApp:
         return self.state
 
     def _prepare(self) -> None:
-        """Load on the worker, with the page already up, what the first run will need."""
+        """Load on the worker, with the first picture already out, what the first run will need."""
         try:
             self._optimizers.prepare()
         finally:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
@@ -15,10 +15,12 @@ from carts_core.settings.inference import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.ending import EndRequest
 from carts_viewer.opening import opened_in_browser
-from carts_viewer.start.site import Site
 from carts_viewer.transport.guard import check_address
 
-Served = TypeVar("Served", ViewerApp, Site)
+if TYPE_CHECKING:
+    from carts_viewer.start.site import Site
+
+Served = TypeVar("Served", ViewerApp, "Site")
 
 
 def serve(
@@ -100,6 +102,8 @@ def serve_site(
     Raises:
         SystemExit: as `serve`.
     """
+    # A viewer of one sequence does without.
+    from carts_viewer.start.site import Site  # noqa: PLC0415
 
     def opened() -> Site:
         check_address(host, port)
@@ -154,7 +158,7 @@ def _serve(
             _close(served, lambda: incident(served))
 
 
-def _close(served: ViewerApp | Site, incident: Callable[[], str | None]) -> None:
+def _close(served: "ViewerApp | Site", incident: Callable[[], str | None]) -> None:
     """Save and close.
 
     Args:

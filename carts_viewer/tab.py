@@ -91,6 +91,11 @@ class Tab:
         self.view = None
         self.person.present = False
 
+    @property
+    def pictured(self) -> bool:
+        """Whether a page shows a picture here."""
+        return self.view is not None and self._pictured is not None
+
     def picture_wait(self) -> float | None:
         """How long until a picture should be sent [s]; None: there is nothing to send."""
         if self.view is None or self._pictured is self.controller.state:

@@ -35,7 +35,7 @@ class Worker:
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:
-        """Begin; `startup` runs on the worker's thread once the first picture is out."""
+        """Begin; `startup` runs on the worker's thread once a page has its first picture."""
         self._startup = startup
         self._thread.start()
 
@@ -67,10 +67,11 @@ class Worker:
 
     def _work(self) -> None:
         self._publish()
-        if self._startup is not None:
-            self._attempt(self._startup, *self._tabs)
         while not self._stop.is_set():
             self._round()
+            if self._startup is not None and any(tab.pictured for tab in self._tabs):
+                self._attempt(self._startup, *self._tabs)
+                self._startup = None
         # What somebody did just before the end is saved, too; nothing long is begun.
         for asked in self._queue.take(0.0):
             if not isinstance(asked.intent, _BEGINNING):

@@ -11,6 +11,7 @@ import tyro
 
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
+from ..imports import uncollected
 from ..stopping import exit_status, message, stopped_by_signals
 from .baseline import Baseline
 from .batch import Batch
@@ -79,7 +80,8 @@ def main(arguments: list[str] | None = None) -> None:
             if print_settings:
                 print(_settings_of(command))
                 return
-        from ..process import tune_process
+        with uncollected():
+            from ..process import tune_process
 
         log_to_stderr()
         tune_process(keep_memory=not isinstance(command, View))

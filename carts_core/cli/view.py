@@ -1,5 +1,6 @@
 """`carts view`: open a sequence in the browser."""
 
+import gc
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..errors import SettingsError
+from ..imports import uncollected
 from .selection import Network
 
 if TYPE_CHECKING:
@@ -36,10 +38,12 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from carts_viewer.serving import serve, serve_site
+        with uncollected():
+            from carts_viewer.serving import serve, serve_site
 
-        from ..batch.folder import is_batch
-
+            from ..batch.folder import is_batch
+        # Modules stay; every search for garbage among them would stop whatever moves on the page for 0.2 s.
+        gc.freeze()
         segmenter = self._segmenter()
         if self.sequence is None or is_batch(self.sequence):
             if self.project is not None:
