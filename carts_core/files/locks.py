@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,6 +11,9 @@ from ..errors import OutputError
 from .folders import explained, opened_folder
 from .paths import OutputPath, as_output
 from .writing import check_own
+
+_PAUSE = 0.1
+"""Between looks at a lock that others hold [s]."""
 
 _SIGNATURE = b"carts lock: "
 """What the content of a lock file of ours begins with."""
@@ -33,6 +37,20 @@ def locked_folder(path: OutputPath | Path) -> Iterator[None]:
     with explained(output), opened_folder(output, make=True) as folder:
         if not try_lock(folder):
             raise BusyError(f"another process is writing to {output}. Wait until it has ended, or name another output.")
+        yield
+
+
+@contextmanager
+def one_after_another(path: OutputPath | Path) -> Iterator[None]:
+    """Hold a folder, made if it is missing, after waiting for all others that hold it like this.
+
+    Raises:
+        OutputError: the folder cannot be made, or its file system knows no locks.
+    """
+    output = path if isinstance(path, OutputPath) else OutputPath(path)
+    with explained(output), opened_folder(output, make=True) as folder:
+        while not try_lock(folder):
+            time.sleep(_PAUSE)
         yield
 
 

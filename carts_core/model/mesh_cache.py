@@ -4,13 +4,15 @@ import hashlib
 import os
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import OutputError
 from ..files import output_path, output_stream
+from ..files.locks import one_after_another
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
 from .meshes import Decimation, LinkMesh
 
@@ -31,6 +33,15 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
         digest.update(str(file.name).encode())
         digest.update(read_bytes(file, MESH))
     return digest.hexdigest()[:32]
+
+
+@contextmanager
+def one_process() -> Iterator[None]:
+    """While others fill the cache, wait; where it cannot be written to or locked, nobody waits."""
+    with ExitStack() as stack:
+        with suppress(OutputError):
+            stack.enter_context(one_after_another(output_path(cache_dir())))
+        yield
 
 
 def read(key: str) -> tuple[tuple[LinkMesh, ...], Decimation] | None:

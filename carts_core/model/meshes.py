@@ -1,6 +1,8 @@
 """Link meshes as the renderer wants them: few triangles, smooth normals, one colour."""
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +21,8 @@ SHARP_EDGE = np.deg2rad(38.0)
 
 _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
 _OPAQUE = 0.99
+_AT_ONCE = 4
+"""Meshes that are decimated at the same time at most: each may take much memory."""
 _MOST_KEPT = 10
 """Times as many triangles as asked for are too many."""
 
@@ -172,20 +176,27 @@ def build_link_meshes(
     before = sum(len(mesh.faces) for _, mesh, _ in parts)
     if before > MOST_FACES:
         raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler ones.")
+    bound = tolerance if before > max_faces else None
     result, deviations = [], [0.0]
-    for number, (link, mesh, color) in enumerate(parts, start=1):
-        try:
-            vertices, normals, faces, deviation = simplify(mesh, tolerance if before > max_faces else None)
-        except DecimationError as error:
-            raise RobotError(
-                f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
-                "Export it again as a clean triangle mesh."
-            ) from error
-        progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")
-        deviations.append(deviation)
-        result.append(
-            LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
-        )
+    # Each mesh is decimated in a process of its own, so that threads are enough to use several cores.
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE), "decimation")
+    try:
+        simplified = [pool.submit(simplify, mesh, bound) for _, mesh, _ in parts]
+        for number, ((link, mesh, color), found) in enumerate(zip(parts, simplified, strict=True), start=1):
+            try:
+                vertices, normals, faces, deviation = found.result()
+            except DecimationError as error:
+                raise RobotError(
+                    f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
+                    "Export it again as a clean triangle mesh."
+                ) from error
+            progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")
+            deviations.append(deviation)
+            result.append(
+                LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
+            )
+    finally:
+        pool.shutdown(cancel_futures=True)
     after = sum(len(mesh.faces) for mesh in result)
     if after > _MOST_KEPT * max_faces:
         raise RobotError(

@@ -165,6 +165,23 @@ def _load_meshes(
     key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
     if (cached := mesh_cache.read(key)) is not None:
         return cached
+    # Of many processes that open a robot at once, as in a batch, one decimates, and the others have what it made.
+    with mesh_cache.one_process():
+        if (cached := mesh_cache.read(key)) is not None:
+            return cached
+        return _prepared_meshes(model, kinematics, urdf, link_names, limits, report, key)
+
+
+def _prepared_meshes(
+    model: yourdfpy.URDF,
+    kinematics: Kinematics,
+    urdf: Path,
+    link_names: tuple[str, ...],
+    limits: tuple[int, float | None],
+    report: Callable[[str], None],
+    key: str,
+) -> tuple[tuple[LinkMesh, ...], Decimation]:
+    """The same from the files, decimated and put into the cache under `key`."""
     report(f"{model.robot.name}: preparing meshes (once)")
     materials = {material.name: material for material in model.robot.materials}
     links = {link.name: link for link in model.robot.links}
