@@ -23,7 +23,7 @@ _LARGEST_ERROR = 3
 _STAYS = 0.4
 """Share of an arm's silhouette that is covered throughout a recording, from which it hardly moves [1]."""
 
-_FEWEST = 5
+_FEWEST = 3
 """Views that a pixel has to be the median of, for their agreement to say something [1]."""
 
 _AGREE = 3.0, 4.0
