@@ -34,6 +34,10 @@ class Progress:
     ended: bool = False
 
 
+STOPPED = Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+"""The end of a calibration whose result nobody wants."""
+
+
 class CalibrationJob:
     """One calibration on a thread of its own."""
 
@@ -66,8 +70,13 @@ class CalibrationJob:
         self._thread.start()
 
     def cancel(self) -> None:
-        """Stop soon; what was reached is reported."""
+        """Stop soon, without a result."""
         self._cancelled.set()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was stopped, be it as it ended."""
+        return self._cancelled.is_set()
 
     def join(self, timeout: float | None = None) -> None:
         """Wait until it has ended.
@@ -91,21 +100,22 @@ class CalibrationJob:
         self._report(Progress("Loading the networks", 0.0))
         extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
         self._report(Progress("Reading images", 0.0))
-        frames = [self._sequence.frame(index) for index in spread(len(self._sequence), FRAMES)]
+        frames = []
+        for index in spread(len(self._sequence), FRAMES):
+            if self.cancelled:
+                return STOPPED
+            frames.append(self._sequence.frame(index))
         optimizer = CalibrationOptimizer(self._scene, frames, extractor)
         last: CalibrationIterate | None = None
         for iterate in optimizer:
+            if self.cancelled:
+                return STOPPED
             last = iterate
             text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
             self._report(Progress(text, iterate.stage / iterate.stages, iterate.scene))
-            if self._cancelled.is_set():
-                optimizer.cancel()
         if last is None:
             return Progress("", 0.0, error="The calibration made no step.", ended=True)
-        # Whoever stops it as it ends does not want its result either.
-        result = None if self._cancelled.is_set() else optimizer.result()
-        if result is None or self._cancelled.is_set():
-            return Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+        result = optimizer.result()
         return Progress("Calibrated", 1.0, result.scene, result, ended=True)
 
 

@@ -9,7 +9,7 @@ from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.recording.importing.found import FoundRecording
 from carts_viewer.recording import plots
-from carts_viewer.recording.calibrating import FRAMES, CalibrationJob, Progress, as_plain
+from carts_viewer.recording.calibrating import FRAMES, STOPPED, CalibrationJob, Progress, as_plain
 from carts_viewer.recording.clicking import Clicking, Wish
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.panel import hand_eye_panel
@@ -100,6 +100,8 @@ class HandEyeStep:
         wish = self.wish(draft)
         if name == "cancel" and self._job is not None:
             self._job.cancel()
+            if self._running():
+                self._progress = Progress("Stopping …", 1.0)
         if self._running():
             return draft
         if name == "skip" and wish is not None:
@@ -209,6 +211,11 @@ class HandEyeStep:
         )
 
     def _proceed(self, progress: Progress) -> None:
+        if self._job is not None and self._job.cancelled:
+            if not progress.ended:
+                return
+            # It may have ended before it saw that it was stopped, and still not be wanted.
+            progress = STOPPED if progress.result is not None else progress
         self._progress = progress
         scene = progress.scene if progress.ended and progress.result is not None else None
         self._report(lambda draft: draft if scene is None else replace(draft, calibration=as_plain(scene)))

@@ -20,10 +20,9 @@ from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
+from carts_core.optimization import CalibrationOptimizer
 from carts_core.recording import Sequence
-from carts_core.recording.background import spread
 from carts_core.rendering import Renderer
-from carts_viewer.recording import calibrating
 from carts_viewer.recording.calibrating import CalibrationJob
 from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.site import Site
@@ -101,11 +100,16 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Go on with day 3")
     visitor.reads("Click the shaft edge")
     click_what_is_asked_for(visitor, made.scene, true, 0.5)
-    # It does not end before it is stopped, however slow the browser is.
-    stopped, cancel = threading.Event(), CalibrationJob.cancel
+    # After its first step it waits to be stopped, however slow the browser is.
+    stopped, cancel, step = threading.Event(), CalibrationJob.cancel, CalibrationOptimizer.step
     monkeypatch.setattr(CalibrationJob, "cancel", lambda job: (cancel(job), stopped.set()))
-    monkeypatch.setattr(calibrating, "spread", lambda *known: (stopped.wait(60), spread(*known))[1])
+    monkeypatch.setattr(
+        CalibrationOptimizer,
+        "step",
+        lambda optimizer: (bool(optimizer.history) and stopped.wait(120), step(optimizer))[1],
+    )
     visitor.press("Calibrate")
+    visitor.reads("Stage 1 of", 120)
     visitor.press("Stop")
     visitor.reads("Stopped; the calibration from your points is as it was.", 120)
     visitor.press("Save and open")

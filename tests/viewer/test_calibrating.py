@@ -1,0 +1,157 @@
+"""A calibration over the recording is stopped at any moment: then the calibration from the points stays."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from clicked_points import clicked
+from viewer_canvas import eventually
+from visitor import write_lab_files
+
+from carts_core.model.camera import HALF_PIXEL
+from carts_core.model.scene import Scene
+from carts_core.optimization import CalibrationOptimizer
+from carts_core.recording import Sequence
+from carts_viewer.recording import calibrating, hand_eye_step
+from carts_viewer.recording.calibrating import CalibrationJob
+from carts_viewer.recording.draft import Draft, DraftFile, Step
+from carts_viewer.recording.place import RecordingPlace
+from carts_viewer.start.site import Site
+
+CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
+
+
+class OneStep:
+    """Stands for `CalibrationOptimizer`: one step, and the scene as it is for a result."""
+
+    def __init__(self, scene: Scene, *_: object) -> None:
+        self._scene = scene
+
+    def __iter__(self) -> Iterator[SimpleNamespace]:
+        yield SimpleNamespace(stage=0, stages=1, index=0, loss=0.5, scene=self._scene)
+
+    def result(self) -> SimpleNamespace:
+        return SimpleNamespace(scene=self._scene)
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
+    """The jobs that are begun."""
+    begun: list[CalibrationJob] = []
+
+    def begin(*arguments, **options) -> CalibrationJob:
+        begun.append(CalibrationJob(*arguments, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(hand_eye_step, "CalibrationJob", begin)
+    monkeypatch.setattr(calibrating, "CalibrationOptimizer", OneStep)
+    return begun
+
+
+@pytest.fixture
+def site(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Iterator[Site]:
+    """At the last step of New recording, with the points clicked."""
+    made = Sequence.open(tiny_sequence(frames=3, width=320, height=240))
+    folder = tmp_path / "labs" / "day"
+    shutil.copytree(made.path.parent / "regular" / "left", folder / "left_images")
+    (camera,) = made.scene.cameras
+    K = camera.K - np.array([[0, 0, HALF_PIXEL], [0, 0, HALF_PIXEL], [0, 0, 0]])
+    write_lab_files(folder, range(1, 4), made.measured["PSM1"], [("left", (320, 240), K)])
+    points = clicked(made.scene, made.measured, range(3), ("left",), noise=0.5)
+    file = DraftFile()
+    file.write(Draft(Step.HAND_EYE, str(folder), "day", points=tuple(points)))
+    with Site([tmp_path / "labs"], port=0) as opened:
+        opened.post(lambda: opened.show_recording(file.key))
+        yield opened
+
+
+def place_of(site: Site) -> RecordingPlace:
+    site.wait()
+    assert isinstance(site.place, RecordingPlace) and 'role="alert"' not in site.document.content
+    return site.place
+
+
+def ended(site: Site, text: str) -> Draft:
+    """The draft once this is to be read."""
+    eventually(lambda: site.document.content, lambda content: text in content)
+    return place_of(site).draft
+
+
+def test_a_calibration_that_is_not_stopped_is_taken(site: Site, jobs: list[CalibrationJob]) -> None:
+    place = place_of(site)
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Calibrated").calibration is not None
+
+
+def test_a_calibration_that_had_ended_before_it_was_stopped_is_not_taken_either(
+    site: Site, jobs: list[CalibrationJob]
+) -> None:
+    place = place_of(site)
+
+    def stop_when_it_has_ended() -> None:
+        place.choose(*CALIBRATE)
+        jobs[-1].join(60)
+        place.choose(*STOP)
+
+    site.post(stop_when_it_has_ended)
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Calibrated").calibration is not None, "the next one is not stopped"
+
+
+@pytest.mark.parametrize("moment", ["images are read", "a step", "the result"])
+def test_a_calibration_is_stopped_at_any_moment(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    place = place_of(site)
+
+    def pressed() -> None:
+        site.post(lambda: place.choose(*STOP))
+        assert site.place is place
+        eventually(lambda: jobs[-1].cancelled, bool)
+
+    def spread(count: int, _: int) -> Iterator[int]:
+        yield 0
+        pressed()
+        yield from range(1, count)
+
+    class Stopped(OneStep):
+        def __iter__(self) -> Iterator[SimpleNamespace]:
+            assert moment != "images are read"
+            yield from super().__iter__()
+            if moment == "a step":
+                pressed()
+                yield from super().__iter__()
+
+        def result(self) -> SimpleNamespace:
+            assert moment == "the result"
+            pressed()
+            return super().result()
+
+    if moment == "images are read":
+        monkeypatch.setattr(calibrating, "spread", spread)
+    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Stopped)
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+
+
+def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch) -> None:
+    place = place_of(site)
+    shown: list[str] = []
+
+    class Slow(CalibrationOptimizer):
+        def step(self):
+            if self.history:
+                site.post(lambda: place.choose(*STOP))
+                site.wait()
+                shown.append(site.document.content)
+            return super().step()
+
+    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Slow)
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    (content,) = shown
+    assert "Stopping …" in content
