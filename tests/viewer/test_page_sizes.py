@@ -46,6 +46,22 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
     assert found == {name: [] for name in TABS}
 
 
+@pytest.mark.parametrize("window", [(1280, 800), (390, 844)])
+def test_the_curves_of_a_run_leave_the_panel_as_wide_as_it_is(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
+) -> None:
+    app = open_viewer()
+    tab = open_tab(app, window)
+    if window[0] < 600:
+        tab.page.get_by_role("button", name="All controls").click()
+        tab.page.get_by_text("Optimize · Review").click()
+    tab.place_in_viewer.put(intents.Step())
+    app.wait_until_shown(120)
+    tab.page.locator(".uplot").first.wait_for(state="visible")
+    tab.page.wait_for_timeout(1000)
+    assert cut_off(tab.page) == []
+
+
 def test_what_is_cut_off_is_found(open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
     tab = open_tab(open_viewer())
     tab.page.add_style_tag(content=".mantine-Slider-root + .mantine-NumberInput-root { width: 1.2rem !important }")
