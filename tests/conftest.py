@@ -46,6 +46,14 @@ def _tuned_as_the_command() -> None:
     tune_process(keep_memory=False)
 
 
+@pytest.fixture(autouse=True)
+def _threads_as_before() -> Iterator[None]:
+    """A test that trains, or compares numbers of threads, leaves none that others would wait for."""
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """Reference data and third-party robots beside the checkout; tests that need them are skipped without them."""

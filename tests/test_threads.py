@@ -1,6 +1,6 @@
 """The same results, to the last bit, however many threads torch has."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,6 @@ from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_core.settings import SurfaceSolver
 from carts_core.threads import one_thread, total
-
-
-@pytest.fixture(autouse=True)
-def _threads_as_before() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 def corrected(sequence: Sequence, index: int, threads: int, iterations: int) -> dict[str, np.ndarray]:

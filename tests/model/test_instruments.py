@@ -13,6 +13,7 @@ from carts_core.model.dvrk_model import dvrk_urdf
 from carts_core.model.instruments import INSTRUMENTS, builtin_urdf
 from carts_core.model.instruments.builtin import instrument_of
 from carts_core.model.keypoints import keypoints
+from carts_core.model.mesh_files import MOST_FACES
 from carts_core.model.meshes import is_closed
 from carts_core.model.parts import PARTS, link_parts
 from carts_core.model.psm_kinematics import forward
@@ -139,7 +140,7 @@ def test_a_portrait_shows_the_tip_whole_before_its_backdrop() -> None:
     assert backdrop[-4:].all()
 
 
-SLOW = pytest.mark.slow  # Real meshes are large, and are decimated first.
+SLOW = pytest.mark.slow
 
 
 @pytest.mark.skipif(not DVRK_MODEL.is_dir(), reason="dvrk_model is not beside this checkout")
@@ -157,7 +158,8 @@ SLOW = pytest.mark.slow  # Real meshes are large, and are decimated first.
 def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, tmp_path: Path) -> None:
     urdf = tmp_path / "real.urdf"
     urdf.write_text(dvrk_urdf(DVRK_MODEL, number, tmp_path))
-    ours, real = Robot.load(f"builtin:{name}"), Robot.load(urdf)
+    # Decimating a real one would take a minute.
+    ours, real = Robot.load(f"builtin:{name}"), Robot.load(urdf, max_faces=MOST_FACES)
     rng = np.random.default_rng(1)
     overlaps = []
     for _ in range(8):

@@ -1,4 +1,4 @@
-"""Paths that are relative mean the same at every later moment, with nothing prepared in a cache."""
+"""Paths that are relative mean the same at every later moment, the shipped robot's with nothing prepared in a cache."""
 
 import shutil
 from collections.abc import Callable
@@ -46,7 +46,6 @@ def test_a_sequence_by_a_relative_path_has_its_images_after_the_working_director
     assert sequence.path == path and sequence.scene.arms[0].robot.urdf == robot_folder / "psm_lnd.urdf"
 
 
-@pytest.mark.usefixtures("cold_cache")
 def test_the_described_real_frames_open_by_a_relative_path(shared_dir: Path, monkeypatch: MonkeyPatch):
     monkeypatch.chdir(Path(__file__).parents[2])
     sequence = Sequence.open("tests/sequences/dvrk_stereo.toml")

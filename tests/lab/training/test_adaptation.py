@@ -47,13 +47,6 @@ elbow = "elbow"
 """
 
 
-@pytest.fixture(autouse=True)
-def _threads_as_before():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture
 def far_away(tmp_path: Path) -> Path:
     """A recording of a robot that is 1.5 m away."""

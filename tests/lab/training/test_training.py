@@ -39,13 +39,6 @@ def small_config(**changes) -> TrainingConfig:
     return TrainingConfig(**({**SMALL, "steps": 30, "architecture": architecture, "images": images} | changes))
 
 
-@pytest.fixture(autouse=True)
-def _threads_as_before():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 def test_a_run_learns_and_leaves_weights_a_checkpoint_and_a_report(tmp_path: Path):
     events: list[TrainingProgress] = []
     result = train(small_config(), tmp_path, events.append)
