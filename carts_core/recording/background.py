@@ -111,9 +111,8 @@ def estimate_background(
     Raises:
         SequenceError: the whole image is covered in every view.
     """
-    views = list(views)
-    seen = sum((~cover).astype(int) for _, cover in views)
-    return _filled(_median(views)[0], seen == 0)
+    known = list(views)
+    return _filled(_median(known)[0], np.all([cover for _, cover in known], axis=0))
 
 
 def _median(
