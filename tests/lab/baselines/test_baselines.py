@@ -47,14 +47,15 @@ class _Frames(TrainingFrames):
 
 @pytest.mark.parametrize("name", get_args(BaselineName))
 def test_each_network_learns_for_some_steps_and_is_the_same_after_it_was_written_and_read(
-    name: BaselineName, tmp_path: Path
+    name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    training = BaselineTraining(augmentation="none", frames=104, steps=3, batch_size=2, warmup=0, threads=1)
+    monkeypatch.setattr("carts_core.lab.baselines.training.VALIDATION", 4)
+    training = BaselineTraining(augmentation="none", frames=104, steps=2, batch_size=2, warmup=0, threads=1)
     lines: list[str] = []
     before = Baseline(_smallest(name))
-    result = train_baseline(_smallest(name), training, _Frames(104), tmp_path / "run", lines.append)
+    result = train_baseline(_smallest(name), training, _Frames(8), tmp_path / "run", lines.append)
     read = read_baseline(result.weights)
-    assert read.row == f"{name}_none" and read.training["steps"] == result.steps == 3
+    assert read.row == f"{name}_none" and read.training["steps"] == result.steps == 2
     assert read.network.settings == _smallest(name)
     changed = [
         key for key, value in read.network.state_dict().items() if not torch.equal(value, before.state_dict()[key])
