@@ -3,10 +3,9 @@
 import json
 from collections.abc import Sequence as Frames
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
 from ..console import in_markdown
 from ..files import OutputPath, output_stream, write_text
@@ -15,9 +14,8 @@ from ..recording import Sequence, calibrated_sequence_file
 from ..wording import counted
 from .calibration import FrameResidual, calibration_json, mean_dice, moved_frames, remark
 
-matplotlib.use("Agg")
-# Names of frames and cameras are no formulas.
-matplotlib.rcParams["text.parse_math"] = False
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_calibration(
@@ -46,9 +44,21 @@ def _cameras(residuals: Frames[FrameResidual]) -> list[str]:
     return list(dict.fromkeys(camera for residual in residuals for camera in residual.dice_before))
 
 
-def _frames_figure(residuals: Frames[FrameResidual]) -> Figure:
+def _figure(width: float, height: float) -> "Figure":
+    """An empty figure of a size [inch]."""
+    # They take 0.3 s, and nothing else of what is imported with this module draws.
+    import matplotlib  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    matplotlib.use("Agg")
+    # Names of frames and cameras are no formulas.
+    matplotlib.rcParams["text.parse_math"] = False
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _frames_figure(residuals: Frames[FrameResidual]) -> "Figure":
     cameras = _cameras(residuals)
-    figure = Figure(figsize=(7.5, 2.3 * (1 + len(cameras))), layout="constrained")
+    figure = _figure(7.5, 2.3 * (1 + len(cameras)))
     axes = figure.subplots(1 + len(cameras), 1, squeeze=False, sharex=True)[:, 0]
     names = [residual.frame for residual in residuals]
     for label in ("before", "after"):
@@ -66,9 +76,9 @@ def _frames_figure(residuals: Frames[FrameResidual]) -> Figure:
     return figure
 
 
-def _unknowns_figure(result: CalibrationResult) -> Figure:
+def _unknowns_figure(result: CalibrationResult) -> "Figure":
     units = list(dict.fromkeys(unknown.unit for unknown in result.unknowns))
-    figure = Figure(figsize=(3.6 * len(units), 0.8 + 0.3 * len(result.unknowns)), layout="constrained")
+    figure = _figure(3.6 * len(units), 0.8 + 0.3 * len(result.unknowns))
     for panel, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
         shown = [unknown for unknown in result.unknowns if unknown.unit == unit][::-1]
         panel.errorbar(

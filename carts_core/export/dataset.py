@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
-from scipy.ndimage import distance_transform_edt
 
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, unique_file_names, write_bytes
@@ -210,8 +209,17 @@ def labelled(
             f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view there, so it is not "
             "known whose they are. Correct the joint positions of this frame, clear its mask, or leave it out."
         )
-    rows, columns = np.asarray(distance_transform_edt(rendered < 0, return_distances=False, return_indices=True))
+    rows, columns = _nearest(rendered >= 0)
     return np.where(mask, rendered[rows, columns], -1)
+
+
+def _nearest(
+    pixels: Bool[np.ndarray, "height width"],
+) -> Int[np.ndarray, "2 height width"]:
+    """Row and column of the nearest of these pixels, for every pixel."""
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - takes 0.2 s, and the viewer starts without
+
+    return np.asarray(distance_transform_edt(~pixels, return_distances=False, return_indices=True))
 
 
 def painted_links(
@@ -243,7 +251,7 @@ def painted_links(
         own = np.isin(rendered, np.flatnonzero(classes == number))
         pixels = painted == number
         if own.any():
-            rows, columns = np.asarray(distance_transform_edt(~own, return_distances=False, return_indices=True))
+            rows, columns = _nearest(own)
             found[pixels] = rendered[rows, columns][pixels]
         else:
             found[pixels] = np.flatnonzero(classes == number)[0]

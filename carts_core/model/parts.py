@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from .robot import SLENDER, Robot
+from .meshes import SLENDER
+from .robot import Robot
 from .scene import Arm
 
 PARTS = ("shaft", "wrist", "jaws")
