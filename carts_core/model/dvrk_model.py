@@ -16,7 +16,7 @@ from ..extras import needs_extra
 from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, read_text
 from ..recording.importing.yaml_files import parse_yaml
 from ..wording import counted
-from .mesh_paths import mesh_path
+from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI
 from .psm_urdf import carrier
 from .xacro_guard import guarded_xacro

@@ -1,17 +1,25 @@
-"""Forward kinematics of a URDF's tree, differentiable and batched."""
+"""Forward kinematics of a URDF tree, differentiable and batched (pytorch-kinematics)."""
 
+import copy
+import math
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import pytorch_kinematics
 import torch
+import yourdfpy
 from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import RobotError
 from ..wording import listed, shown
-from .urdf import Joint, Urdf
 
+NO_LIMIT = 1e3
+"""A larger joint limit [rad], [m] means none."""
+_JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
+"""What of a joint moves links; limits and dynamics have required attributes that many URDFs leave out."""
 ROUND_OFF = 1e-5
 """Angles this close [rad] to a multiple of 90 degrees mean that multiple: URDF exporters print 1.5708 for pi/2."""
 
@@ -29,57 +37,67 @@ def exact_right_angles(root: Element) -> None:
             origin.set("rpy", " ".join(repr(float(angle)) for angle in angles))
 
 
+def _skeleton(urdf_text: str) -> str:
+    """The URDF's links and joints alone: what the kinematics parser needs, and nothing that it warns about."""
+    root = ElementTree.fromstring(urdf_text)
+    for child in list(root):
+        if child.tag not in ("link", "joint"):
+            root.remove(child)
+        elif child.tag == "link":
+            for part in list(child):
+                child.remove(part)
+        else:
+            for part in list(child):
+                if part.tag not in _JOINT_PARTS:
+                    child.remove(part)
+            if child.find("axis") is None:
+                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # as URDF has it; the parser takes z
+    return ElementTree.tostring(root, encoding="unicode")
+
+
 class Kinematics:
     """Transforms of a robot's links from its independent joint positions.
 
-    A joint's own motion is `I + s A + c B` with constant matrices: where it turns by q about the axis with the
-    cross-product matrix K, `s = sin q`, `c = 1 - cos q`, `A = K` and `B = K K` (Rodrigues' formula); where it slides by
-    q along its axis, `s = q` and `A` has the axis in its last column.
-
     Args:
-        model: the parsed URDF, with exact right angles.
+        model: the parsed URDF.
+        urdf_text: its text, with exact right angles.
         base_link: the frame that transforms are given in; it must not move with any joint.
         source: file named in errors.
     """
 
-    def __init__(self, model: Urdf, base_link: str | None, source: Path) -> None:
-        free = model.free_joints
-        self.joint_names: tuple[str, ...] = tuple(joint.name for joint in free)
-        self.joint_types: tuple[str, ...] = tuple("revolute" if joint.turns else "prismatic" for joint in free)
+    def __init__(self, model: yourdfpy.URDF, urdf_text: str, base_link: str | None, source: Path) -> None:
+        self.joint_names: tuple[str, ...] = tuple(model.actuated_joint_names)
+        joints = model.joint_map
+        self.joint_types: tuple[str, ...] = tuple(
+            "prismatic" if joints[name].type == "prismatic" else "revolute" for name in self.joint_names
+        )
         self.joint_limits: Float[Tensor, "dofs 2"] = torch.tensor(
-            [joint.limits for joint in free], dtype=torch.float64
+            [_limits(joints[name]) for name in self.joint_names], dtype=torch.float64
         ).reshape(-1, 2)
-        links = [link.name for link in model.links]
-        self.base_link = base_link or model.root
+        links = list(model.link_map)
+        children = {joint.child for joint in joints.values()}
+        self.base_link = base_link or next(link for link in links if link not in children)
         if self.base_link not in links:
             raise RobotError(f"{source}: no link is called {self.base_link!r}. The links are: {', '.join(links)}.")
-        joints = model.downwards()
-        self._row = {name: row for row, name in enumerate([model.root, *(joint.child for joint in joints)])}
-        self._parents = [self._row[joint.parent] for joint in joints]
-        constants = [*_mimic_matrix(joints, self.joint_names), *_motions(joints)]
-        constants.append(np.array([joint.turns for joint in joints], bool))
-        self._constants = {torch.device("cpu"): tuple(torch.from_numpy(constant) for constant in constants)}
+        chain = pytorch_kinematics.build_chain_from_urdf(_skeleton(urdf_text)).to(dtype=torch.float64)
+        self._chains = {torch.device("cpu"): chain}
+        self._frame_index = {name: int(chain.get_frame_indices(name)[0]) for name in links}
+        self._expand, self._offset = _mimic_matrix(model, chain.get_joint_parameter_names())
         self._T_base_root = self._base_transform(source)
 
     def _base_transform(self, source: Path) -> Tensor:
         probes = torch.stack([torch.zeros(len(self.joint_names)), torch.full((len(self.joint_names),), 0.1)]).double()
-        Ts_root_base = self._Ts_root(probes)[self._row[self.base_link]]
+        Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
         if not torch.allclose(Ts_root_base[0], Ts_root_base[1]):
             raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint; name one that does not.")
         return torch.linalg.inv(Ts_root_base[0])
 
     def _Ts_root(self, joint_positions: Float[Tensor, "n dofs"]) -> Float[Tensor, "links n 4 4"]:
         device = joint_positions.device
-        if device not in self._constants:
-            self._constants[device] = tuple(value.to(device) for value in self._constants[torch.device("cpu")])
-        expand, offset, T_parent_joint, A, B, turns = self._constants[device]
-        q = joint_positions @ expand.T + offset
-        s, c = torch.where(turns, q.sin(), q), torch.where(turns, 1.0 - q.cos(), 0.0)
-        Ts_parent_child = T_parent_joint + s[..., None, None] * A + c[..., None, None] * B
-        Ts = [torch.eye(4, dtype=q.dtype, device=device).expand(len(q), 4, 4)]
-        for parent, T in zip(self._parents, Ts_parent_child.unbind(1), strict=True):
-            Ts.append(Ts[parent] @ T)
-        return torch.stack(Ts)
+        if device not in self._chains:
+            self._chains[device] = copy.deepcopy(self._chains[torch.device("cpu")]).to(device=device)
+        expand, offset = self._expand.to(device), self._offset.to(device)
+        return self._chains[device].forward_kinematics_tensor(joint_positions @ expand.T + offset)
 
     def __call__(
         self, joint_positions: Float[Tensor, "*batch dofs"], link_names: tuple[str, ...]
@@ -96,40 +114,38 @@ class Kinematics:
                 f"{', '.join(self.joint_names)}."
             )
         for name in link_names:
-            if name not in self._row:
-                raise RobotError(f"the robot has no link {shown(name)}. Its links are: {listed(self._row)}.")
+            if name not in self._frame_index:
+                raise RobotError(f"the robot has no link {shown(name)}. Its links are: {listed(self._frame_index)}.")
         batch = joint_positions.shape[:-1]
         Ts_root = self._Ts_root(joint_positions.reshape(-1, dofs).double())
-        index = torch.tensor([self._row[name] for name in link_names], device=joint_positions.device)
+        index = torch.tensor([self._frame_index[name] for name in link_names], device=joint_positions.device)
         Ts_base = self._T_base_root.to(joint_positions.device) @ Ts_root[index]
         return Ts_base.transpose(0, 1).reshape(*batch, len(link_names), 4, 4).to(joint_positions.dtype)
 
 
-def _motions(joints: list[Joint]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_parent_joint, T_parent_joint A and T_parent_joint B of every joint [joints, 4, 4]."""
-    T, A, B = (np.zeros((len(joints), 4, 4)) for _ in range(3))
-    for row, joint in enumerate(joints):
-        T[row] = joint.T_parent_joint
-        if joint.turns:
-            K = np.zeros((4, 4))
-            K[:3, :3] = np.cross(np.eye(3), joint.axis)
-            A[row], B[row] = T[row] @ K, T[row] @ K @ K
-        elif joint.moves:
-            A[row, :3, 3] = T[row, :3, :3] @ joint.axis
-    return T, A, B
+def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
+    limit = joint.limit
+    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
+        return -np.inf, np.inf
+    # Some robots write a huge number for no limit.
+    lower, upper = (
+        math.copysign(math.inf, value) if abs(value) > NO_LIMIT else float(value)
+        for value in (limit.lower, limit.upper)
+    )
+    return lower, upper
 
 
-def _mimic_matrix(joints: list[Joint], independent: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix [joints, dofs] and offset [joints] that turn independent joint positions into all of them."""
-    named = {joint.name: joint for joint in joints}
-    expand, offset = np.zeros((len(joints), len(independent))), np.zeros(len(joints))
-    for row, joint in enumerate(joints):
-        if not joint.moves:
-            continue
-        factor, followed = 1.0, joint
-        while (mimic := followed.mimic) is not None:
-            offset[row] += factor * mimic.offset
-            factor *= mimic.factor
-            followed = named[mimic.joint]
-        expand[row, independent.index(followed.name)] = factor
+def _mimic_matrix(model: yourdfpy.URDF, parameters: list[str]) -> tuple[Tensor, Tensor]:
+    """Matrix and offset that turn independent joint positions into all joint positions of the chain."""
+    independent = list(model.actuated_joint_names)
+    expand = torch.zeros(len(parameters), len(independent), dtype=torch.float64)
+    offset = torch.zeros(len(parameters), dtype=torch.float64)
+    for row, name in enumerate(parameters):
+        factor, shift, joint = 1.0, 0.0, model.joint_map[name]
+        while joint.mimic is not None:
+            shift += factor * (joint.mimic.offset or 0.0)
+            factor *= joint.mimic.multiplier if joint.mimic.multiplier is not None else 1.0
+            joint = model.joint_map[joint.mimic.joint]
+        expand[row, independent.index(joint.name)] = factor
+        offset[row] = shift
     return expand, offset

@@ -1,12 +1,30 @@
 """Link meshes as the renderer wants them: few triangles, smooth normals, one colour."""
 
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import trimesh
+import yourdfpy
 from jaxtyping import Float, Int
 
-SLENDER = 0.1
-"""Largest width of a shaft, in lengths [1]."""
+from ..errors import RobotError
+from ..wording import shown
+from .decimation import DecimationError, decimated
+from .mesh_files import MOST_FACES, check_mesh, mesh_path, read_mesh
+
+SHARP_EDGE = np.deg2rad(38.0)
+"""Faces that meet at a larger angle [rad] do not share a smooth normal."""
+
+_DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
+_OPAQUE = 0.99
+_AT_ONCE = 4
+"""Meshes that are decimated at the same time at most: each may take much memory."""
+_MOST_KEPT = 10
+"""Times as many triangles as asked for are too many."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +39,101 @@ class LinkMesh:
     faces: Int[np.ndarray, "F 3"]
     color: Float[np.ndarray, "3"]
     """Linear RGB in [0, 1]."""
-    closed: bool
-    """Whether each part of it encloses a volume, with its normals outwards."""
+
+
+def is_closed(mesh: LinkMesh) -> bool:
+    """Whether each part of a mesh encloses a volume, with its normals outwards.
+
+    Copies of a vertex at sharp edges count as one.
+    """
+    joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    joined.merge_vertices(merge_norm=True, digits_vertex=7)
+    if not (joined.is_watertight and joined.is_winding_consistent):
+        return False
+    parts = trimesh.graph.connected_component_labels(joined.face_adjacency, node_count=len(joined.faces))
+    a, b, c = joined.triangles.swapaxes(0, 1)
+    volumes = np.bincount(parts, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
+    return bool((volumes > 0).all())
+
+
+def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
+    """Meshes of one URDF visual in its link's frame, each with its colour.
+
+    Translucent visuals are markers for people (a ball at the remote centre, say) and are left out.
+
+    Raises:
+        RobotError: a mesh file is missing or cannot be read.
+    """
+    color, opacity = _urdf_color(visual, materials)
+    if opacity < _OPAQUE or visual.geometry is None:
+        return []
+    parts: list[tuple[trimesh.Trimesh, np.ndarray]] = []
+    for mesh in _geometry(visual.geometry, folder):
+        if visual.origin is not None:
+            mesh.apply_transform(visual.origin)
+            check_mesh(mesh, "a mesh at its <origin>")
+        parts.append((mesh, color if color is not None else _mesh_color(mesh)))
+    return parts
+
+
+def _urdf_color(visual: yourdfpy.Visual, materials: dict) -> tuple[np.ndarray | None, float]:
+    material = visual.material
+    if material is not None and material.color is None and material.name in materials:
+        material = materials[material.name]
+    if material is None or material.color is None:
+        return None, 1.0
+    rgba = np.asarray(material.color.rgba, dtype=float)
+    return rgba[:3], float(rgba[3])
+
+
+def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[trimesh.Trimesh]:
+    if geometry.box is not None:
+        return [trimesh.creation.box(extents=geometry.box.size)]
+    if geometry.cylinder is not None:
+        return [trimesh.creation.cylinder(radius=geometry.cylinder.radius, height=geometry.cylinder.length)]
+    if geometry.sphere is not None:
+        return [trimesh.creation.icosphere(radius=geometry.sphere.radius)]
+    if geometry.mesh is None:
+        return []
+    scale = np.ones(3) if geometry.mesh.scale is None else np.ones(3) * np.asarray(geometry.mesh.scale)
+    named = f"the URDF in {folder} names it as {shown(geometry.mesh.filename)}"
+    return read_mesh(mesh_path(folder, geometry.mesh.filename), scale, named)
+
+
+def _mesh_color(mesh: trimesh.Trimesh) -> np.ndarray:
+    visual = mesh.visual
+    material = getattr(visual, "material", None)
+    rgba = getattr(material, "main_color", None) if material is not None else getattr(visual, "main_color", None)
+    return _DEFAULT_COLOR if rgba is None else np.asarray(rgba, dtype=float)[:3] / 255.0
+
+
+def simplify(
+    mesh: trimesh.Trimesh, tolerance: float | None
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], float]:
+    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and what it deviates by [m].
+
+    Args:
+        mesh: [m]
+        tolerance: how far its surface may move [m]; None leaves it as it is.
+
+    Raises:
+        DecimationError: the mesh is degenerate, or so irregular that it takes too long.
+    """
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(digits_vertex=7)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    deviation = 0.0
+    if tolerance is not None and len(mesh.faces):
+        vertices, faces, deviation = decimated(np.array(mesh.vertices), np.array(mesh.faces), tolerance)
+        mesh = trimesh.Trimesh(vertices, faces)
+        mesh.update_faces(mesh.nondegenerate_faces())
+    if not len(mesh.faces):
+        raise DecimationError("all its triangles are without area")
+    smooth = trimesh.graph.smooth_shade(mesh, angle=SHARP_EDGE)
+    normals = np.array(smooth.vertex_normals)
+    if not np.isfinite(normals).all():
+        raise DecimationError("its normals are not finite")
+    return np.array(smooth.vertices), normals, np.array(smooth.faces), deviation
 
 
 @dataclass(frozen=True)
@@ -43,3 +154,53 @@ class Decimation:
             f"{self.after} of {self.before} triangles are kept, which moves no surface by more than "
             f"{self.deviation * 1e3:.2f} mm"
         )
+
+
+def build_link_meshes(
+    parts: Sequence[tuple[int, trimesh.Trimesh, np.ndarray]],
+    max_faces: int,
+    tolerance: float,
+    progress: Callable[[str], None],
+) -> tuple[tuple[LinkMesh, ...], Decimation]:
+    """The meshes of links, decimated to a tolerance where they have more than `max_faces` triangles together.
+
+    Args:
+        parts: index of a link, a mesh of it [m], and its colour.
+        max_faces: so many triangles in all are left as they are.
+        tolerance: how far surfaces may move [m].
+        progress: called with a line for people for every mesh.
+
+    Raises:
+        RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
+    """
+    before = sum(len(mesh.faces) for _, mesh, _ in parts)
+    if before > MOST_FACES:
+        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler ones.")
+    bound = tolerance if before > max_faces else None
+    result, deviations = [], [0.0]
+    # Each mesh is decimated in a process of its own, so that threads are enough to use several cores.
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE), "decimation")
+    try:
+        simplified = [pool.submit(simplify, mesh, bound) for _, mesh, _ in parts]
+        for number, ((link, mesh, color), found) in enumerate(zip(parts, simplified, strict=True), start=1):
+            try:
+                vertices, normals, faces, deviation = found.result()
+            except DecimationError as error:
+                raise RobotError(
+                    f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
+                    "Export it again as a clean triangle mesh."
+                ) from error
+            progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")
+            deviations.append(deviation)
+            result.append(
+                LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
+            )
+    finally:
+        pool.shutdown(cancel_futures=True)
+    after = sum(len(mesh.faces) for mesh in result)
+    if after > _MOST_KEPT * max_faces:
+        raise RobotError(
+            f"the meshes have {after} triangles when simplified to {tolerance * 1e3:.2g} mm; allowed are "
+            f"{_MOST_KEPT * max_faces}. Export them as clean triangle meshes."
+        )
+    return tuple(result), Decimation(before, after, max(deviations))

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from .meshes import SLENDER
-from .robot import Robot
+from .robot import SLENDER, Robot
 from .scene import Arm
 
 PARTS = ("shaft", "wrist", "jaws")

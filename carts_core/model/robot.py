@@ -1,8 +1,14 @@
 """A robot: degrees of freedom, forward kinematics and the meshes of its links, from any URDF."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
+import torch
+import trimesh
+import yourdfpy
 from jaxtyping import Float
 from torch import Tensor
 
@@ -11,10 +17,16 @@ from ..files.reading import ROBOT, is_regular, read_text
 from . import mesh_cache
 from .instruments import robot_file
 from .kinematics import Kinematics, exact_right_angles
-from .mesh_paths import mesh_path
-from .meshes import Decimation, LinkMesh
-from .urdf import MeshFile, Urdf, read_urdf
+from .mesh_files import mesh_path
+from .meshes import Decimation, LinkMesh, build_link_meshes, load_visual
 from .urdf_check import parsed_urdf
+
+INSTRUMENT_TOLERANCE = 2e-4
+"""How far decimation may move surfaces of an instrument [m]."""
+REACH_TOLERANCE = 1e-3
+"""The same for other robots, a part of their reach [1]."""
+SLENDER = 0.1
+"""Largest width of a shaft, in lengths [1]."""
 
 
 class Robot:
@@ -84,21 +96,24 @@ class Robot:
         try:
             root = parsed_urdf(read_text(urdf, ROBOT), urdf)
             exact_right_angles(root)
-            model = read_urdf(root)
-            kinematics = Kinematics(model, base_link, urdf)
+            text = ElementTree.tostring(root, encoding="unicode")
+            model = yourdfpy.URDF.load(
+                io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
+            )
+            kinematics = Kinematics(model, text, base_link, urdf)
         except FileNotFoundError as error:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
             raise
-        except (OSError, ValueError, KeyError) as error:
+        except Exception as error:  # the URDF parser raises many kinds
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         if not kinematics.joint_names:
-            raise RobotError(f"robot {model.name} ({urdf}) has no joint that moves. Name a robot that has one.")
-        link_names = tuple(link.name for link in model.links if link.visuals)
+            raise RobotError(f"robot {model.robot.name} ({urdf}) has no joint that moves. Name a robot that has one.")
+        link_names = tuple(link.name for link in model.robot.links if link.visuals)
         meshes, decimation = _load_meshes(model, kinematics, urdf, link_names, (max_faces, tolerance), report)
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
-        return Robot(model.name, urdf, kinematics, link_names, meshes, decimation)
+        return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation)
 
     def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:
         """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
@@ -133,7 +148,7 @@ class Robot:
 
 
 def _load_meshes(
-    model: Urdf,
+    model: yourdfpy.URDF,
     kinematics: Kinematics,
     urdf: Path,
     link_names: tuple[str, ...],
@@ -142,10 +157,10 @@ def _load_meshes(
 ) -> tuple[tuple[LinkMesh, ...], Decimation]:
     """Meshes of links; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     mesh_files = [
-        mesh_path(urdf.parent, visual.shape.name)
-        for link in model.links
+        mesh_path(urdf.parent, visual.geometry.mesh.filename)
+        for link in model.robot.links
         for visual in link.visuals
-        if isinstance(visual.shape, MeshFile)
+        if visual.geometry is not None and visual.geometry.mesh is not None
     ]
     key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
     if (cached := mesh_cache.read(key)) is not None:
@@ -154,9 +169,51 @@ def _load_meshes(
     with mesh_cache.one_process():
         if (cached := mesh_cache.read(key)) is not None:
             return cached
-        # What reads meshes takes half a second to import.
-        from .mesh_building import prepared_meshes  # noqa: PLC0415
+        return _prepared_meshes(model, kinematics, urdf, link_names, limits, report, key)
 
-        made = prepared_meshes(model, kinematics, urdf.parent, link_names, limits, report)
-        mesh_cache.write(key, *made)
-        return made
+
+def _prepared_meshes(
+    model: yourdfpy.URDF,
+    kinematics: Kinematics,
+    urdf: Path,
+    link_names: tuple[str, ...],
+    limits: tuple[int, float | None],
+    report: Callable[[str], None],
+    key: str,
+) -> tuple[tuple[LinkMesh, ...], Decimation]:
+    """The same from the files, decimated and put into the cache under `key`."""
+    report(f"{model.robot.name}: preparing meshes (once)")
+    materials = {material.name: material for material in model.robot.materials}
+    links = {link.name: link for link in model.robot.links}
+    parts = [
+        (index, mesh, color)
+        for index, name in enumerate(link_names)
+        for visual in links[name].visuals
+        for mesh, color in load_visual(visual, urdf.parent, materials)
+    ]
+    max_faces, tolerance = limits
+    if tolerance is None:
+        tolerance = _tolerance(kinematics, link_names, parts)
+    meshes, decimation = build_link_meshes(parts, max_faces, tolerance, report)
+    if decimation.deviation:
+        report(f"{model.robot.name}: {decimation}")
+    mesh_cache.write(key, meshes, decimation)
+    return meshes, decimation
+
+
+def _tolerance(
+    kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
+) -> float:
+    """How far surfaces may move [m]: what an endoscope's image cannot show, or little of a robot's reach."""
+    if not parts:
+        return INSTRUMENT_TOLERANCE
+    longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])
+    if longest[-2] < SLENDER * longest[-1]:
+        return INSTRUMENT_TOLERANCE
+    rest = torch.zeros(len(kinematics.joint_names), dtype=torch.float64)
+    Ts = kinematics(rest, link_names).numpy()
+    reach = max(
+        np.linalg.norm(mesh.bounding_box.vertices @ Ts[link, :3, :3].T + Ts[link, :3, 3], axis=1).max()
+        for link, mesh, _ in parts
+    )
+    return max(float(reach) * REACH_TOLERANCE, 1e-6)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yourdfpy
 import trimesh
 
 from carts_core.errors import RobotError
@@ -220,3 +221,28 @@ def test_a_urdf_that_xacro_made_is_no_xacro_though_it_declares_the_namespace(tmp
 def test_a_link_that_is_not_there_is_said_with_those_that_are(shipped_psm: Robot) -> None:
     with pytest.raises(RobotError, match=r"no link 'tip'\. Its links are: .*tool_tip_link"):
         shipped_psm.link_transform(torch.zeros(len(shipped_psm.joint_names)), "tip")
+
+
+BRANCHED = """<robot name="branched">
+  <link name="tip"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>
+  <link name="base"/><link name="arm"/><link name="slide"/><link name="finger"/><link name="plate"/>
+  <joint name="grip" type="revolute"><parent link="slide"/><child link="finger"/><origin xyz="0 0 0.2" rpy="0 1 0"/>
+    <axis xyz="0 0 -1"/><mimic joint="push" multiplier="-2" offset="0.3"/></joint>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="1 2 -2"/></joint>
+  <joint name="push" type="prismatic"><parent link="arm"/><child link="slide"/><origin xyz="0.3 0 0" rpy="1 2 3"/>
+    <axis xyz="0 1 0"/><limit effort="1" velocity="1" lower="-0.1" upper="1e9"/></joint>
+  <joint name="weld" type="fixed"><parent link="arm"/><child link="plate"/><origin rpy="0 0 0.5"/></joint>
+  <joint name="bend" type="revolute"><parent link="plate"/><child link="tip"/></joint>
+</robot>"""
+
+
+def test_links_are_where_another_library_has_them_and_an_axis_that_is_not_given_is_x(tmp_path: Path) -> None:
+    path = tmp_path / "branched.urdf"
+    path.write_text(BRANCHED)
+    robot, other = Robot.load(path), yourdfpy.URDF.load(str(path), load_meshes=False)
+    assert robot.joint_names == tuple(other.actuated_joint_names) == ("turn", "push", "bend")
+    assert robot.joint_limits.tolist() == [[-np.inf, np.inf], [-0.1, np.inf], [-np.inf, np.inf]]
+    for positions in np.random.default_rng(0).uniform(-1, 1, (20, 3)):
+        other.update_cfg(positions)
+        T = robot.forward_kinematics(torch.from_numpy(positions))[0].numpy()
+        np.testing.assert_allclose(T, other.get_transform("tip", "base"), rtol=0, atol=1e-6)
