@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yourdfpy
 import trimesh
+import yourdfpy
 
 from carts_core.errors import RobotError
 from carts_core.model.decimation import deviation
