@@ -1,8 +1,11 @@
 """Imports of very many modules at once."""
 
 import gc
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
 
 
 @contextmanager
@@ -13,3 +16,25 @@ def uncollected() -> Iterator[None]:
         yield
     finally:
         gc.enable()
+
+
+class _Later(ModuleType):
+    """Stands for a module, which is imported when something of it is asked for."""
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(import_module(self.__name__), name)
+
+
+@contextmanager
+def deferred(package: str, name: str) -> Iterator[None]:
+    """`from package import name` in the block, name being a module, imports it where it is first used: maybe never."""
+    whole = f"{package}.{name}"
+    if whole in sys.modules:
+        yield
+        return
+    parent = import_module(package)
+    setattr(parent, name, _Later(whole))
+    try:
+        yield
+    finally:
+        delattr(parent, name)

@@ -7,14 +7,17 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import pytorch_kinematics
 import torch
 import yourdfpy
 from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import RobotError
+from ..imports import deferred
 from ..wording import listed, shown
+
+with deferred("matplotlib", "pyplot"):  # for its solvers' plots, which nobody asks for here: .2 s
+    import pytorch_kinematics
 
 NO_LIMIT = 1e3
 """A larger joint limit [rad], [m] means none."""

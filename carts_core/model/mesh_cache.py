@@ -16,7 +16,7 @@ from ..files.locks import one_after_another
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
 from .meshes import Decimation, LinkMesh
 
-_VERSION = 2
+_VERSION = 3
 
 
 def cache_dir() -> Path:
@@ -58,6 +58,7 @@ def read(key: str) -> tuple[tuple[LinkMesh, ...], Decimation] | None:
                     stored[f"{i}_normals"],
                     stored[f"{i}_faces"],
                     stored[f"{i}_color"],
+                    bool(stored[f"{i}_closed"]),
                 )
                 for i in range(int(stored["count"]))
             )
@@ -75,7 +76,7 @@ def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> Non
         "deviation": np.array(decimation.deviation),
     }
     for i, mesh in enumerate(meshes):
-        for field in ("link", "vertices", "normals", "faces", "color"):
+        for field in ("link", "vertices", "normals", "faces", "color", "closed"):
             arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
     try:
         with output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:

@@ -39,14 +39,16 @@ class LinkMesh:
     faces: Int[np.ndarray, "F 3"]
     color: Float[np.ndarray, "3"]
     """Linear RGB in [0, 1]."""
+    closed: bool
+    """Whether it encloses a volume, so that backs of triangles are never seen."""
 
 
-def is_closed(mesh: LinkMesh) -> bool:
+def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> bool:
     """Whether each part of a mesh encloses a volume, with its normals outwards.
 
     Copies of a vertex at sharp edges count as one.
     """
-    joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    joined = trimesh.Trimesh(vertices, faces, process=False)
     joined.merge_vertices(merge_norm=True, digits_vertex=7)
     if not (joined.is_watertight and joined.is_winding_consistent):
         return False
@@ -192,9 +194,8 @@ def build_link_meshes(
                 ) from error
             progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")
             deviations.append(deviation)
-            result.append(
-                LinkMesh(link, vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32), color)
-            )
+            vertices, normals, faces = vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int32)
+            result.append(LinkMesh(link, vertices, normals, faces, color, is_closed(vertices, faces)))
     finally:
         pool.shutdown(cancel_futures=True)
     after = sum(len(mesh.faces) for mesh in result)

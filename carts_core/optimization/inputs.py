@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
 from ..errors import SettingsError
@@ -73,12 +72,16 @@ def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[
     """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
     if deviation == 0:
         return images
+    from kornia.filters import filter2d_separable  # noqa: PLC0415 - as below
+
     kernel = _kernel(deviation, images.device)
     return filter2d_separable(images, kernel, kernel, border_type="replicate")
 
 
 @lru_cache(maxsize=32)
 def _kernel(deviation: float, device: torch.device) -> Float[Tensor, "1 n"]:
+    from kornia.filters import get_gaussian_kernel1d  # noqa: PLC0415 - takes 0.2 s, and the viewer starts without
+
     return get_gaussian_kernel1d(2 * kernel_radius(deviation) + 1, deviation, device=device)
 
 

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..model.meshes import is_closed
 from ..model.parts import link_parts
 from ..model.robot import Robot
 from ..model.scene import Scene, SceneState
@@ -61,7 +60,7 @@ class SceneGeometry:
                 face_links.append(np.full(count, link))
                 arms.append(np.full(count, arm_index))
                 face_parts.append(np.full(count, parts[mesh.link]))
-                surfaces.append(np.full(count, len(surfaces) if is_closed(mesh) else -1))
+                surfaces.append(np.full(count, len(surfaces) if mesh.closed else -1))
                 colors.append(np.broadcast_to(mesh.color, (count, 3)))
                 first_vertex += len(mesh.vertices)
             first_link += len(robot.link_names)
