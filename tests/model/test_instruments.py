@@ -14,7 +14,6 @@ from carts_core.model.instruments import INSTRUMENTS, builtin_urdf
 from carts_core.model.instruments.builtin import instrument_of
 from carts_core.model.keypoints import keypoints
 from carts_core.model.mesh_files import MOST_FACES
-from carts_core.model.meshes import is_closed
 from carts_core.model.parts import PARTS, link_parts
 from carts_core.model.psm_kinematics import forward
 from carts_core.model.robot import Robot
@@ -55,7 +54,7 @@ def test_an_instrument_has_the_joints_and_the_kinematics_of_its_arm(name: str) -
 @pytest.mark.parametrize("instrument", INSTRUMENTS, ids=lambda instrument: instrument.name)
 def test_meshes_are_closed_few_and_as_long_as_is_said(instrument) -> None:
     robot = Robot.load(f"builtin:{instrument.name}")
-    assert all(is_closed(mesh) for mesh in robot.meshes)
+    assert all(mesh.closed for mesh in robot.meshes)
     assert 3_000 < sum(len(mesh.faces) for mesh in robot.meshes) < 12_000
     joints = torch.zeros(len(robot.joint_names), dtype=torch.float64)
     Ts, hinge = robot.forward_kinematics(joints), robot.link_transform(joints, "wrist_yaw_link").numpy()
