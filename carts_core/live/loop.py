@@ -1,6 +1,7 @@
 """From a source through a tracker to whoever wants results, always with the newest frame."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -11,6 +12,13 @@ from ..rendering import Renderer
 from .messages import ResultMessage, encoded_masks
 from .moments import Moment, Newest, Source
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
+
+_RECENT = 20
+"""Frames that tell how long the next one will take."""
+_USUAL = 75
+"""So many of a hundred take no longer than what is expected."""
+_FRESH = 0.01
+"""A frame that has waited for less is always taken [s]."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +88,11 @@ def follow(
         CartsError: what ended the stream, or a frame that does not fit the scene.
     """
     statistics = statistics or LiveStatistics()
-    newest = Newest(source, tracker.live.oldest_seconds)
+    newest, taken = Newest(source), deque[float](maxlen=_RECENT)
     try:
-        while (moment := newest.take()) is not None:
+        while (moment := newest.take(_patience(list(taken), tracker.live.oldest_seconds))) is not None:
             estimate = tracker.track(moment.frame, moment.camera_poses)
+            taken.append(estimate.seconds)
             tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
             statistics.add(tracked)
             statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
@@ -94,6 +103,12 @@ def follow(
         statistics.ended = time.monotonic()
         statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
     return statistics
+
+
+def _patience(taken: Sequence[float], oldest: float) -> float:
+    """How long a frame may have waited if its result is to be no older than `oldest` [s]."""
+    usual = float(np.percentile(taken, _USUAL)) if taken else 0.0
+    return max(oldest - usual, _FRESH)
 
 
 class Results:

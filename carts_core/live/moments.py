@@ -157,14 +157,13 @@ class Newest:
 
     Args:
         source: that is read and, in the end, closed.
-        oldest: a frame that has waited longer is dropped, too [s].
 
     Attributes:
         arrived, dropped: how many frames.
     """
 
-    def __init__(self, source: Source, oldest: float) -> None:
-        self._source, self._oldest = source, oldest
+    def __init__(self, source: Source) -> None:
+        self._source = source
         self._moment: Moment | None = None
         self._ended, self._error = False, None
         self._changed = threading.Condition()
@@ -172,8 +171,11 @@ class Newest:
         self._thread = threading.Thread(target=self._read, name="carts-live-source", daemon=True)
         self._thread.start()
 
-    def take(self) -> Moment | None:
+    def take(self, patience: float) -> Moment | None:
         """The newest frame, waited for; None at the end.
+
+        Args:
+            patience: a frame that has waited longer is dropped for the next one, unless it is the last one [s].
 
         Raises:
             CartsError: what ended the source.
@@ -181,7 +183,7 @@ class Newest:
         with self._changed:
             while True:
                 moment, self._moment = self._moment, None
-                if moment is not None and (self._ended or time.monotonic() - moment.arrived <= self._oldest):
+                if moment is not None and (self._ended or time.monotonic() - moment.arrived <= patience):
                     return moment
                 self.dropped += moment is not None
                 if self._ended:

@@ -26,7 +26,7 @@ class LiveSettings:
     search_seconds: float = 0.4
     """Lost arms are searched for this often; frames between are compared with where they were last seen [s]."""
     oldest_seconds: float = 0.1
-    """A frame that has waited longer is dropped for the newest one [s]."""
+    """A frame whose result would be older, at the usual time for a frame, is dropped for the next one [s]."""
 
     def __post_init__(self) -> None:
         require(1e-3 <= self.bad_loss <= 10, "bad_loss", self.bad_loss, "0.001 to 10")

@@ -75,9 +75,9 @@ WARM: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
 """A frame of a sequence whose neighbours are known."""
 
 LIVE: tuple[Stage, ...] = (
-    Observe(scale=0.75, margin=12, attention=12),
+    Observe(scale=0.6, margin=10, attention=10),
     Descend(blur=1.2, steps=1),
-    AlignEdges(steps=8),
+    AlignEdges(steps=6),
 )
 """A frame of a live stream, near where it is expected: one small observation, one step, and the outlines."""
 

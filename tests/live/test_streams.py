@@ -6,6 +6,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,7 +75,7 @@ class Repeater:
             state,
             frame.measured,
             std,
-            0.0,
+            self._seconds,
         )
 
 
@@ -118,6 +119,26 @@ def test_a_frame_that_has_waited_too_long_is_not_tracked(sequence: Sequence) -> 
 
     statistics = follow(Stale(), Repeater(sequence), [])  # pyright: ignore
     assert (statistics.arrived, statistics.dropped, statistics.tracked) == (2, 1, 1)
+
+
+def test_a_frame_whose_result_would_be_too_old_at_the_usual_time_is_not_tracked(sequence: Sequence) -> None:
+    frame = sequence.frame(0)
+
+    class Uneven:
+        def __iter__(self) -> Iterator[Moment]:
+            yield Moment(frame)
+            time.sleep(0.3)
+            # It has waited for less than it may, but not for so much less as the tracker takes.
+            yield Moment(replace(frame, frame_id="late"), arrived=time.monotonic() - 0.07)
+            time.sleep(0.3)
+            yield Moment(frame)
+
+        def close(self) -> None:
+            """Nothing is open."""
+
+    tracker = Repeater(sequence, seconds=0.05)
+    statistics = follow(Uneven(), tracker, [])  # pyright: ignore
+    assert (statistics.dropped, statistics.tracked) == (1, 2) and "late" not in {one.frame_id for one in tracker.frames}
 
 
 def test_what_ends_a_source_is_raised_where_frames_are_taken(sequence: Sequence) -> None:
