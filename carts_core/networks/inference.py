@@ -7,7 +7,6 @@ from collections.abc import Callable
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,7 +28,9 @@ TOLERANCE = 1e-4
 """Largest difference of two surface maps that count as the same [1]."""
 _GAIN = 0.9
 """Share of torch's time below which another engine is taken [1]."""
-_ROUNDS = 5
+_ROUNDS = 7
+_MEASUREMENT = 2
+"""Which way of measuring is remembered."""
 _PROBE = 7, 13
 """Height and width of the image that is measured, in strides of the network: a window around an arm."""
 
@@ -102,7 +103,8 @@ def _difference(network: SurfaceNetwork, other: Surface) -> float:
 def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
     """The faster one, as it was measured the first time on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
-    key = fingerprint(sha256, platform.node(), platform.processor(), versions, torch.get_num_threads())[:32]
+    machine = platform.node(), platform.processor(), torch.get_num_threads()
+    key = fingerprint(_MEASUREMENT, sha256, versions, machine)[:32]
     path = cache_dir() / f"inference-{key}.json"
     if (known := _read(path)) is not None:
         return known
@@ -126,7 +128,7 @@ def _read(path: Path) -> Engine | None:
 
 @torch.no_grad()
 def _times(network: SurfaceNetwork, other: Surface) -> dict[Engine, float]:
-    """Seconds for the probe, each the median of some rounds in turn."""
+    """Seconds for the probe, each the shortest of some rounds in turn: others at work only lengthen them."""
     images, given = _probe(network)
     engines: dict[Engine, Callable[[], Tensor]] = {
         "torch": lambda: network(images.contiguous(memory_format=torch.channels_last), given).map(),
@@ -138,4 +140,4 @@ def _times(network: SurfaceNetwork, other: Surface) -> dict[Engine, float]:
             began = time.perf_counter()
             run()
             seconds[name].append(time.perf_counter() - began)
-    return {name: median(values) for name, values in seconds.items()}
+    return {name: min(values) for name, values in seconds.items()}
