@@ -18,6 +18,7 @@ from ..files.reading import VALUES, parse_json, read_bytes
 from ..fingerprints import fingerprint
 from ..model.mesh_cache import cache_dir
 from ..model.surface import SURFACE_CHANNELS
+from ..process import inference_threads
 from ..settings.inference import Engine, Inference
 from .surface_network import SurfaceNetwork
 
@@ -103,7 +104,7 @@ def _difference(network: SurfaceNetwork, other: Surface) -> float:
 def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
     """The faster one, as it was measured the first time on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
-    machine = platform.node(), platform.processor(), torch.get_num_threads()
+    machine = platform.node(), platform.processor(), torch.get_num_threads(), inference_threads()
     key = fingerprint(_MEASUREMENT, sha256, versions, machine)[:32]
     path = cache_dir() / f"inference-{key}.json"
     if (known := _read(path)) is not None:

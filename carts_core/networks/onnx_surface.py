@@ -15,6 +15,7 @@ from ..errors import OutputError
 from ..files import output_path, write_bytes
 from ..files.reading import WEIGHTS, read_bytes
 from ..model.mesh_cache import cache_dir
+from ..process import inference_threads
 from .surface_network import SurfaceNetwork
 
 _VERSION = 1
@@ -36,7 +37,7 @@ class _Maps(nn.Module):
 
 
 class OnnxSurface:
-    """A surface network in ONNX Runtime, with as many threads as torch has when it is made.
+    """A surface network in ONNX Runtime, with `inference_threads` as they are when it is made.
 
     Its graph is exported once and kept in the cache, under the fingerprint of the weights.
 
@@ -77,7 +78,7 @@ class OnnxSurface:
 
 def _session(graph: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = torch.get_num_threads(), 1
+    options.intra_op_num_threads, options.inter_op_num_threads = inference_threads(), 1
     # Waiting threads that spin take the cores from whatever else runs, such as torch.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
