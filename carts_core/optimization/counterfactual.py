@@ -22,6 +22,7 @@ from ..imaging.window import Window
 from ..model.scene import Scene
 from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..recording import MeanBackground
+from ..threads import total
 from .inputs import pixel_weights, smoothed, stacked_images
 from .predictor import FramePredictor
 
@@ -75,7 +76,7 @@ class Background:
     @property
     def deceptive(self) -> bool:
         """Whether the network has many false positives there."""
-        return float(self.seen.mean()) > _DECEPTIVE
+        return total(self.seen) / self.seen.numel() > _DECEPTIVE
 
     def compared(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> "Change":
         """Images, RGB in [0, 1], beside the background under their light.

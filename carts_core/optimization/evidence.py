@@ -9,6 +9,7 @@ from torch import Tensor
 from ..imaging.window import Window
 from ..model.scene import SceneState
 from ..model.surface import COVERAGE, SURFACE_CHANNELS
+from ..threads import total
 from .failure import ArmEvidence, log_odds_of_failure
 from .frame_images import FrameImages
 from .losses import attention
@@ -80,8 +81,8 @@ def evidence(
     rendered = rendered * weight
     return Evidence(
         **asdict(worst),
-        area=float(covered.mean()),
-        start_area=float(was.mean()),
+        area=total(covered) / covered.numel(),
+        start_area=total(was) / was.numel(),
         loss=loss,
         predicted=_share(alone, rendered),
         changed=_share_of_told(rendered, change),
@@ -101,7 +102,7 @@ def _elsewhere(images: FrameImages, state: SceneState, predictor: FramePredictor
     if images.change is not None:
         seen = seen * images.change.surely
     far = 1.0 - attention((labels >= 0).to(seen), round(_MARGIN * images.scale))
-    return float((seen * far * images.weight).mean())
+    return total(seen * far * images.weight) / seen.numel()
 
 
 def _places(
@@ -137,7 +138,7 @@ def _of_arm(
     if change is not None and _share(change[0], rendered) > _TOLD:
         overlap = _overlap(rendered * change[0], change[1] * change[0] * here)
     return ArmEvidence(
-        residual=float(2.0 * (rendered - conditioned).square().sum() / (rendered + conditioned).sum().clamp(min=1.0)),
+        residual=2.0 * total((rendered - conditioned).square()) / max(total(rendered + conditioned), 1.0),
         agreement=_overlap(rendered, conditioned),
         unconditioned=_overlap(rendered, alone),
         overlap_with_change=overlap,
@@ -163,9 +164,9 @@ def _still_in_view(images: FrameImages, start: SceneState, end: SceneState) -> f
 
 def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:
     """Soft Dice of two maps in [0, 1]; 0 where both are empty."""
-    return float(2.0 * torch.minimum(one, other).sum() / (one.sum() + other.sum()).clamp(min=1e-6))
+    return 2.0 * total(torch.minimum(one, other)) / max(total(one) + total(other), 1e-6)
 
 
 def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1 h w"]) -> float:
     """Share of a map in [0, 1] that another one has too; 0 of an empty one."""
-    return float((part * whole).sum() / whole.sum().clamp(min=1e-6))
+    return total(part * whole) / max(total(whole), 1e-6)
