@@ -41,8 +41,8 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Begin the range at this frame: what is played, solved, optimized and exported. Key: (">[&nbsp;In</button>
-        <button data-do="last" title="End the range at this frame. Key: )">Out&nbsp;]</button>
+        <button data-do="first" title="Begin the range at this frame: what is played, solved, optimized and exported. Key: (">(&nbsp;Start</button>
+        <button data-do="last" title="End the range at this frame. Key: )">End&nbsp;)</button>
         <button data-do="whole" title="No range: the whole sequence">×</button>
         <span class="carts-range"></span>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, or the fit"></select>

@@ -58,13 +58,16 @@ def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, flo
         said = f" {quality(cameras[name])}" if name in cameras else ""
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
+    if scores and line:
+        line += "<small>Dice: overlap with the recording's own mask.</small>"
     if verdict is None:
         name = "running" if running else "not checked"
         return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
     remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
+    about = "<br><small>About the mask. Each joint's deviation: Values.</small>" if verdict.verdict == "good" else ""
     return (
         f'<div class="carts-verdict {verdict.verdict}" role="status"><b>{verdict.verdict.capitalize()}</b> '
-        f"{escaped(verdict.reason)}{remedy}{line}</div>"
+        f"{escaped(verdict.reason)}{about}{remedy}{line}</div>"
     )
 
 

@@ -11,6 +11,10 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
 _LONGEST_LIST = 200
+_MEANING = (
+    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Kept are frames that you accepted, corrected "
+    "by hand or marked here."
+)
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
 
@@ -59,7 +63,7 @@ class KeyframesPanel:
         self._between.disabled = state.solving or not self._solvable
         # What has just been solved without keyframes needs no advice about them.
         planned = not state.solving and (bool(state.project.kept_frames) or state.solve is None)
-        lines = [self._plan] if planned else []
+        lines = [self._plan, _MEANING] if planned else []
         if state.solve is not None:
             done, total = state.solve.progress
             self._progress.value = 100.0 * done / total

@@ -70,7 +70,7 @@ class OptimizePanel:
         """Bring the widgets up to date."""
         running = state.run.phase is Phase.RUNNING
         self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
-        self._run.disabled = running
+        self._run.disabled = running or state.busy is not None
         self._pause.disabled = not running
         self._step.disabled = running
         self._reset.disabled = not state.run.curves.loss

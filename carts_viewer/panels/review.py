@@ -29,7 +29,7 @@ class ReviewPanel:
         self._counted: ProjectState | None = None
         with gui.add_folder("Review"):
             self._state = gui.add_html("")
-            accept = gui.add_button("Accept + next", icon=viser.Icon.CHECK, color="teal")
+            self._accept = accept = gui.add_button("Accept + next", icon=viser.Icon.CHECK, color="gray")
             keep = gui.add_button("Accept", color="gray")
             page.row(accept, keep, weights=(3, 2))
             work = gui.add_button("Needs work", color="gray")
@@ -61,6 +61,9 @@ class ReviewPanel:
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
         name = review_name(state.project, state.index)
         self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{name}</b>{keyframe}</p>'
+        # Bright where the images say that there is something to accept.
+        good = state.verdict is not None and state.verdict.verdict == "good"
+        self._accept.color = "teal" if good else "gray"
         if not self._waits(intents.SetNote):
             write(self._note, review.note)
         if self._counted is None or not (state.unsaved or state.project is self._counted):
