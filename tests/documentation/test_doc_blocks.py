@@ -1,7 +1,10 @@
 """Every command and Python block of the documentation runs, with an empty HOME and relative paths, from elsewhere."""
 
+import ast
+import importlib
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -11,7 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 from doc_blocks import ROOT, Block, all_blocks, blocks
+
+from carts_core.cli.command_line import Command
 
 RUNNABLE = {"python", "console", "bash"}
 TESTED_ELSEWHERE = {"toml", "sql"}
@@ -20,9 +26,13 @@ NO_PROGRAMS = {"json", "text", ""}
 SLOW = {
     "docs/howto/calibration.md",
     "docs/howto/exports.md",
+    "docs/howto/import.md",
+    "docs/howto/masks.md",
     "docs/howto/sequences.md",
+    "docs/reference/exports.md",
     "docs/reference/sequence_format.md",
 }
+"""Pages whose blocks run in the slow tests; that commands and imports of all pages are understood is always tested."""
 SECONDS = 280
 
 TO_RUN = {
@@ -81,6 +91,27 @@ def test_the_blocks_of_a_page_run(page: str, reader: tuple[Path, dict[str, str]]
     finished = run_blocks(todo, reader)
     assert finished.returncode == 0, f"{finished.stdout[-2000:]}\n{finished.stderr[-4000:]}"
     assert finished.stdout.count("--- ") == len(todo)
+
+
+def test_commands_and_imports_of_every_page_are_understood(
+    reader: tuple[Path, dict[str, str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(reader[0])
+    for block in all_blocks():
+        if block.language == "python":
+            for node in ast.walk(ast.parse(block.text)):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else ()
+                for name in names:
+                    if isinstance(node, ast.ImportFrom):
+                        assert hasattr(importlib.import_module(node.module or ""), name), f"{block}: {name}"
+                    else:
+                        importlib.import_module(name)
+        for command in block.commands() if block.language == "console" else ():
+            if block.reason is None and command.startswith("carts "):
+                try:
+                    tyro.cli(Command, args=shlex.split(command)[1:])  # pyright: ignore
+                except SystemExit as end:
+                    assert end.code == 0, f"{block}: {command}\n{capsys.readouterr().err}"
 
 
 def test_every_block_is_run_marked_or_tested_elsewhere() -> None:

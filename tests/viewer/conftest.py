@@ -79,16 +79,20 @@ def browser() -> Iterator[Browser]:
 def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
     """Opens a tab of a viewer, in a window of any size, when the first picture is there.
 
-    The browser has seen the page before, unless it is a `new` one.
+    The browser has seen the page before, unless it is a `new` one. `asked` gets every address that the page asks for.
     """
     with ExitStack() as stack:
 
-        def make(app: ViewerApp, window: tuple[int, int] = (1280, 800), *, new: bool = False) -> Tab:
+        def make(
+            app: ViewerApp, window: tuple[int, int] = (1280, 800), *, new: bool = False, asked: list[str] | None = None
+        ) -> Tab:
             context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
             stack.callback(context.close)
             if not new:
                 context.add_init_script("localStorage.setItem('carts-tour', 'seen')")
             page = context.new_page()
+            if asked is not None:
+                page.on("request", lambda request: asked.append(request.url))
             page.goto(app.url)
             tab = Tab(app, page, Canvas(app, page))
             tab.wait_until_ready()

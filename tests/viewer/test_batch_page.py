@@ -56,6 +56,8 @@ def test_failures_come_first_and_a_frame_opens_with_what_was_found(batch: Path, 
         eventually(lambda: app.state.index, lambda index: index == 1, 60)
         assert app.state.verdict is not None and app.state.pose.source.value == "optimizer"
         assert app.project.path.parent == batch / "jobs" / read_jobs(batch)[0].name
+        # A page that is closed while it loads may keep the browser waiting.
+        page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
         page.close()
 
 

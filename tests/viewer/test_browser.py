@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import expect
 from viewer_canvas import decoded, eventually
 from viewer_tab import Tab
 
@@ -21,19 +21,15 @@ from carts_viewer.state import Phase
 pytestmark = pytest.mark.browser
 
 
-@pytest.mark.parametrize("window", [(1280, 800), (1000, 950), (1700, 620)])
-def test_the_overlay_lies_on_the_frame_at_any_window_shape(
-    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
+@pytest.mark.parametrize(
+    "windows", [((1700, 620), (1000, 950)), pytest.param(((1000, 950), (1280, 800)), marks=pytest.mark.slow)]
+)
+def test_the_overlay_lies_on_the_frame_at_any_window_shape_also_when_it_changes(
+    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab], windows: tuple[tuple[int, int], ...]
 ) -> None:
-    tab = open_tab(open_marked(), window)
+    tab = open_tab(open_marked(), windows[0])
     assert tab.canvas.eventually_registered() <= 1.5
-
-
-def test_a_window_that_changes_its_shape_keeps_the_overlay_in_place(
-    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    tab = open_tab(open_marked())
-    tab.page.set_viewport_size({"width": 1100, "height": 900})
+    tab.page.set_viewport_size({"width": windows[1][0], "height": windows[1][1]})
     assert tab.canvas.eventually_registered() <= 1.5
 
 
@@ -81,6 +77,8 @@ def test_the_3d_view_turns_and_the_endoscope_view_comes_back_exactly(
     assert tab.canvas.eventually_registered() <= 1.5
 
 
+# The tests of several tabs type values, too, and look at the overlay of both.
+@pytest.mark.slow
 def test_typing_a_joint_value_moves_the_overlay_to_where_it_belongs(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
@@ -211,13 +209,13 @@ def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_ca
 def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    app = open_viewer(frames=16, width=160, height=120)
+    app = open_viewer(frames=7, width=160, height=120)
     tab, other = open_tab(app), open_tab(app, (1000, 900))
     tab.page.get_by_text("Review", exact=True).first.click()
     tab.page.keyboard.press("k")
-    expect(tab.page.get_by_text("from 001 to 016")).to_be_visible()
+    expect(tab.page.get_by_text("from 001 to 007")).to_be_visible()
     app.queue.put(intents.MoveFrame(1))
-    expect(tab.page.get_by_text("15 to solve, 1 kept")).to_be_visible()
+    expect(tab.page.get_by_text("6 to solve, 1 kept")).to_be_visible()
     tab.button("Solve between")
     stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
     expect(stop).to_be_visible()
@@ -228,10 +226,10 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     place = other.place_in_viewer
     other.page.close()
     eventually(lambda: place.person.present, lambda present: not present)
-    expect(tab.page.get_by_text("15 frames solved")).to_be_visible(timeout=60_000)
+    expect(tab.page.get_by_text("6 frames solved")).to_be_visible(timeout=60_000)
     expect(stop).to_be_hidden()
-    assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 15
-    assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 16))
+    assert tab.page.locator("rect.carts-source[data-source=propagated]").count() == 6
+    assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 7))
     steps = app.state.undoable
     # The same again would be no step.
     tab.page.keyboard.press("Control+z")
@@ -245,11 +243,12 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     eventually(lambda: app.state.project.joints(1), lambda joints: not joints)
 
 
-def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
+def test_an_error_is_shown_and_can_be_dismissed_and_the_page_asks_no_other_host_for_anything(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_viewer(frames=12)
-    tab = open_tab(app)
+    asked: list[str] = []
+    tab = open_tab(app, asked=asked)
     (app.sequence.path.parent / "regular" / "left" / "012.png").unlink()  # Too far away to be read in advance.
     tab.type_value(app.view.page.find("Frame"), 12)
     message = tab.page.locator(".carts-error[role=alert]")
@@ -261,8 +260,12 @@ def test_an_error_is_shown_in_the_page_and_can_be_dismissed(
     expect(note).to_be_hidden()
     tab.type_value(app.view.page.find("Frame"), 2)
     eventually(lambda: app.state.index, lambda index: index == 1)
+    # Nor was any other host asked for anything.
+    assert asked and all(url.startswith((app.url, "data:", "blob:")) for url in asked)
 
 
+# What one tab types is seen in another one by the tests of several tabs, too.
+@pytest.mark.slow
 def test_two_tabs_on_one_frame_show_the_same(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
@@ -362,15 +365,3 @@ def test_reviewing_is_saved_as_the_page_says_and_is_there_in_another_server(
         project = again.wait_until_shown(60).project
     assert (project.review(0).state, project.review(0).note) == ("needs work", "smoke on the left")
     assert project.review(1).state == "accepted" and len(project.steps) == 3
-
-
-def test_the_page_asks_no_other_host_for_anything(open_viewer: Callable[..., ViewerApp], browser: Browser) -> None:
-    app = open_viewer()
-    context = browser.new_context()
-    asked: list[str] = []
-    page = context.new_page()
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(app.url)
-    page.wait_for_function("window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
-    context.close()
-    assert asked and all(url.startswith((app.url, "data:", "blob:")) for url in asked)

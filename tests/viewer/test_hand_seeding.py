@@ -21,7 +21,7 @@ def _dice(app: ViewerApp) -> float:
     return -1.0 if scores is None or scores.dice is None else scores.dice
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_two_clicks_bring_a_frame_back_that_is_5_degrees_off(
     open_viewer: Callable[..., ViewerApp],
     open_tab: Callable[..., Tab],

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clicked_points import clicked
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 from swaying import write_log, write_swaying
 from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
@@ -96,6 +96,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     points = place_of(visitor).draft.points
     visitor.press("Undo")
     eventually(lambda: place_of(visitor).draft.points, lambda now: now == points[:-1])
+    expect(visitor.page.locator("main").get_by_text("All points are there")).to_have_count(0)
     visitor.press("All recordings")
     visitor.press("Go on with day 3")
     visitor.reads("Click the shaft edge")

@@ -16,7 +16,7 @@ FOLDERS = {"Optimize": ("Free parameters",), "Review": ("Find", "Masks of others
 """What is folded at first, by the tab that it lies in."""
 
 
-@pytest.mark.parametrize("window", [(1280, 800), (1920, 1080), (390, 844)])
+@pytest.mark.parametrize("window", [(1280, 800), pytest.param((1920, 1080), marks=pytest.mark.slow), (390, 844)])
 def test_no_number_table_or_label_is_cut_off_in_any_tab(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
 ) -> None:
@@ -46,7 +46,7 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
     assert found == {name: [] for name in TABS}
 
 
-@pytest.mark.parametrize("window", [(1280, 800), (390, 844)])
+@pytest.mark.parametrize("window", [pytest.param((1280, 800), marks=pytest.mark.slow), (390, 844)])
 def test_the_curves_of_a_run_leave_the_panel_as_wide_as_it_is(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
 ) -> None:

@@ -102,7 +102,7 @@ def test_nothing_acknowledged_is_lost_to_60_signals(
     print(f"{sum(counts)} edits acknowledged in 60 lives")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_note_that_nobody_has_left_yet_is_saved(
     tiny_sequence: Callable[..., Path], untrained_weights: Path, number: signal.Signals
 ) -> None:
