@@ -12,8 +12,8 @@ from carts_viewer.transport.tab_page import TabPage
 
 _LONGEST_LIST = 200
 _MEANING = (
-    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Kept are frames that you accepted, corrected "
-    "by hand or marked here."
+    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Kept are frames that you accepted, "
+    "corrected by hand or marked here."
 )
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
