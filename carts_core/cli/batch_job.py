@@ -12,12 +12,14 @@ from typing import Any
 import tyro
 
 from ..batch.engine import Outcome
+from ..batch.findings import FILE as FINDINGS
 from ..batch.findings import write_findings
 from ..batch.manifest import Job, Step
 from ..batch.state import RunningJob, StepState, running
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
-from ..files import OutputPath, write_text
+from ..files import OutputPath, remove_file, write_text
+from ..files.reading import is_regular
 from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
 from ..settings.inference import Inference
@@ -123,13 +125,15 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
+            # They are of what was there before; whoever is killed from here on makes them when the job goes on.
+            remove_file(folder / FINDINGS)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
             state.step_done(step, StepState(key, round(time.perf_counter() - began, 3)))
             done += 1
         if step in ("import", "calibrate"):
             sequence = (folder / _FOLDERS[step] / "sequence.toml").path
-    if done:
+    if not is_regular((folder / FINDINGS).path):
         write_findings(job, folder, sequence)
     return done
 

@@ -120,6 +120,21 @@ def test_a_base_frame_that_drifts_is_reported(sequence: Path, tmp_path: Path) ->
     assert [round(row["translation_mm"], 6) for row in rows] == [0.0, 0.0, 3.0]
 
 
+def test_findings_of_a_job_whose_worker_died_before_them_are_made_when_it_goes_on(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (job, *_), batch = read_manifest(manifest(sequence, steps='"optimize"')), output_path(tmp_path / "b")
+    assert BatchWork(batch)(job).status == "done"
+    whole = results(batch.path)
+    with monkeypatch.context() as patch:
+        patch.setattr("carts_core.cli.batch_job.write_findings", lambda *_: pytest.fail("its worker dies"))
+        with pytest.raises(pytest.fail.Exception):
+            BatchWork(batch, again=True)(job)
+    # What they were before is not taken for what they are now.
+    assert "findings.json" not in {Path(name).name for name in results(batch.path)}
+    assert BatchWork(batch)(job).status == "known" and results(batch.path) == whole
+
+
 def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: Path, tmp_path: Path) -> None:
     batch = output_path(tmp_path / "b")
 
