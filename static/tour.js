@@ -8,7 +8,7 @@
     ["canvas", "The picture", "The recorded image, with the arm over it where the joint positions say it is. Wheel: zoom; drag: move; " +
       "a click chooses a camera."],
     [".carts-verdict", "The verdict", "Whether the fit can be relied on: good, doubtful or failed, with the reason and what to try. " +
-      "It comes from the images, not from the solver, and is about the mask: joints that the image does not determine are marked."],
+      "It comes from the images, not from the solver, and is about the mask. After a run, Optimize names joints that the images do not determine."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
     ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
     [".carts-strip", "The timeline", "All frames: high bars fit badly. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
