@@ -8,11 +8,14 @@ import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Bool, Float
+from scipy.spatial.distance import pdist
+from trimesh.exchange.ply import export_ply
 
 from ..files import OutputPath, write_bytes, write_text
 from ..model.scene import Arm, SceneState
@@ -22,9 +25,6 @@ from .dataset import Dataset, View
 from .monitor import Monitor
 from .png import image_png, mask_png
 from .rle import bounding_box
-
-if TYPE_CHECKING:
-    import trimesh
 
 _MM = 1000.0
 _NOWHERE = [-1, -1, -1, -1]
@@ -40,7 +40,7 @@ class _Object:
     name: str
     link: int
     """As `View.link_ids` counts."""
-    mesh: "trimesh.Trimesh"
+    mesh: trimesh.Trimesh
     """In the link's frame [mm]."""
 
 
@@ -66,8 +66,6 @@ def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 def _objects(arms: tuple[Arm, ...]) -> Iterator[_Object]:
     """The links that have a mesh."""
-    import trimesh  # noqa: PLC0415 - takes 0.2 s, and most exports do without
-
     first, number = 0, 1
     for arm in arms:
         for link, name in enumerate(arm.robot.link_names):
@@ -83,9 +81,6 @@ def _objects(arms: tuple[Arm, ...]) -> Iterator[_Object]:
 
 
 def _write_models(objects: list[_Object], folder: OutputPath) -> None:
-    from scipy.spatial.distance import pdist  # noqa: PLC0415 - as above
-    from trimesh.exchange.ply import export_ply  # noqa: PLC0415
-
     info, names = {}, {}
     for one in objects:
         low, high = one.mesh.bounds

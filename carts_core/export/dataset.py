@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, unique_file_names, write_bytes
@@ -213,12 +214,8 @@ def labelled(
     return np.where(mask, rendered[rows, columns], -1)
 
 
-def _nearest(
-    pixels: Bool[np.ndarray, "height width"],
-) -> Int[np.ndarray, "2 height width"]:
+def _nearest(pixels: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "2 height width"]:
     """Row and column of the nearest of these pixels, for every pixel."""
-    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - takes 0.2 s, and the viewer starts without
-
     return np.asarray(distance_transform_edt(~pixels, return_distances=False, return_indices=True))
 
 

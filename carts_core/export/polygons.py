@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int
+from scipy.spatial.distance import cdist
 
 MIN_POINTS = 3
 """Readers take fewer points for something else than a polygon."""
@@ -31,8 +32,6 @@ def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "po
 
 def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
     """One closed line along the rim and all holes. The shortest link first: no other hole can lie across it."""
-    from scipy.spatial.distance import cdist  # noqa: PLC0415 - takes 0.2 s, and masks mostly have no holes
-
     while holes:
         distances = [cdist(rim, hole, "sqeuclidean") for hole in holes]
         nearest = min(range(len(holes)), key=lambda index: distances[index].min())

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
@@ -102,8 +103,6 @@ class Recorder:
 
     def _write_mounts(self, number: int, name: str, tracked: Tracked) -> None:
         """A row for each camera, since any may begin to move."""
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - takes 0.2 s, and few streams are recorded
-
         mounts = mounts_of(self._scene, tracked.moment.frame, tracked.moment.camera_poses)
         for camera in self._scene.cameras:
             path = self._output / _motion_file(camera.name)

@@ -80,7 +80,7 @@ def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[
 
 @lru_cache(maxsize=32)
 def _kernel(deviation: float, device: torch.device) -> Float[Tensor, "1 n"]:
-    from kornia.filters import get_gaussian_kernel1d  # noqa: PLC0415 - takes 0.2 s, and the viewer starts without
+    from kornia.filters import get_gaussian_kernel1d  # noqa: PLC0415 - takes 0.1 s, and the viewer starts without
 
     return get_gaussian_kernel1d(2 * kernel_radius(deviation) + 1, deviation, device=device)
 

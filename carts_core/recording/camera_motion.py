@@ -6,6 +6,7 @@ then its place on the mount, and a point of the world is at `T_camera_mount @ in
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ..errors import SequenceError
 from ..model.ecm_kinematics import JOINT_NAMES, forward
@@ -65,8 +66,6 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
             f"{table.path}, line {table.lines[far[0]]}: the camera is {np.abs(positions[far[0]]).max():.4g} m away, "
             f'{_FARTHEST:g} m is allowed. If the columns are in mm, say so: length_unit = "mm".'
         )
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - takes 0.2 s, and most cameras do not move
-
     Ts = np.tile(np.eye(4), (len(table), 1, 1))
     Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(turns).as_matrix(), positions
     return Ts if kind == POSES[0] else np.linalg.inv(Ts)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
 from ..wording import counted
@@ -171,8 +172,6 @@ class PoseSamples:
         """Poses at places among the rows, numbered from 0."""
         if len(self.Ts_world_mount) == 1:
             return np.tile(self.Ts_world_mount, (len(places), 1, 1))
-        from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - takes 0.2 s, and most cameras do not move
-
         rows, points = np.arange(len(self.Ts_world_mount)), self.Ts_world_mount[:, :3, 3]
         Ts = np.tile(np.eye(4), (len(places), 1, 1))
         Ts[:, :3, :3] = Slerp(rows, Rotation.from_matrix(self.Ts_world_mount[:, :3, :3]))(places).as_matrix()

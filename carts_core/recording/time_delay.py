@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import minimize_scalar
 
 from ..model.robot import Robot
 from .sequence import Sequence
@@ -207,7 +208,6 @@ class _Delays:
 
     def _refined(self, around: float, blocks: np.ndarray) -> float:
         """The offset near another one that explains most of some blocks [s]."""
-        from scipy.optimize import minimize_scalar  # noqa: PLC0415 - takes 0.3 s, and few recordings are estimated
 
         def unexplained(offset: float) -> float:
             parts = self._parts(offset)

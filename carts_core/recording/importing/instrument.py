@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ...errors import CartsError
 from ...model.psm_kinematics import CLASSIC, PsmGeometry, forward
@@ -60,8 +61,6 @@ def fit_base_frame(
             "Check that both topics were recorded at the same time."
         )
     Ts = Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry))
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - takes 0.2 s, and a viewer does without
-
     rotations = Rotation.from_matrix(Ts[:, :3, :3])
     mean = rotations.mean()
     T = np.eye(4)
