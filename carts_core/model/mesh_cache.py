@@ -4,8 +4,8 @@ import hashlib
 import os
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +35,29 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
     return digest.hexdigest()[:32]
 
 
-@contextmanager
-def one_process() -> Iterator[None]:
-    """While others fill the cache, wait; where it cannot be written to or locked, nobody waits."""
-    with ExitStack() as stack:
+Made = tuple[tuple[LinkMesh, ...], Decimation]
+"""Meshes of links, and what became of those of the files."""
+
+
+def kept(key: str, make: Callable[[], Made]) -> Made:
+    """What is stored under `key`, made and stored if nothing is.
+
+    Of many processes that open a robot at once, as in a batch, one makes it, and the others wait for that and have it;
+    where the cache cannot be written to or locked, nobody waits.
+    """
+    if (stored := read(key)) is not None:
+        return stored
+    with ExitStack() as held:
         with suppress(OutputError):
-            stack.enter_context(one_after_another(output_path(cache_dir())))
-        yield
+            held.enter_context(one_after_another(output_path(cache_dir())))
+        if (stored := read(key)) is not None:
+            return stored
+        made = make()
+        write(key, *made)
+        return made
 
 
-def read(key: str) -> tuple[tuple[LinkMesh, ...], Decimation] | None:
+def read(key: str) -> Made | None:
     """Meshes stored under `key` and what became of them, or None when there are none (or the file is damaged)."""
     try:
         with (

@@ -110,7 +110,11 @@ class Robot:
         if not kinematics.joint_names:
             raise RobotError(f"robot {model.robot.name} ({urdf}) has no joint that moves. Name a robot that has one.")
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
-        meshes, decimation = _load_meshes(model, kinematics, urdf, link_names, (max_faces, tolerance), report)
+        limits = max_faces, tolerance
+        meshes, decimation = mesh_cache.kept(
+            _cache_key(model, kinematics, urdf, limits),
+            lambda: _prepared_meshes(model, kinematics, urdf, link_names, limits, report),
+        )
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
         return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation)
@@ -147,29 +151,15 @@ class Robot:
         return self.joint_names.index(joint_name)
 
 
-def _load_meshes(
-    model: yourdfpy.URDF,
-    kinematics: Kinematics,
-    urdf: Path,
-    link_names: tuple[str, ...],
-    limits: tuple[int, float | None],
-    report: Callable[[str], None],
-) -> tuple[tuple[LinkMesh, ...], Decimation]:
-    """Meshes of links; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
+def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
+    """What link meshes are made from; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     mesh_files = [
         mesh_path(urdf.parent, visual.geometry.mesh.filename)
         for link in model.robot.links
         for visual in link.visuals
         if visual.geometry is not None and visual.geometry.mesh is not None
     ]
-    key = mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
-    if (cached := mesh_cache.read(key)) is not None:
-        return cached
-    # Of many processes that open a robot at once, as in a batch, one decimates, and the others have what it made.
-    with mesh_cache.one_process():
-        if (cached := mesh_cache.read(key)) is not None:
-            return cached
-        return _prepared_meshes(model, kinematics, urdf, link_names, limits, report, key)
+    return mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
 
 
 def _prepared_meshes(
@@ -179,9 +169,8 @@ def _prepared_meshes(
     link_names: tuple[str, ...],
     limits: tuple[int, float | None],
     report: Callable[[str], None],
-    key: str,
-) -> tuple[tuple[LinkMesh, ...], Decimation]:
-    """The same from the files, decimated and put into the cache under `key`."""
+) -> mesh_cache.Made:
+    """Meshes of links from their files, decimated."""
     report(f"{model.robot.name}: preparing meshes (once)")
     materials = {material.name: material for material in model.robot.materials}
     links = {link.name: link for link in model.robot.links}
@@ -197,7 +186,6 @@ def _prepared_meshes(
     meshes, decimation = build_link_meshes(parts, max_faces, tolerance, report)
     if decimation.deviation:
         report(f"{model.robot.name}: {decimation}")
-    mesh_cache.write(key, meshes, decimation)
     return meshes, decimation
 
 

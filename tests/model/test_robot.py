@@ -244,5 +244,15 @@ def test_links_are_where_another_library_has_them_and_an_axis_that_is_not_given_
     assert robot.joint_limits.tolist() == [[-np.inf, np.inf], [-0.1, np.inf], [-np.inf, np.inf]]
     for positions in np.random.default_rng(0).uniform(-1, 1, (20, 3)):
         other.update_cfg(positions)
-        T = robot.forward_kinematics(torch.from_numpy(positions))[0].numpy()
-        np.testing.assert_allclose(T, other.get_transform("tip", "base"), rtol=0, atol=1e-6)
+        for link in ("tip", "arm", "slide", "finger", "plate"):
+            T = robot.link_transform(torch.from_numpy(positions), link).numpy()
+            np.testing.assert_allclose(T, other.get_transform(link, "base"), rtol=0, atol=1e-6)
+
+
+def test_derivatives_of_transforms_are_those_of_finite_differences(tmp_path: Path) -> None:
+    path = tmp_path / "branched.urdf"
+    path.write_text(BRANCHED)
+    robot = Robot.load(path)
+    positions = torch.tensor([[0.3, 0.02, -0.7], [0.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    for link in ("finger", "tip"):
+        assert torch.autograd.gradcheck(lambda q, link=link: robot.link_transform(q, link), positions)
