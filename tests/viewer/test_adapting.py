@@ -1,11 +1,10 @@
 """The network adapted to the recording, as a job of the page, and which network runs."""
 
 import json
-import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ from carts_core.recording import Sequence
 from carts_core.resources import shipped_weights
 from carts_viewer import adapting, intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.handlers import jobs
-from carts_viewer.job_work import Progress
 from carts_viewer.jobs import Job, JobState
 from carts_viewer.networks import STARTED, Networks
 from carts_viewer.running import OptimizerFactory
@@ -145,18 +142,11 @@ def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
     assert at_desk.do(intents.Reset(), intents.SetObserved("masks", "recording"), intents.Step()).unfamiliar == ()
 
 
-def done_at_once(sequence: Path, folder: Path, minutes: float) -> Iterator[Progress]:
-    """Stands for `adapt`, which the tests at a desk really run: the shipped network is what was made."""
-    folder.mkdir()
-    shutil.copy(shipped_weights()[1], folder / "surface.safetensors")
-    yield Progress(1, 1, "made")
-
-
 @pytest.mark.browser
+@pytest.mark.usefixtures("small_run")
 def test_the_network_is_adapted_in_the_page_and_used(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], monkeypatch: pytest.MonkeyPatch
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    monkeypatch.setattr(jobs, "adapt", done_at_once)
     app = open_viewer(frames=2)
     tab = open_tab(app)
     tab.page.get_by_text("Jobs", exact=True).first.click()

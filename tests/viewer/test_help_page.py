@@ -56,6 +56,11 @@ def test_the_tour_is_offered_once_goes_over_the_page_and_can_be_left_at_any_time
     tab.page.get_by_role("button", name="No tour").click()
     expect(tab.page.locator(".carts-offer")).to_have_count(0)
     assert tab.page.evaluate(stored) == "declined"
+    # Nor is somebody who does not want it asked again.
+    tab.page.reload()
+    tab.wait_until_ready()
+    tab.page.wait_for_timeout(2500)
+    expect(tab.page.locator(".carts-offer")).to_have_count(0)
     tab.page.evaluate("localStorage.removeItem('carts-tour')")
     # What it speaks of is in view, whatever was unfolded before.
     tab.page.reload()

@@ -202,7 +202,29 @@ def test_with_a_tool_in_hand_the_wheel_zooms_the_right_button_moves_and_strokes_
 
 
 @pytest.mark.browser
-def test_strokes_in_a_row_are_a_step_each_and_a_run_is_given_what_they_ignore(
+def test_thirty_strokes_in_a_row_are_thirty_steps(open_marked: Open, open_tab: OpenTab) -> None:
+    app = open_marked()
+    tab = open_tab(app)
+    hand = Hand(tab)
+    tab.page.keyboard.press("Shift+M")
+    hand.holds(target="Ignore region")
+    hand.take("Shift+B", Tool.BRUSH)
+    for key in "[[[[[]":
+        tab.page.keyboard.press(key)
+        tab.page.wait_for_timeout(60)
+    width = 8
+    hand.holds(diameter=width)
+    lines = [((20.0 + 9 * n, 30.0), (25.0 + 9 * n, 210.0)) for n in range(30)]
+    for line in lines:
+        hand.draw(*line)
+    hand.steps(30)
+    assert {step.name for step in app.project.state.steps} == {"Ignore pixels, frame 001"}
+    wanted = np.logical_or.reduce([_line((240, 320), *line, width=width) for line in lines])
+    assert _same(_ignored(app), wanted)
+
+
+@pytest.mark.browser
+def test_a_run_in_the_page_is_given_the_ignore_region(
     open_marked: Open, open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[Any] = []
@@ -218,18 +240,8 @@ def test_strokes_in_a_row_are_a_step_each_and_a_run_is_given_what_they_ignore(
     tab.page.keyboard.press("Shift+M")
     hand.holds(target="Ignore region")
     hand.take("Shift+B", Tool.BRUSH)
-    for key in "[[[[[]":
-        tab.page.keyboard.press(key)
-        tab.page.wait_for_timeout(60)
-    width = 8
-    hand.holds(diameter=width)
-    lines = [((20.0 + 18 * n, 30.0), (25.0 + 18 * n, 210.0)) for n in range(15)]
-    for line in lines:
-        hand.draw(*line)
-    hand.steps(15)
-    assert {step.name for step in app.project.state.steps} == {"Ignore pixels, frame 001"}
-    wanted = np.logical_or.reduce([_line((240, 320), *line, width=width) for line in lines])
-    assert _same(_ignored(app), wanted)
+    hand.draw((100.0, 100.0), (150.0, 150.0))
+    hand.steps(1)
     monkeypatch.setattr(OptimizerFactory, "make", watched)
     tab.button("Step")
     eventually(lambda: len(given), bool)

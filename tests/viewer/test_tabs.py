@@ -100,18 +100,18 @@ def test_a_tab_that_is_closed_in_mid_drag_leaves_a_saved_edit_and_does_not_hold_
     _shows_its_own(second)
 
 
-def test_one_worker_does_what_two_tabs_ask_for_and_loses_nothing_of_it(
+def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
     app = open_viewer(frames=12)
-    tabs = [open_tab(app, WINDOW) for _ in range(2)]
+    tabs = [open_tab(app, WINDOW) for _ in range(3)]
     for count, tab in enumerate(tabs, start=1):
         for _ in range(count):
             tab.page.keyboard.press("n")
-    eventually(lambda: [tab.state.index for tab in tabs], lambda places: places == [1, 2])
+    eventually(lambda: [tab.state.index for tab in tabs], lambda places: places == [1, 2, 3])
     for tab in tabs:
         tab.page.keyboard.press("o")
-    eventually(lambda: app.state.undoable, lambda steps: steps == 2)
+    eventually(lambda: app.state.undoable, lambda steps: steps == 3)
     for count, tab in enumerate(tabs, start=2):
         expect(tab.page.get_by_text(f"({count} of 12)")).to_be_visible(timeout=20_000)
 
