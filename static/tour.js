@@ -8,17 +8,20 @@
     ["canvas", "The picture", "The recorded image, with the arm over it where the joint positions say it is. Wheel: zoom; drag: move; " +
       "a click chooses a camera."],
     [".carts-verdict", "The verdict", "Whether the fit can be relied on: good, doubtful or failed, with the reason and what to try. " +
-      "It comes from the images, not from the solver, and is about the mask. After a run, Optimize names joints that the images do not determine."],
+      "It comes from the images, not from the solver, and is about the mask. After a run, Optimize names joints that the images do " +
+      "not determine."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
     ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
     [".carts-strip", "The timeline", "All frames: high bars fit badly. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "White ticks are keyframes and frames that stay as they are."],
-    ["Review", "Review", "Accept (G) goes on to the next frame that nobody has reviewed. Here are also keyframes, Solve between, search and history."],
+    ["Review", "Review", "Accept (G) goes on to the next frame that nobody has reviewed. Here are also keyframes, Solve between, " +
+      "search and history."],
     ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Everything is saved at once; Undo takes back anything."],
     [".carts-review-bar", "Review", "The verdict, and what you say of the frame: accepting goes on to the next one."],
     [".carts-review-bar [data-do=controls]", "All controls", "Everything else is behind this button, in tabs: fit, review, values, jobs, export, help."],
-    [".carts-bar [data-do=help]", "More", "The sheet of keys is behind this button, or press the key ?. Every control says what it does when the pointer rests on it."],
+    [".carts-bar [data-do=help]", "More", "The sheet of keys is behind this button, or press the key ?. Every control says what it " +
+      "does when the pointer rests on it."],
   ];
   let steps = []; // those that are about something in view, which is less on a small screen
   let place = -1;

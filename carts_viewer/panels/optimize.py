@@ -70,9 +70,8 @@ class OptimizePanel:
         """Bring the widgets up to date."""
         running = state.run.phase is Phase.RUNNING
         self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
-        self._run.disabled = running or state.busy is not None
+        self._run.disabled = self._step.disabled = running or state.busy is not None
         self._pause.disabled = not running
-        self._step.disabled = running
         self._reset.disabled = not state.run.curves.loss
         self._unfamiliar.content = "".join(
             f'<p class="carts-notice" role="status">{escaped(warning)}</p>' for warning in state.unfamiliar
