@@ -38,7 +38,8 @@ def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
     # Untuned, glibc asks for anything from none to all of it anew, as the heap happens to end; this has it ask for all.
     anew = page_faults("", MALLOC_MMAP_THRESHOLD_="131072")
     assert anew > 100_000
-    assert page_faults(TUNED) < 0.01 * anew
+    # The heap may still grow a little in the first rounds: on one machine in three by up to five images of 1,200 pages.
+    assert page_faults(TUNED) < 0.1 * anew
 
 
 @pytest.mark.parametrize(("given", "expected"), [({"OMP_NUM_THREADS": "2"}, 2), ({}, None)])
