@@ -115,6 +115,7 @@ def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
     groups["Optimize"].append(("Ctrl+drag", "Drag a link of an arm; its joints follow"))
+    groups["Optimize"].append(("Shift+click", "Say where a keypoint of the arm is; Shift+drag takes it along"))
     groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold it, or press it to keep it"))
     groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
     groups["View"].append(("?", "This sheet"))
@@ -127,6 +128,7 @@ def key_table(layers: Iterable[Layer]) -> str:
     rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
     rows += [
         "| **Ctrl+drag** | Drag a link of an arm; its joints follow |",
+        "| **Shift+click** | Say where a keypoint of the arm is; Shift+drag takes it along |",
         "| **,** | Loupe: pixels, coordinates, colour; hold it, or press it to keep it |",
         "| **.** (held) | The measured pose, or the one compared with |",
         "| **?** | All keys on one sheet |",

@@ -25,7 +25,6 @@ from carts_viewer.panels.people import PeoplePanel
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
 from carts_viewer.panels.review import ReviewPanel
 from carts_viewer.panels.settings import FreePanel, SettingsPanel
-from carts_viewer.panels.timeline import TimelinePanel
 from carts_viewer.panels.values import ValuesPanel
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
@@ -108,7 +107,6 @@ class Layout:
 def _review(page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> list[Panel]:
     """What is said and known of frames."""
     return [
-        TimelinePanel(page.gui),
         ReviewPanel(page, emit, waits),
         KeyframesPanel(page, session, emit),
         KeypointsPanel(page, session, emit),

@@ -378,14 +378,9 @@
     window.addEventListener("click", (event) => {
       const target = event.target instanceof Element ? event.target : null;
       const frame = target?.closest("[data-frame]");
-      const timeline = target?.closest("svg.carts-timeline");
-      if (frame) {
-        event.preventDefault();
-        report("picked", frame.dataset.frame);
-      } else if (timeline) {
-        const box = timeline.getBoundingClientRect();
-        report("picked", String(Math.floor(((event.clientX - box.left) / box.width) * timeline.dataset.frames)));
-      }
+      if (!frame) return;
+      event.preventDefault();
+      report("picked", frame.dataset.frame);
     }, { capture: true });
     window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }

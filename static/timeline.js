@@ -3,8 +3,10 @@
 (() => {
   "use strict";
 
-  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#60a5fa"]; // the last ones: moved by hand, solved
+  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#e879f9"];
+  const NAMES = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved with other frames"];
   const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
+  const VERDICTS = ["", "good", "doubtful", "failed"];
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
   const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
   const [PICTURES, CURVE] = [38, 36]; // heights of what is left out in low windows [px]
@@ -47,13 +49,14 @@
         <span class="carts-range"></span>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, or the fit"></select>
         <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve">▾</button>
+        <button data-do="legend" title="What the colours and marks mean" aria-expanded="false">Legend</button>
         <output></output>
       </div>
       <canvas role="slider" tabindex="-1" aria-label="Timeline: drag to scrub, wheel to zoom, Shift and drag for a range"></canvas>`;
     tip = document.createElement("div");
     tip.className = "carts-tip";
     tip.hidden = true;
-    strip.append(tip);
+    strip.append(tip, legend());
     [canvas, readout, picker] = ["canvas", "output", "select"].map((name) => strip.querySelector(name));
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
       strip.addEventListener(kind, (event) => event.stopPropagation());
@@ -67,6 +70,11 @@
     const actions = {
       first: () => window.carts.report("pressed", "("), last: () => window.carts.report("pressed", ")"),
       whole: () => window.carts.report("asked", "range none"),
+      legend: () => {
+        const card = strip.querySelector(".carts-strip-legend");
+        card.hidden = !card.hidden;
+        strip.querySelector("[data-do=legend]").setAttribute("aria-expanded", String(!card.hidden));
+      },
       lanes: () => { open = !open; localStorage.setItem("carts-lanes", open ? "open" : "closed"); dirty = true; },
     };
     strip.addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
@@ -75,6 +83,25 @@
     fillPicker();
     below.parentElement.append(strip);
     dirty = true;
+  }
+
+  /** What is drawn of a frame, from top to bottom, with the colours. */
+  function legend() {
+    const card = document.createElement("dl");
+    card.className = "carts-strip-legend";
+    card.hidden = true;
+    const keys = (colours, names) => [...names.keys()].filter((number) => colours[number])
+      .map((number) => `<span class="carts-key"><span class="carts-swatch" style="background: ${colours[number]}"></span>${names[number]}</span>`)
+      .join(" ");
+    const rows = [
+      ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving leaves it as it is"],
+      ["Bar", `the higher, the worse it fits. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
+      ["Stripe below", `the verdict on the fit: ${keys(FIT, VERDICTS)}`],
+      ["Stripe below that", `where the joints come from: ${keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])}`],
+      ["Line at the bottom", "the whole sequence; the frame in it is what is shown above, amber is the range"],
+    ];
+    card.innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");
+    return card;
   }
 
   function fillPicker() {
@@ -260,8 +287,8 @@
   /** What is known of a frame, in words. */
   function described(frame) {
     const code = codes[frame] ?? 0;
-    const said = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved with other frames"][code & 7];
-    const fit = ["", " · good", " · doubtful", " · failed"][(code >> 3) & 3];
+    const said = NAMES[code & 7];
+    const fit = VERDICTS[(code >> 3) & 3] && ` · ${VERDICTS[(code >> 3) & 3]}`;
     const value = curveHigh() ? window.carts.lanes.valueAt(frame) : "";
     return `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;
   }

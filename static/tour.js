@@ -8,12 +8,12 @@
     ["canvas", "The picture", "The recorded image, with the arm over it where the joint positions say it is. Wheel: zoom; drag: move; " +
       "a click chooses a camera."],
     [".carts-verdict", "The verdict", "Whether the fit can be relied on: good, doubtful or failed, with the reason and what to try. " +
-      "It comes from the images, not from the solver, and is about the mask. After a run, Optimize names joints that the images do " +
-      "not determine."],
+      "It comes from the images, not from the solver, and is about the mask. The tab Values marks joints that the " +
+      "images hardly show."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
     ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
     [".carts-strip", "The timeline", "All frames: high bars fit badly. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
-      "White ticks are keyframes and frames that stay as they are."],
+      "Legend explains colours and marks."],
     ["Review", "Review", "Accept (G) goes on to the next frame that nobody has reviewed. Here are also keyframes, Solve between, " +
       "search and history."],
     ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
@@ -35,7 +35,9 @@
     const direct = /^[A-Z]/.test(name) ? null : document.querySelector(name);
     if (direct) return visible(direct) ? direct : null;
     const named = [...document.querySelectorAll("button, [role=tab], .mantine-Paper-root *")];
-    return named.find((one) => one.textContent.trim() === name && visible(one)) ?? null;
+    const found = named.find((one) => one.textContent.trim() === name && visible(one)) ?? null;
+    // The name of a folder stands for the folder.
+    return found?.closest("button, [role=tab]") ? found : found?.parentElement.closest(".mantine-Paper-root") ?? null;
   }
 
   /** Scroll panels to what a step is about: one may have been scrolled past it. */

@@ -22,11 +22,11 @@ from carts_viewer.running import OptimizerFactory, scene_at
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
 
 _REASONS = {
-    "iterations": "Done, best iterate kept",
+    "iterations": "Done: the best iteration is the result",
     "not optimized": "Evaluated only, as the solver says",
     "converged": "Ended: no step lowers the loss any more",
     "failed": "Ended: the image contradicts what was found",
-    "start kept": "Start kept: it explains the image as well",
+    "start kept": "Ended where it started: nothing explains the image better",
     "cancelled": "Cancelled",
 }
 

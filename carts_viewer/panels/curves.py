@@ -17,7 +17,7 @@ _QUANTITIES = (("Loss", "1", _TEAL), ("Dice", "1", _BLUE), ("Joint error", "°",
 
 
 class CurvesPanel:
-    """Small charts, one per quantity; the pointer reads values off, markers show stages and what is kept."""
+    """Small charts, one per quantity; the pointer reads values off, markers show stages and the result."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._shown: tuple[Curves | None, bool] = (None, False)
@@ -46,8 +46,8 @@ def note(curves: Curves, outdated: bool) -> str:
     if outdated:
         return "Of the last run; the pose, the image or a setting was changed since."
     if curves.comparable:
-        return "○ a new stage, ● kept. All losses against the last look at the image."
-    return "○ a new stage looks at the image anew: until the run has ended, losses only compare within one."
+        return "○ a stage of the solver begins · ● the result"
+    return "○ a stage of the solver begins; until the run has ended, losses only compare within a stage."
 
 
 class _Chart:
@@ -110,4 +110,4 @@ class _Chart:
     def _newest_and_kept(self, series: Sequence[float | None], best: int) -> str:
         newest, kept = series[-1], series[best]
         text = "" if newest is None else f"<b>{newest:.3g}</b>"
-        return text if kept is None else f"{text} · kept <b>{kept:.3g}</b> of iteration {best}"
+        return text if kept is None else f"{text} · result <b>{kept:.3g}</b>, iteration {best}"

@@ -12,6 +12,7 @@ from carts_viewer.transport.tab_page import TabPage
 
 _POSSIBLE, _LIKELY = 0.1, 0.5
 """Probabilities of a failure from which a single camera's fit is doubtful and has failed; as the verdict's own [1]."""
+_MEANING = "What the images say of the fit. Good: rely on the mask. Doubtful: look at it. Failed: do not use it."
 
 
 class FitPanel:
@@ -65,8 +66,9 @@ def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, flo
         return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
     remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
     about = "<br><small>About the mask. Each joint's deviation: Values.</small>" if verdict.verdict == "good" else ""
+    name = verdict.verdict
     return (
-        f'<div class="carts-verdict {verdict.verdict}" role="status"><b>{verdict.verdict.capitalize()}</b> '
+        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>{name.capitalize()}</b> '
         f"{escaped(verdict.reason)}{about}{remedy}{line}</div>"
     )
 

@@ -39,8 +39,9 @@ class JobsPanel:
                 hint="Train it for the robots, cameras, distances and empty backgrounds of this recording",
             )
             gui.add_html(
-                '<p class="carts-caption">Solving (Review) and exports queue up here, too. A calibration fits base '
-                "frames, or what is ticked under Free parameters.</p>"
+                '<p class="carts-caption"><b>Optimize each alone</b> is Run on every frame by itself; to fit '
+                "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits base frames, or what is "
+                "ticked under Free parameters. Solving and exports queue up here, too.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="For everybody; remembered")
         self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)

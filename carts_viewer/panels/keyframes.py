@@ -12,8 +12,8 @@ from carts_viewer.transport.tab_page import TabPage
 
 _LONGEST_LIST = 200
 _MEANING = (
-    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Kept are frames that you accepted, "
-    "corrected by hand or marked here."
+    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Frames that you accepted, moved by hand or "
+    "marked as keyframes are kept as they are."
 )
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
@@ -25,7 +25,7 @@ class KeyframesPanel:
         gui = page.gui
         self._ids = session.sequence.frame_ids
         self._seen: tuple[ProjectState | None, int, tuple[int, int] | None] = (None, -1, None)
-        self._solvable, self._plan = False, ""
+        self._solvable, self._open, self._plan = False, True, ""
         self._index = 0
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
@@ -56,20 +56,22 @@ class KeyframesPanel:
         """Bring the widgets up to date."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
-        self._all.label = "Solve all" if state.range is None else "Solve range"
-        self._all.disabled = self._direction.disabled = state.solving
+        self._all.label = _whole(state)
+        self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
+        self._all.disabled = state.solving or not self._open
         # What has just been solved without keyframes needs no advice about them.
         planned = not state.solving and (bool(state.project.kept_frames) or state.solve is None)
         lines = [self._plan, _MEANING] if planned else []
         if state.solve is not None:
             done, total = state.solve.progress
             self._progress.value = 100.0 * done / total
-            lines.append(f"<b>{escaped(state.solve.text)}</b>")
+            text = escaped(state.solve.text)
+            lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
         self._show_listed(state)
-        self._text.content = f'<p class="carts-caption">{"<br>".join(lines)}</p>'
+        self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
 
     def _take_shown(self) -> intents.Intent:
         return intents.TakeSolved(self._index)
@@ -104,7 +106,18 @@ class KeyframesPanel:
         self._solvable = bool(kept) and count > 0
         first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
         where = "in the range" if state.range is not None and state.index in state.part else "yet"
-        done = f"Nothing to solve from <b>{first}</b> to <b>{last}</b>: every frame is kept"
-        plan = f"Here from <b>{first}</b> to <b>{last}</b>: {count} to solve, {len(frames) - count} kept"
-        none = f"No frame is kept {where}: accept one or correct one by hand, or solve all of them."
-        self._plan = none if not kept else plan if count else done
+        done = f"<b>Solve between</b>, {first} to {last}: every frame is kept"
+        plan = f"<b>Solve between</b>, {first} to {last}: {_frames(count)} would be fitted, {len(frames) - count} kept"
+        none = f"<b>Solve between</b> needs a kept frame; none is kept {where}"
+        open_frames = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
+        self._open = open_frames > 0
+        rest = f"{_frames(open_frames)} would be fitted" if open_frames else "every frame is kept"
+        self._plan = f"{none if not kept else plan if count else done}<br><b>{_whole(state)}</b>: {rest}"
+
+
+def _whole(state: ViewState) -> str:
+    return "Solve all" if state.range is None else "Solve range"
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'' if count == 1 else 's'}"

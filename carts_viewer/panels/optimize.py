@@ -5,6 +5,7 @@ import math
 import viser
 
 from carts_core.optimization import BASE_FRAME_GAIN
+from carts_core.project import ReviewState
 from carts_core.settings import SolverName
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
@@ -28,6 +29,14 @@ MASKS = {"Of the recording": "recording", "Imported": "imported", "Painted": "pa
 """The same for whose masks."""
 UNDETERMINED = "Not determined by this image"
 """What people read for unknowns that an image says nothing of."""
+_CONSEQUENCE = "The mask hardly depends on these, so it can be right although their values are guesses."
+_RUN = "Press Run to fit the arm to this frame."
+_BEFORE_RUN = {
+    ReviewState.ACCEPTED: "This frame is accepted. Run would fit it again, from where it is.",
+    ReviewState.REJECTED: "This frame is rejected. Run would fit it all the same.",
+    ReviewState.OPTIMIZED: "This frame has been fitted. Run goes on from where it is.",
+}
+"""What people read before a run."""
 
 
 class OptimizePanel:
@@ -103,7 +112,7 @@ def status_line(state: ViewState) -> str:
         parts.append(escaped(state.run.reason))
     if state.run_outdated and phase is Phase.IDLE:
         parts.append("changed since")
-    return " · ".join(parts) or "Press Run to fit the arm to this frame."
+    return " · ".join(parts) or _BEFORE_RUN.get(state.review.state, _RUN)
 
 
 def undetermined_lines(state: ViewState, session: Session) -> str:
@@ -111,13 +120,13 @@ def undetermined_lines(state: ViewState, session: Session) -> str:
     known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
-    lines = []
+    lines: list[str] = []
     for how, meaning in (("weak", "Weakly determined by this image"), ("not visible", UNDETERMINED)):
         these = [name for name in known.names if known.observability(name) == how]
         names = [_spoken(name) + _moved(name, state, session) for name in these]
         if names:
             lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
-    return "".join(lines)
+    return "".join([*lines, f'<p class="carts-caption">{_CONSEQUENCE}</p>' if lines else ""])
 
 
 def _moved(unknown: str, state: ViewState, session: Session) -> str:
@@ -134,14 +143,14 @@ def _moved(unknown: str, state: ViewState, session: Session) -> str:
 
 
 def calibration_line(state: ViewState) -> str:
-    """That base frames may be wrong, if the residual of the run says so, as HTML."""
+    """That base frames may be wrong, if the residual of the run says so, and what to do, as HTML."""
     gain = state.run.base_frame_gain
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (
-        '<p class="carts-caption">Base frames or the camera\'s pose may be wrong: free base frames would reduce '
-        f"the remaining residual by {100 * gain:.0f} %. Tick <b>Base frames</b> under Free parameters and "
-        "run again, or use <code>carts calibrate</code>.</p>"
+        '<p class="carts-caption">The calibration (base frames or the camera\'s pose) may be off: free base frames '
+        f"would reduce the remaining residual by {100 * gain:.0f} %. A good mask can be accepted all the same; if you "
+        "need joint values, calibrate first: <b>Jobs</b>, <b>Calibrate</b>.</p>"
     )
 
 

@@ -11,13 +11,16 @@ from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
-STATE_COLORS = {
+_COLORS = {
     ReviewState.UNTOUCHED: "#6b7280",
+    BY_HAND: "#facc15",
     ReviewState.OPTIMIZED: "#60a5fa",
+    SOLVED: "#e879f9",
     ReviewState.NEEDS_WORK: "#fb923c",
     ReviewState.ACCEPTED: "#2dd4a7",
     ReviewState.REJECTED: "#ef4444",
 }
+"""By what `review_name` says, in the order in which frames are counted; as in the timeline."""
 
 
 class ReviewPanel:
@@ -60,7 +63,7 @@ class ReviewPanel:
         review = state.review
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
         name = review_name(state.project, state.index)
-        self._state.content = f'<p class="carts-caption">{_dot(review.state)}<b>{name}</b>{keyframe}</p>'
+        self._state.content = f'<p class="carts-caption">{_dot(name)}<b>{name}</b>{keyframe}</p>'
         # Bright where the images say that there is something to accept.
         good = state.verdict is not None and state.verdict.verdict == "good"
         self._accept.color = "teal" if good else "gray"
@@ -72,12 +75,14 @@ class ReviewPanel:
 
     def _count(self, project: ProjectState) -> None:
         counts = Counter(review_name(project, index) for index in range(len(project.identity.frame_ids)))
-        shown = [(_dot(name), counts[name], str(name)) for name in ReviewState]
-        shown[1:1] = [(_dot(ReviewState.UNTOUCHED), counts[BY_HAND], BY_HAND)]
-        shown[3:3] = [(_dot(ReviewState.OPTIMIZED), counts[SOLVED], SOLVED)]
-        known = " ".join(f'<span class="carts-key">{dot}{count} {name}</span>' for dot, count, name in shown if count)
+        known = " ".join(
+            f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>'
+            for name in map(str, _COLORS)
+            if counts[name]
+        )
         self._counts.content = f'<p class="carts-caption">{known}</p>'
 
 
-def _dot(state: ReviewState) -> str:
-    return f'<span class="carts-swatch" style="background: {STATE_COLORS[state]}"></span>'
+def _dot(name: str) -> str:
+    """The colour of what `review_name` says."""
+    return f'<span class="carts-swatch" style="background: {_COLORS[name]}"></span>'

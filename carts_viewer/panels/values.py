@@ -8,6 +8,17 @@ from carts_viewer.panels.joints import to_shown
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
+_UNSURE = 1.0
+"""Standard deviation from which a joint's value is a guess [deg] and [mm]: less than half of what arms are off by."""
+_UNUSUAL = (5.0, 13.0)
+"""Corrections that are rare, twice the deviation that the solver expects of measured joints [deg] and [mm]."""
+_EXPLAINED = (
+    f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
+    "hardly show this joint. Its value is a guess; the mask hardly depends on it.<br>"
+    f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:g}° or {_UNUSUAL[1]:g} mm, which is rare "
+    "in real arms. Smaller changes are usual."
+)
+
 
 class ValuesPanel:
     """By how much every joint of the shown frame was corrected."""
@@ -32,7 +43,7 @@ class ValuesPanel:
                 cells = [
                     f"{measured:.2f}",
                     f"{now:.2f}",
-                    _signed(now - measured),
+                    _marked(_signed(now - measured), abs(now - measured) > _UNUSUAL[0 if limits.revolute else 1]),
                     _deviation(limits, known.get(arm.name), joint),
                 ]
                 if arm.name in truth:
@@ -41,10 +52,7 @@ class ValuesPanel:
                 name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
                 rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
         body = "".join(f"<tr>{row}</tr>" for row in rows)
-        self._table.content = (
-            f'<table class="carts-values">{body}</table>'
-            '<p class="carts-caption">± is the standard deviation of what the optimizer found.</p>'
-        )
+        self._table.content = f'<table class="carts-values">{body}</table><p class="carts-caption">{_EXPLAINED}</p>'
 
 
 def _signed(difference: float) -> str:
@@ -55,4 +63,11 @@ def _signed(difference: float) -> str:
 def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
     """Standard deviation of a joint as people read it; nothing where it is not known."""
     value = known[joint] if known else None
-    return "" if value is None else f"{to_shown(limits, value):.2f}"
+    if value is None:
+        return ""
+    shown = to_shown(limits, value)
+    return _marked(f"{shown:.2f}", shown > _UNSURE)
+
+
+def _marked(text: str, on: bool) -> str:
+    return f'<span class="carts-unsure">{text}</span>' if on else text

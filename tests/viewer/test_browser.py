@@ -144,7 +144,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     loss = curves.loss
     assert min(loss[1:]) < loss[0]
     expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
-    expect(tab.page.get_by_text(f"kept {loss[curves.best]:.3g} of iteration {curves.best}").first).to_be_visible()
+    expect(tab.page.get_by_text(f"result {loss[curves.best]:.3g}, iteration {curves.best}").first).to_be_visible()
     app.wait_until_shown()
     assert app.view.scene.sent("/overlay") != start
     charts = tab.page.evaluate(
@@ -215,7 +215,7 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     tab.page.keyboard.press("k")
     expect(tab.page.get_by_text("from 001 to 007")).to_be_visible()
     app.queue.put(intents.MoveFrame(1))
-    expect(tab.page.get_by_text("6 to solve, 1 kept")).to_be_visible()
+    expect(tab.page.get_by_text("6 frames would be fitted, 1 kept")).to_be_visible()
     tab.button("Solve between")
     stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
     expect(stop).to_be_visible()
@@ -355,7 +355,7 @@ def test_reviewing_is_saved_as_the_page_says_and_is_there_in_another_server(
     tab.button("Accept + next")
     eventually(lambda: app.state.index, lambda index: index == 2)
     expect(tab.page.get_by_text("1 accepted")).to_be_visible()
-    timeline = tab.page.locator("svg.carts-timeline")
+    timeline = tab.page.locator(".carts-strip canvas")
     box = timeline.bounding_box()
     assert box is not None
     timeline.click(position={"x": 0.1 * box["width"], "y": 20})

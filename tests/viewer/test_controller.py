@@ -92,7 +92,7 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     first = desk.state
     assert len(first.run.curves.loss) == 1 and first.maps is not None
     state = desk.finish()
-    assert state.run.phase is Phase.IDLE and state.run.reason == "Done, best iterate kept"
+    assert state.run.phase is Phase.IDLE and state.run.reason == "Done: the best iteration is the result"
     assert len(state.run.curves.loss) == 5 and len(state.run.curves.scores) == 5
     assert min(state.run.curves.loss) < state.run.curves.loss[0]
     assert state.maps is not None and state.maps.iterate.loss == min(state.run.curves.loss)

@@ -11,25 +11,11 @@ from viewer_canvas import decoded, eventually
 from viewer_desk import Desk
 from viewer_tab import Tab
 
-from carts_core.project import Figures, Project
+from carts_core.project import Figures
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.panels.timeline import badness
 from carts_viewer.thumbnails import HEIGHT
 from carts_viewer.traces import Traces
-
-
-def _figures(project: Project, *figures: Figures) -> dict[int, float]:
-    project.record_figures(dict(enumerate(figures)), project.state)
-    return badness(project.state)
-
-
-def test_badness_is_the_loss_over_the_largest_until_any_frame_has_dice(desk: Desk) -> None:
-    project = desk.session.editor.project
-    assert badness(project.state) == {}
-    assert _figures(project, Figures(loss=0.2), Figures(loss=0.4)) == {0: 0.5, 1: 1.0}
-    assert _figures(project, Figures(loss=0.2), Figures(loss=0.4, dice=0.75)) == {1: 0.25}
-
 
 # ---- Curves --------------------------------------------------------------------------------------------------------
 
@@ -104,6 +90,13 @@ def test_the_status_is_that_of_the_shown_frame_and_a_label_at_the_pointer_has_th
     tab.page.mouse.move(box["x"] + box["width"] * 5.5 / 8, box["y"] + 30)
     expect(tip).to_have_text("006 of 8 · untouched")
     expect(status).to_contain_text("001 of 8 · untouched")
+    legend = tab.page.locator(".carts-strip-legend")
+    expect(legend).to_be_hidden()
+    tab.page.get_by_role("button", name="Legend").click()
+    expect(legend).to_contain_text("solving leaves it as it is")
+    tab.page.get_by_role("button", name="Legend").click()
+    expect(legend).to_be_hidden()
+    tab.page.mouse.move(box["x"] + box["width"] * 5.5 / 8, box["y"] + 30)
     label = tip.bounding_box()
     assert label is not None and abs(label["x"] + label["width"] / 2 - box["x"] - box["width"] * 5.5 / 8) < 2
     tab.page.mouse.move(box["x"] + 200, box["y"] - 200)
