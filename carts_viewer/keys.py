@@ -105,17 +105,21 @@ _GROUPS = {
     "View": ("",),
 }
 """Names of groups, and words by which the keys of a group are known; the first group that fits has the key."""
+_POINTER = (
+    ("Ctrl+drag", "Drag a link of an arm; its joints follow"),
+    ("Shift+click", "Say where a keypoint of the arm is; Shift+drag takes it along"),
+)
+"""What the pointer does on the picture while a key is held."""
 
 
 def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]]]:
     """The shortcuts for the sheet of keys: group by group, each key with what it does."""
     groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
+    groups["On the picture"] = list(_POINTER)
     order = ["Review", "Optimize", "Paint", "Frames", "View"]
     for shortcut in shortcuts(layers):
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
-    groups["Optimize"].append(("Ctrl+drag", "Drag a link of an arm; its joints follow"))
-    groups["Optimize"].append(("Shift+click", "Say where a keypoint of the arm is; Shift+drag takes it along"))
     groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold it, or press it to keep it"))
     groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
     groups["View"].append(("?", "This sheet"))
@@ -127,8 +131,7 @@ def key_table(layers: Iterable[Layer]) -> str:
     """The shortcuts as a Markdown table."""
     rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
     rows += [
-        "| **Ctrl+drag** | Drag a link of an arm; its joints follow |",
-        "| **Shift+click** | Say where a keypoint of the arm is; Shift+drag takes it along |",
+        *(f"| **{key}** | {text} |" for key, text in _POINTER),
         "| **,** | Loupe: pixels, coordinates, colour; hold it, or press it to keep it |",
         "| **.** (held) | The measured pose, or the one compared with |",
         "| **?** | All keys on one sheet |",

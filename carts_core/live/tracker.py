@@ -236,10 +236,11 @@ class LiveTracker:
 
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
         """Whether what was measured can be relied on; where nothing was known, only a search can."""
+        if attempt.effort is Effort.SEARCH:
+            # It comes from far off, and ends less close than frames that follow each other.
+            return measurement.loss <= self.live.bad_loss
         if self._bad(measurement):
             return False
-        if attempt.effort is Effort.SEARCH:
-            return True
         contradiction = measurement.information.mahalanobis(attempt.expected)
         return self._filtered is not None and contradiction <= _CONTRADICTS
 

@@ -114,6 +114,7 @@ def test_both_leave_frames_without_a_painted_mask_to_the_network(sequence: Path,
     assert painted["dice_after"] > painted["dice_before"] and other["dice_after"] is None and other["verdict"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_network")
 def test_ignored_pixels_of_the_project_and_of_a_label_are_left_out(
     tiny_sequence: Callable[..., Path], tmp_path: Path

@@ -54,7 +54,7 @@ def test_a_network_is_loaded_where_it_is_asked_for(
 
 
 @pytest.mark.usefixtures("no_network")
-@pytest.mark.parametrize("mode", ["frame", "sequence"])
+@pytest.mark.parametrize("mode", ["frame", pytest.param("sequence", marks=pytest.mark.slow)])
 def test_frames_whose_mask_has_changed_are_optimized_again(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], mode: str
 ) -> None:

@@ -31,6 +31,7 @@ SLOW = {
     "docs/howto/sequences.md",
     "docs/reference/exports.md",
     "docs/reference/sequence_format.md",
+    "docs/tutorial/python.md",
 }
 """Pages whose blocks run in the slow tests; that commands and imports of all pages are understood is always tested."""
 SECONDS = 280

@@ -25,6 +25,9 @@ from carts_core.errors import CartsError
 from fuzz.kinds import KINDS, NotFiniteError, make_folder
 
 SECONDS = 10.0
+"""Of computing that an input may take [s]."""
+PATIENCE = 120.0
+"""How long an answer is waited for on a busy machine [s]."""
 MEMORY = 2 * 2**30
 """Of the worker, above what it holds before its first input [bytes]."""
 
@@ -74,8 +77,8 @@ def _watched(pipe: Connection, jobs: list[tuple[str, int]]) -> Iterator[Outcome]
     """Outcomes as the worker sends them, up to the first input that it does not get over."""
     for kind, seed in jobs:
         try:
-            if not pipe.poll(SECONDS + 2.0):
-                yield Outcome(kind, seed, "hang", seconds=SECONDS)
+            if not pipe.poll(PATIENCE):
+                yield Outcome(kind, seed, "hang", seconds=PATIENCE)
                 return
             yield pipe.recv()
         except EOFError:
@@ -99,7 +102,7 @@ def _outcome(folder: Path, kind: str, seed: int, right: bytes) -> Outcome:
     path = folder / KINDS[kind].file
     path.write_bytes(wrong_input(kind, seed, right))
     Path("/proc/self/clear_refs").write_text("5")  # The peak is counted from here on.
-    before, start = _memory("VmRSS"), time.monotonic()
+    before, start = _memory("VmRSS"), time.process_time()
     detail = ""
     try:
         KINDS[kind].read(path)
@@ -110,7 +113,7 @@ def _outcome(folder: Path, kind: str, seed: int, right: bytes) -> Outcome:
         result, detail = "not finite", traceback.format_exc()
     except BaseException:
         result, detail = "traceback", traceback.format_exc()
-    seconds = time.monotonic() - start
+    seconds = time.process_time() - start
     if result in GOOD and seconds > SECONDS:
         result = "hang"
     if result in GOOD and _memory("VmHWM") - before > MEMORY:

@@ -54,6 +54,7 @@ def test_where_most_of_the_arm_contradicts_the_estimate_is_wrong_and_nothing_is_
     assert propose_ignore(scene, silhouette, similarity) == {}
 
 
+@pytest.mark.slow
 def test_a_frame_is_solved_again_without_what_contradicts_and_reset_forgets_it(
     sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def ended(desk: Desk) -> Job:
     return desk.state.jobs[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_run")
 def test_a_job_adapts_the_network_and_what_it_made_is_used_and_remembered(at_desk: Desk) -> None:
     at_desk.do(intents.Adapt(1))

@@ -28,6 +28,7 @@ def test_every_key_brings_its_frame_with_its_overlay(open_viewer: Callable[..., 
     assert not latency.stale and 0 < latency.median <= latency.p95 <= latency.worst
 
 
+@pytest.mark.slow
 def test_a_short_soak_sees_what_it_is_there_for(
     open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ from carts_viewer.app import ViewerApp
 pytestmark = pytest.mark.browser
 
 
-@pytest.mark.parametrize("rest", [400, 6000])
+@pytest.mark.parametrize("rest", [400, pytest.param(6000, marks=pytest.mark.slow)])
 def test_a_drag_right_after_a_field_was_in_use_or_with_a_rest_on_the_way_is_one_step(
     open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab], rest: int
 ) -> None:

@@ -201,6 +201,7 @@ def test_with_a_tool_in_hand_the_wheel_zooms_the_right_button_moves_and_strokes_
     assert len(app.project.state.steps) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_thirty_strokes_in_a_row_are_thirty_steps(open_marked: Open, open_tab: OpenTab) -> None:
     app = open_marked()

@@ -223,6 +223,7 @@ def test_measurements_of_other_settings_weights_or_code_are_not_used(
     assert not set(tiny_benchmark().runs.values()) & set(reference.values())
 
 
+@pytest.mark.slow
 def test_a_killed_benchmark_leaves_lines_that_are_all_valid(tmp_path: Path, tiny_sequence) -> None:
     path = tiny_sequence(frames=1, domains=("regular",), width=160, height=128)
     script = tmp_path / "bench.py"

@@ -31,6 +31,7 @@ def campaign(sandbox: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> int:
     return made
 
 
+@pytest.mark.slow
 def test_hostile_names_lead_nowhere_when_synthesized(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
