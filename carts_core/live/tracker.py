@@ -2,6 +2,7 @@
 
 import math
 import statistics
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -30,6 +32,10 @@ _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""
 _CONTRADICTS = 9.0
 """A correction three deviations off what was expected, on average, contradicts it."""
+_CHANGED = 0.5
+"""Change of small pictures from which they show something else: they correlate by less than a half [1]."""
+_SMALL = (32, 24)
+"""Width and height of these pictures [px]."""
 
 
 class LiveVerdict(StrEnum):
@@ -85,6 +91,18 @@ class _Attempt:
     """Correction that follows."""
 
 
+@dataclass(frozen=True)
+class _Recovery:
+    """An attempt on a thread of its own."""
+
+    attempt: _Attempt
+    picture: Float[np.ndarray, "cameras pixels"]
+    """Of its frame, small."""
+    measurement: Future[Measurement]
+    dropped: threading.Event
+    """Set to give it up."""
+
+
 class LiveTracker:
     """Follows the arms of a scene. One frame at a time; frames may be left out, and times need not be even.
 
@@ -134,7 +152,9 @@ class LiveTracker:
         self._searched = -math.inf
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
         self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
-        self._recovery: tuple[_Attempt, Future[Measurement]] | None = None
+        self._recovery: _Recovery | None = None
+        self._gave_up = False
+        """Whether the last search was given up."""
 
     def close(self) -> None:
         """End the thread once it is done with its frame."""
@@ -194,6 +214,8 @@ class LiveTracker:
         """With no more effort than it takes, and no more than the thread that calls is to have."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
+        picture = _picture(frame)
+        self._drop_outdated(picture)
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
@@ -204,17 +226,31 @@ class LiveTracker:
             return found
         attempt = self._known(errors, now, effort)
 
+        dropped = threading.Event()
+
         def more() -> Measurement:
             if effort is Effort.SEARCH:
-                return small.cold(frame, variables, attempt.expected)
+                return small.cold(frame, variables, attempt.expected, cancelled=dropped.is_set)
             return full.warm(frame, variables, attempt.expected, attempt.expected.mean)
 
         if effort is Effort.SEARCH:
             self._searched = now
         if self._pool is None or found is None:
             return attempt, more()
-        self._recovery = attempt, self._pool.submit(more)
+        self._recovery = _Recovery(attempt, picture, self._pool.submit(more), dropped)
         return found
+
+    def _drop_outdated(self, picture: Float[np.ndarray, "cameras pixels"]) -> None:
+        """Give up a search in a frame that this one does not resemble: what hid the arms, say, has been taken away."""
+        running = self._recovery
+        if running is None or running.attempt.effort is not Effort.SEARCH or running.picture.shape != picture.shape:
+            return
+        # The one after it runs to its end, or arms that move fast before a plain wall would never be found.
+        if self._gave_up:
+            return
+        if _change(running.picture, picture) > _CHANGED:
+            running.dropped.set()
+            self._recovery, self._searched, self._gave_up = None, -math.inf, True
 
     def _further(self, now: float) -> Effort:
         """What is tried with a frame that did not fit."""
@@ -225,10 +261,11 @@ class LiveTracker:
 
     def _take_recovered(self, errors: ErrorModel) -> Effort | None:
         """Use what came of more effort with an earlier frame, unless a later one has fitted since; the effort if so."""
-        if self._recovery is None or not self._recovery[1].done():
+        if self._recovery is None or not self._recovery.measurement.done():
             return None
-        attempt, measurement = self._recovery[0], self._recovery[1].result()
-        self._recovery = None
+        attempt, future = self._recovery.attempt, self._recovery.measurement
+        self._recovery, self._gave_up = None, False
+        measurement = future.result()
         if attempt.time <= self._seen or not self._fits(attempt, measurement):
             return None
         self._take(errors, attempt, measurement)
@@ -274,3 +311,16 @@ class LiveTracker:
             priors = self._model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
             self._errors = ErrorModel(self._model, variables.expected(*priors).cpu().double().numpy())
         return self._errors
+
+
+def _picture(frame: Frame) -> Float[np.ndarray, "cameras pixels"]:
+    """The images, small and gray, each without its mean."""
+    small = [cv2.resize(image, _SMALL, interpolation=cv2.INTER_AREA) for image in frame.images.values()]
+    pixels = np.stack([image.reshape(_SMALL[0] * _SMALL[1], -1).mean(axis=1) for image in small]).astype(float)
+    return pixels - pixels.mean(axis=1, keepdims=True)
+
+
+def _change(before: Float[np.ndarray, "cameras pixels"], now: Float[np.ndarray, "cameras pixels"]) -> float:
+    """How much pictures have changed in the camera where they did most [1]: 0.7 where they have nothing in common."""
+    sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
+    return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())

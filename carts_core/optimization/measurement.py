@@ -1,6 +1,7 @@
 """What the images of one frame measure of its correction, near a place where it is looked for."""
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,10 +85,23 @@ class FrameSolver:
         loss = fit.reached.evaluation.stage_loss
         return Measurement(_double(correction), seen.scaled(self._share), loss, fit.used)
 
-    def cold(self, frame: Frame, variables: Variables, expected: Gaussian, *, quick: bool = False) -> Measurement:
-        """Find the correction from the measured values on; quick in smaller images but for the end."""
+    def cold(
+        self,
+        frame: Frame,
+        variables: Variables,
+        expected: Gaussian,
+        *,
+        quick: bool = False,
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Measurement:
+        """Find the correction from the measured values on; quick in smaller images but for the end.
+
+        Raises:
+            CancelledError: `cancelled` has said so, after some evaluation.
+        """
         stages = reduced(self._cold, _QUICK_SCALE) if quick else self._cold
-        fit = self._run(frame, variables, _prior(expected, variables), stages, np.zeros(len(variables)))
+        start = np.zeros(len(variables))
+        fit = self._run(frame, variables, _prior(expected, variables), stages, start, cancelled)
         assert fit.reached is not None
         end = self.warm(frame, variables, expected, _double(fit.reached.offsets))
         return replace(end, iterations=fit.used + end.iterations)
@@ -129,13 +143,20 @@ class FrameSolver:
         )
 
     def _run(
-        self, frame: Frame, variables: Variables, prior: Prior, stages: tuple[Stage, ...], start: np.ndarray
+        self,
+        frame: Frame,
+        variables: Variables,
+        prior: Prior,
+        stages: tuple[Stage, ...],
+        start: np.ndarray,
+        cancelled: Callable[[], bool] = lambda: False,
     ) -> Fit:
         problem = self._problem(frame, variables, prior)
         offsets = variables.clamp(torch.from_numpy(start).to(variables.lower))
         fit = Fit(problem, offsets, self._settings.iterations)
         for _ in run_stages(stages, fit):
-            pass
+            if cancelled():
+                raise CancelledError
         return fit
 
 

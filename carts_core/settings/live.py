@@ -15,7 +15,7 @@ class LiveSettings:
     """Stages of a frame that is where it is expected."""
     full: tuple[Stage, ...] = presets.WARM
     """Stages where the small ones end in a bad fit."""
-    search: tuple[Stage, ...] = presets.reduced(presets.COLD, 1.0)
+    search: tuple[Stage, ...] = presets.LIVE_SEARCH
     """Stages where the arms are lost; `small` follows."""
     bad_loss: float = 0.06
     """Loss from which a fit is bad [1]."""

@@ -27,9 +27,16 @@ from .stages import (
 _FAR = Observe(margin=27, attention=27, haze=False)
 """An observation that has to find arms which are several degrees off."""
 
+
+def reduced(stages: tuple[Stage, ...], scale: float) -> tuple[Stage, ...]:
+    """The same stages with no observation at more than `scale` times the working image."""
+    return tuple(replace(s, scale=min(s.scale, scale)) if isinstance(s, Observe) else s for s in stages)
+
+
 _COARSE = Descend(blur=8.0, robust=2.0, tolerance=0.06)
 _MEDIUM = Descend(blur=3.0, tolerance=0.06)
 _FINE = Descend(blur=1.6, tolerance=0.06)
+_RESTART = RandomRestart(then=(Descend(blur=8.0), _FAR, Descend(blur=3.0)))
 
 SEARCH: tuple[Stage, ...] = (
     SilhouetteSearch(),
@@ -39,7 +46,7 @@ SEARCH: tuple[Stage, ...] = (
     # Conditioned on the start again, so that an error of the first pass is not confirmed by itself.
     Observe(given=Given.START, margin=27, attention=27, haze=False),
     _MEDIUM,
-    RandomRestart(then=(Descend(blur=8.0), _FAR, Descend(blur=3.0))),
+    _RESTART,
     Observe(),
     _MEDIUM,
     _FINE,
@@ -81,6 +88,9 @@ LIVE: tuple[Stage, ...] = (
 )
 """A frame of a live stream, near where it is expected: one small observation, one step, and the outlines."""
 
+LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
+"""A frame of a live stream whose arms are lost; `LIVE` follows."""
+
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
 """How well a given state fits a frame, in a smaller image."""
 
@@ -102,8 +112,3 @@ FEATURES: tuple[Stage, ...] = (FirstOrder(attention=20, blur=1.6), FirstOrder())
 
 PAPER: tuple[Stage, ...] = (FirstOrder(share=1.0, blur=0.0),)
 """The paper's: one attention, no blur."""
-
-
-def reduced(stages: tuple[Stage, ...], scale: float) -> tuple[Stage, ...]:
-    """The same stages with no observation at more than `scale` times the working image."""
-    return tuple(replace(s, scale=min(s.scale, scale)) if isinstance(s, Observe) else s for s in stages)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
+from concurrent.futures import CancelledError
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -175,10 +176,10 @@ def test_a_search_beside_the_stream_keeps_no_frame_waiting(concurrent: Stream, m
     searching, go_on = Event(), Event()
     cold = FrameSolver.cold
 
-    def slow(*arguments: Any) -> Measurement:
+    def slow(*arguments: Any, **options: Any) -> Measurement:
         searching.set()
         assert go_on.wait(60)
-        return cold(*arguments)
+        return cold(*arguments, **options)
 
     monkeypatch.setattr(FrameSolver, "cold", slow)
     first = [concurrent.next() for _ in range(3)]
@@ -211,10 +212,49 @@ def test_an_arm_that_jumps_is_found_again_beside_the_stream(concurrent: Stream) 
     assert after[-1][0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
 
 
+def test_a_search_in_a_picture_that_is_gone_is_given_up_for_the_next_one(
+    concurrent: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[float] = []
+    given_up: list[float] = []
+    cold = FrameSolver.cold
+
+    def noted(self: FrameSolver, frame: Frame, *arguments: Any, cancelled: Callable[[], bool]) -> Measurement:
+        begun.append(frame.timestamp or 0.0)
+        hidden = concurrent.predictor.hidden
+        # A search among nothing takes until somebody gives it up.
+        while hidden and not cancelled():
+            time.sleep(0.01)
+        try:
+            return cold(self, frame, *arguments, cancelled=cancelled)
+        except CancelledError:
+            given_up.append(frame.timestamp or 0.0)
+            raise
+
+    def until(verdict: LiveVerdict) -> None:
+        for _ in range(400):
+            if concurrent.next(0.02)[0] is verdict:
+                return
+            time.sleep(0.02)
+        pytest.fail(f"never {verdict}")
+
+    monkeypatch.setattr(FrameSolver, "cold", noted)
+    until(LiveVerdict.GOOD)
+    concurrent.predictor.hidden = True
+    until(LiveVerdict.LOST)
+    begun.clear(), given_up.clear()
+    while not begun:
+        concurrent.next(0.02)
+    concurrent.predictor.hidden, concurrent.slip = False, float(np.deg2rad(4.0))
+    shown = concurrent.time
+    until(LiveVerdict.GOOD)
+    assert given_up == begun[:1] and given_up[0] <= shown and concurrent.overlap() > 0.97
+
+
 def test_what_goes_wrong_in_a_search_beside_the_stream_is_raised(
     concurrent: Stream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*_: Any) -> Measurement:
+    def broken(*_: Any, **options: Any) -> Measurement:
         raise SettingsError("no such weights")
 
     monkeypatch.setattr(FrameSolver, "cold", broken)
