@@ -11,9 +11,9 @@ from .stages import Stage
 class LiveSettings:
     """What a tracker does with each frame, and when it takes the arms for lost."""
 
-    small: tuple[Stage, ...] = presets.LIVE
+    small: tuple[Stage, ...] = presets.WARM
     """Stages of a frame that is where it is expected."""
-    full: tuple[Stage, ...] = presets.WARM
+    full: tuple[Stage, ...] = presets.WARM_WIDE
     """Stages where the small ones end in a bad fit."""
     search: tuple[Stage, ...] = presets.LIVE_SEARCH
     """Stages where the arms are lost; `small` follows."""

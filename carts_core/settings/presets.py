@@ -78,18 +78,19 @@ COLD: tuple[Stage, ...] = (*SEARCH, Observe(), FINEST)
 _WIDE = Observe(margin=27, attention=27)
 """An observation with more room around the arms."""
 
-WARM: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
-"""A frame of a sequence whose neighbours are known."""
+WARM_WIDE: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
+"""As `WARM`, for a frame that may be farther from where it is expected."""
 
-LIVE: tuple[Stage, ...] = (
+WARM: tuple[Stage, ...] = (
     Observe(scale=0.6, margin=10, attention=10),
     Descend(blur=1.2, steps=1),
     AlignEdges(steps=6),
 )
-"""A frame of a live stream, near where it is expected: one small observation, one step, and the outlines."""
+"""A frame of a sequence or stream, near where its neighbours let expect it: one small observation, one step, and the
+outlines."""
 
 LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
-"""A frame of a live stream whose arms are lost; `LIVE` follows."""
+"""A frame of a live stream whose arms are lost; `WARM` follows."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
 """How well a given state fits a frame, in a smaller image."""

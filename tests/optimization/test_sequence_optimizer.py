@@ -356,12 +356,13 @@ def test_a_measurement_informs_others_as_firmly_as_its_noise_says(truths: Truths
         seen = solver.warm(frame, variables, expected, np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
         return solver.warm(frame, variables, expected, seen.correction)
 
-    firm, loose = (measure(SequenceSettings(measurement_noise=factor * settings.noise)) for factor in (1, 2))
+    model = SequenceSettings(measurement_noise=settings.noise, warm=presets.WARM_WIDE)
+    firm, loose = (measure(replace(model, measurement_noise=factor * settings.noise)) for factor in (1, 2))
     np.testing.assert_allclose(firm.correction, loose.correction, atol=1e-6)
     precision = firm.information.precision
     np.testing.assert_allclose(precision, 4.0 * loose.information.precision, rtol=1e-3, atol=1e-3 * precision.max())
     # Edges of so small an image lie elsewhere.
-    warm = tuple(stage for stage in presets.WARM if not isinstance(stage, AlignEdges))
-    surface = measure(SequenceSettings(measurement_noise=settings.noise, warm=warm))
+    warm = tuple(stage for stage in model.warm if not isinstance(stage, AlignEdges))
+    surface = measure(replace(model, warm=warm))
     assert np.abs(surface.correction[:2]).max() < 0.3 * np.deg2rad(0.2), "the truth is at 0"
     assert precision[0, 0] > 1.05 * surface.information.precision[0, 0], "edges inform others, too"
