@@ -1,18 +1,29 @@
 """What jobs do that no other part of the viewer does: runs on many frames, each alone, and a calibration."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Container, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from carts_core.errors import CartsError
 from carts_core.model.scene import Scene
 from carts_core.optimization.calibration import CalibrationOptimizer
-from carts_core.project import CorrectedIntrinsics, CorrectedTransform, Figures, Key, Provenance, Source
+from carts_core.project import (
+    CorrectedIntrinsics,
+    CorrectedTransform,
+    Figures,
+    Key,
+    ProjectState,
+    Provenance,
+    ReviewState,
+    Source,
+)
 from carts_core.recording import spread
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_viewer.context import Context
 from carts_viewer.running import OptimizerFactory, scene_at
 from carts_viewer.solved import Comparison
+
+_ACCEPTED, _OPTIMIZED = ReviewState.ACCEPTED, ReviewState.OPTIMIZED
 
 
 @dataclass(frozen=True)
@@ -102,9 +113,17 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     if session.editor.view.records.get(-1) is not before.records.get(-1):
         raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
     context.save()
+    accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
-    yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}")
+    again = f" All masks have moved: solve the {solved} frames again that were fitted before." if solved else ""
+    again += f" {accepted} accepted frames are unreviewed now." if accepted else ""
+    yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}{again}")
+
+
+def _count(project: ProjectState, states: Container[ReviewState]) -> int:
+    """Frames in one of these review states."""
+    return sum(project.review(index).state in states for index in project.records if index >= 0)
 
 
 def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> dict[Key[Any], Any]:

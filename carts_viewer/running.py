@@ -163,6 +163,7 @@ class OptimizerFactory(NetworkLoader):
         direction: Direction,
         free: FreeParameters,
         keyframes: Mapping[int, Mapping[str, np.ndarray]],
+        keyframe_std: Mapping[int, Mapping[str, np.ndarray]],
         target: Target,
         ignore: Ignore,
     ) -> SequenceRun:
@@ -178,6 +179,7 @@ class OptimizerFactory(NetworkLoader):
             direction: Where to begin.
             free: Which joints may move.
             keyframes: Frame -> arm -> joint positions [rad, m] that stay.
+            keyframe_std: Frame -> arm -> their standard deviations [rad, m], where they are known.
             target: What is fitted.
             ignore: Frame -> camera -> pixels that show something else.
 
@@ -196,6 +198,7 @@ class OptimizerFactory(NetworkLoader):
             model=model,
             free=free,
             keyframes=keyframes,
+            keyframe_std=keyframe_std,
             ignore=ignore,
             backgrounds=Backgrounds.of(sequence, cameras, domain),
             cameras=list(cameras),

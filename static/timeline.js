@@ -98,7 +98,8 @@
       ["Bar", `the higher, the worse it fits. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
       ["Stripe below", `the verdict on the fit: ${keys(FIT, VERDICTS)}`],
       ["Stripe below that", `where the joints come from: ${keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])}`],
-      ["Line at the bottom", "the whole sequence; the frame in it is what is shown above, amber is the range"],
+      ["Line at the bottom", "the whole sequence; the frame in it is what is shown above"],
+      ["Bands", "teal: the shown frame; pink: being solved; amber ends: the range, with what is outside dimmed"],
     ];
     card.innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");
     return card;

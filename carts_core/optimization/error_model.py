@@ -39,10 +39,10 @@ class Information:
         return Information(np.zeros((n, n)), np.zeros(n))
 
     @staticmethod
-    def exact(correction: Float[np.ndarray, " n"]) -> "Information":
-        """Of a known correction; entries that are NaN are not known."""
+    def known(correction: Float[np.ndarray, " n"], std: Float[np.ndarray, " n"] | float = 0.0) -> "Information":
+        """Of a correction that is known up to a standard deviation [rad]; entries that are NaN are not known."""
         known = np.isfinite(correction)
-        precision = np.where(known, _EXACT, 0.0)
+        precision = np.where(known, 1.0 / (np.square(std) + 1.0 / _EXACT), 0.0)
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
     def scaled(self, share: float) -> "Information":

@@ -1,6 +1,6 @@
 """Frames that a stopped run has already solved are not solved again."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, is_dataclass
 from typing import Any
 
@@ -42,10 +42,18 @@ class ResumableFrameSolver(FrameSolver):
         key = _key("warm", frame, expected, start)
         return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start))
 
-    def cold(self, frame: Frame, variables: Variables, expected: Gaussian, *, quick: bool = False) -> Measurement:
+    def cold(
+        self,
+        frame: Frame,
+        variables: Variables,
+        expected: Gaussian,
+        *,
+        quick: bool = False,
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Measurement:
         """As `FrameSolver.cold`."""
-        key = _key("cold", frame, expected, quick)
-        return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, quick=quick))
+        key, options = _key("cold", frame, expected, quick), {"quick": quick, "cancelled": cancelled}
+        return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, **options))
 
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
         """As `FrameSolver.at`."""

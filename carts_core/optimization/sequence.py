@@ -51,6 +51,8 @@ class SequenceOptimizer:
         model: of the measurement error, and the direction.
         free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] that a person set.
+        keyframe_std: position -> arm name -> standard deviations [rad, m] of keyframes that an optimizer found and a
+            person accepted: their joints may be guesses. Others, and deviations that are NaN, count as exact.
         ignore: position -> camera name -> pixels that show an occluder; none by default.
         backgrounds: of the cameras, for what the network takes for an arm in them.
         cameras: names of the cameras that take part, all by default.
@@ -73,6 +75,7 @@ class SequenceOptimizer:
         model: SequenceSettings | None = None,
         free: FreeParameters | None = None,
         keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
+        keyframe_std: Mapping[int, Mapping[str, ArrayLike]] | None = None,
         ignore: Ignore | None = None,
         backgrounds: Backgrounds | None = None,
         cameras: Sequence[str] | None = None,
@@ -87,6 +90,12 @@ class SequenceOptimizer:
         }
         for positions in self._keyframes.values():
             self._scene.state(positions)
+        self._keyframe_std = {
+            index: {
+                name: _deviations((keyframe_std or {}).get(index, {}).get(name), values) for name, values in of.items()
+            }
+            for index, of in self._keyframes.items()
+        }
         gaps = visiting_gaps(times, self.model)
         unknown = set(self._keyframes) - set(gaps)
         if unknown:
@@ -250,9 +259,11 @@ class SequenceOptimizer:
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
         given = self._keyframes[frame.index]
         correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
+        std = self._keyframe_std[frame.index]
+        farther = variables.joint_offsets([given[arm.name] + std[arm.name] for arm in self._scene.arms])
         here = np.where(np.isfinite(correction), correction, expected.mean)
         seen = self._solver.at(frame, variables, expected, here)
-        return replace(seen, information=Information.exact(correction))
+        return replace(seen, information=Information.known(correction, farther - correction))
 
     def _open(self, index: int) -> tuple[Frame, Variables]:
         frame = self._load(index)
@@ -295,5 +306,10 @@ class SequenceOptimizer:
             estimate,
             state=replace(estimate.state, joint_positions=state.joint_positions),
             joint_positions={arm.name: given[arm.name].copy() for arm in self._scene.arms},
-            joint_std={arm.name: np.zeros_like(given[arm.name]) for arm in self._scene.arms},
+            joint_std={arm.name: self._keyframe_std[index][arm.name].copy() for arm in self._scene.arms},
         )
+
+
+def _deviations(given: ArrayLike | None, positions: np.ndarray) -> np.ndarray:
+    """Standard deviations of a keyframe's joint positions; 0 where none are known."""
+    return np.zeros_like(positions) if given is None else np.nan_to_num(np.asarray(given, np.float64))

@@ -26,7 +26,7 @@ _REASONS = {
     "not optimized": "Evaluated only, as the solver says",
     "converged": "Ended: no step lowers the loss any more",
     "failed": "Ended: the image contradicts what was found",
-    "start kept": "Ended where it started: nothing explains the image better",
+    "start kept": "The start is kept: what was found fits hardly better",
     "cancelled": "Cancelled",
 }
 

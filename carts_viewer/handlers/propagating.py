@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import singledispatchmethod
 from typing import Any
 
+import numpy as np
+
 from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
 from carts_core.project import Figures, Key, ProjectState, between_kept
@@ -122,6 +124,7 @@ class PropagatingHandler:
             state.direction,
             state.free,
             keyframes={index: self._session.joints(pose.scene) for index, pose in poses.items()},
+            keyframe_std={index: _deviations(self._before, index) for index in kept},
             target=target,
             ignore=lambda index: self._session.ignored(index, cameras, target),
         )
@@ -219,3 +222,9 @@ class PropagatingHandler:
     def _report(self, **changes: Any) -> None:
         if self._context.state.solve is not None:
             self._context.change(solve=replace(self._context.state.solve, **changes))
+
+
+def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
+    """Of a kept frame's joint positions [rad, m], by arm; those that a person set have none."""
+    known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
+    return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}

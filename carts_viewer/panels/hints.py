@@ -82,7 +82,8 @@ HINTS = {
     # Jobs
     "Which frames": "What the job works on",
     "Optimize each alone": "Run on each of these frames from where it is; what would fit worse is not taken",
-    "Calibrate": "Fit base frames, or what is ticked under Free parameters, to these frames together",
+    "Calibrate": "Fit base frames, or what is ticked under Free parameters, to these frames together. All masks "
+    "move with it, so accepted frames become unreviewed; one step of undo",
     "Job": "The job that the buttons and the log below are about",
     "Cancel": "Stop this job, or take it out of the queue; what it has saved stays",
     "Start again": "Queue this job once more; one on many frames goes on where it stopped",

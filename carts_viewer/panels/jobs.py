@@ -41,7 +41,8 @@ class JobsPanel:
             gui.add_html(
                 '<p class="carts-caption"><b>Optimize each alone</b> is Run on every frame by itself; to fit '
                 "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits base frames, or what is "
-                "ticked under Free parameters. Solving and exports queue up here, too.</p>"
+                "ticked under Free parameters. All masks move with it: solve again afterwards; accepted frames have to "
+                "be accepted again. Solving and exports queue up here, too.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="For everybody; remembered")
         self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)
@@ -102,7 +103,8 @@ def job_line(job: Job, now: float) -> str:
     left = job.seconds_left(now)
     eta = "" if left is None else f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
     running = job.state is JobState.RUNNING
-    steps = f" {job.done} of {job.total}{eta}" if running and job.total else ""
+    # What a solve says itself has frames and time.
+    steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""
     share = 100.0 * job.done / job.total if job.total else 0.0
     bar = f'<progress max="100" value="{share:.0f}"></progress>' if running else ""
     return (

@@ -62,9 +62,7 @@ class KeyframesPanel:
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
         self._all.disabled = state.solving or not self._open
-        # What has just been solved without keyframes needs no advice about them.
-        planned = not state.solving and (bool(state.project.kept_frames) or state.solve is None)
-        lines = [self._plan, _MEANING] if planned else []
+        lines = [] if state.solving else [self._plan, _MEANING]
         if state.solve is not None:
             done, total = state.solve.progress
             self._progress.value = 100.0 * done / total

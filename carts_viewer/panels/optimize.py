@@ -32,7 +32,7 @@ UNDETERMINED = "Not determined by this image"
 _CONSEQUENCE = "The mask hardly depends on these, so it can be right although their values are guesses."
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
-    ReviewState.ACCEPTED: "This frame is accepted. Run would fit it again, from where it is.",
+    ReviewState.ACCEPTED: "This frame is accepted. Run would fit it again; if it moves, it has to be accepted again.",
     ReviewState.REJECTED: "This frame is rejected. Run would fit it all the same.",
     ReviewState.OPTIMIZED: "This frame has been fitted. Run goes on from where it is.",
 }
@@ -149,8 +149,9 @@ def calibration_line(state: ViewState) -> str:
         return ""
     return (
         '<p class="carts-caption">The calibration (base frames or the camera\'s pose) may be off: free base frames '
-        f"would reduce the remaining residual by {100 * gain:.0f} %. A good mask can be accepted all the same; if you "
-        "need joint values, calibrate first: <b>Jobs</b>, <b>Calibrate</b>.</p>"
+        f"would reduce the remaining residual by {100 * gain:.0f} %. A good mask can be accepted as it is. Masks and "
+        "joint values become better if you calibrate (<b>Jobs</b>, <b>Calibrate</b>) and run or solve again, best "
+        "before you accept frames: a calibration moves all masks, so it takes their acceptance back.</p>"
     )
 
 

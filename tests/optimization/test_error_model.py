@@ -74,7 +74,7 @@ def test_what_the_others_say_leaves_out_the_frame_itself() -> None:
 def test_what_is_exact_stays_exact_and_moves_the_neighbours() -> None:
     given = np.array([0.04, np.nan, -0.01])
     seen = [Information.nothing(N) for _ in range(FRAMES)]
-    seen[2] = Information.exact(given)
+    seen[2] = Information.known(given)
     found = smoothed(seen)
     assert np.allclose(found[2].mean[[0, 2]], given[[0, 2]], atol=1e-9)
     assert np.sqrt(found[2].covariance.diagonal())[[0, 2]].max() < 1e-6

@@ -154,6 +154,25 @@ def test_a_keyframe_stays_as_given_and_draws_the_others(truths: Truths) -> None:
         assert (estimates[index].joint_std[ARM] > 0).all()
 
 
+def test_what_an_accepted_frame_leaves_open_its_neighbours_do_not_take_for_known(truths: Truths) -> None:
+    given = {ARM: truths.sequence.frame(2).measured[ARM] + 0.02}
+    std = {ARM: np.array([1e-3, 1e-3, np.nan, 0.03, 1e-3, 1e-3, 1e-3])}
+    truths.blind = set(range(FRAMES))
+    found = []
+    for known in (None, {2: std}):
+        sequence = optimizer(truths, keyframes={2: given}, keyframe_std=known)
+        list(sequence)
+        found.append(sequence.estimates)
+    exact, open_ones = found
+    assert np.array_equal(open_ones[2].joint_std[ARM], np.nan_to_num(std[ARM]))
+    assert np.array_equal(open_ones[2].joint_positions[ARM], given[ARM]), "it stays as given"
+    roll = 3
+    assert open_ones[1].joint_std[ARM][roll] > 1.5 * exact[1].joint_std[ARM][roll]
+    assert open_ones[1].joint_std[ARM][0] == pytest.approx(np.hypot(1e-3, exact[1].joint_std[ARM][0]), rel=0.05)
+    moved = [of[1].joint_positions[ARM][roll] - truths.sequence.frame(1).measured[ARM][roll] for of in found]
+    assert 0.0 < moved[1] < 0.8 * moved[0], "less of the guess is carried over"
+
+
 def test_cancelling_keeps_what_is_there(truths: Truths) -> None:
     sequence = optimizer(truths, model=ALONE)
     sequence.step()

@@ -1,6 +1,7 @@
 """Jobs: one after the other, with progress and a log, and what becomes of them when the viewer ends."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,8 @@ def test_only_jobs_that_have_ended_are_forgotten_however_many_wait(tmp_path: Pat
 
 
 def test_a_line_says_how_far_a_job_is_and_how_long_it_will_take() -> None:
-    job = Job(3, "solve", "Solve <all>", state=JobState.RUNNING, done=10, total=40, began=100.0, text="Frame 10")
+    job = Job(3, "optimize", "Solve <all>", state=JobState.RUNNING, done=10, total=40, began=100.0, text="Frame 10")
     line = job_line(job, now=120.0)
     assert "3. Solve &lt;all&gt;" in line and "10 of 40, about 60 s left" in line and 'value="25"' in line
+    solve = job_line(replace(job, kind="solve"), now=120.0)
+    assert "10 of 40" not in solve and "Frame 10" in solve and 'value="25"' in solve
