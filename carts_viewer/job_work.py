@@ -116,8 +116,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
-    again = f" All masks have moved: solve the {solved} frames again that were fitted before." if solved else ""
-    again += f" {accepted} accepted frames are unreviewed now." if accepted else ""
+    again = " All masks have moved: run or solve again what was fitted before." if solved else ""
+    again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
     yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}{again}")
 
 
