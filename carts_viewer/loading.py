@@ -42,7 +42,7 @@ class NetworkLoader:
         self._weights = weights
         self._device = device
         self._inference: Inference = inference
-        self._report = report
+        self.report = report
         self._surface: Path | None = None
         self._extractor: FeatureExtractor | None = None
         self._unfamiliar: dict[tuple[object, ...], tuple[str, ...]] = {}
@@ -72,7 +72,7 @@ class NetworkLoader:
             WeightsError: it cannot be loaded.
         """
         if self._extractor is None:
-            self._report("Loading the networks")
+            self.report("Loading the networks")
             weights = list(self._weights)
             if self._surface is not None:
                 others = [path for path in weights if read_weights(path).network.kind != SurfaceNetwork.kind]

@@ -87,7 +87,7 @@ class OptimizerFactory(NetworkLoader):
             CartsError: weights, an image, a mask or a setting is not usable.
         """
         predictor = self.predictor(target)
-        self._report("Preparing the frame")
+        self.report("Preparing the frame")
         if target.observed.what != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
                 "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "

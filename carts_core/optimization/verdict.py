@@ -103,7 +103,10 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     ),
 )
 
-_REMEDY = "Look at the overlay; set the arm by hand, or correct the frame in sequence mode."
+_REMEDY = (
+    "Look at the overlay. Run the optimizer, set the arm by hand, or fit the frame together with its neighbours "
+    "(sequence mode; Solve in the page)."
+)
 _REMEDY_FAILED = "Set the arm roughly by hand and run again, check the calibration, or give an image of the background."
 
 
@@ -113,7 +116,7 @@ def _weakest(found: Evidence) -> str:
         return "what is rendered and the given mask differ."
     against = {
         "what the network predicts lies elsewhere.": found.agreement,
-        "without the fit as a hint, the network predicts something else.": found.unconditioned,
+        "the network, which is shown the fit as a hint, predicts something else without it.": found.unconditioned,
     }
     if found.overlap_with_change is not None:
         against["what differs from the empty background lies elsewhere."] = found.overlap_with_change

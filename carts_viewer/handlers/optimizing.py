@@ -269,6 +269,7 @@ class OptimizingHandler:
     @handle.register
     def _(self, intent: intents.Assess) -> None:
         self.end("Stopped: the fit was checked")
+        self._optimizers.report("comparing with the images")
         state = self._context.state
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)

@@ -192,7 +192,8 @@ class PropagatingHandler:
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
             self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
             self._context.refresh()
-        text = f"{'Stopped: ' if run.cancelled else ''}{len(figures)} frames solved, one step of undo"
+        solved = f"{len(figures)} frame{'' if len(figures) == 1 else 's'} solved, one step of undo"
+        text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
         return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
 
     @handle.register

@@ -19,6 +19,10 @@ _WITHOUT_IMAGES = ("masks", "csv", "npz", "json", *_DVRK, "video")
 """Formats with no images beside their labels."""
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
+_WRITTEN = (
+    "Masks, keypoints and poses are those of the rendered arms at their joint positions now; masks with what was "
+    "painted. The recording's own masks are not written."
+)
 _NOT_KEPT = "This project ends with the viewer, and its exports with it: download them."
 
 
@@ -35,6 +39,7 @@ class ExportPanel:
         self._chosen = ""
         self._range: tuple[int, int] | None = None
         with gui.add_folder("Export frames"):
+            gui.add_html(f'<p class="carts-caption">{_WRITTEN}</p>')
             self._format = gui.add_dropdown("Format", list(self._formats))
             self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
             self._within = gui.add_checkbox("Only the range", True, visible=False)

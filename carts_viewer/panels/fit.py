@@ -40,16 +40,19 @@ class FitPanel:
         # It stays where it is, so that nothing below it moves under the pointer.
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
-        self._text.content = fit_text(state.verdict, running=running, scores=_scores(state, self._cameras))
+        self._text.content = fit_text(
+            state.verdict, running=running, scores=_scores(state, self._cameras), busy=state.busy
+        )
 
 
-def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, float]) -> str:
+def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, float], busy: str | None = None) -> str:
     """A verdict with its reason, remedy and cameras, as HTML.
 
     Args:
         verdict: of the shown pose; None where it was not assessed.
         running: whether the pose is still moving.
         scores: Dice of the cameras with a true mask.
+        busy: what is being prepared, for people.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
     chips = []
@@ -60,9 +63,11 @@ def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, flo
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
     if scores and line:
-        line += "<small>Dice: overlap with the recording's own mask.</small>"
+        line += "<small>Dice: overlap of the rendered arms with the recording's own mask, as a check.</small>"
     if verdict is None:
         name = "running" if running else "not checked"
+        if busy is not None:
+            name += f' <span class="carts-spinner"></span>{escaped(busy)} …'
         return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
     remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
     about = "<br><small>About the mask. Each joint's deviation: Values.</small>" if verdict.verdict == "good" else ""

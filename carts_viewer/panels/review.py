@@ -65,7 +65,9 @@ class ReviewPanel:
         name = review_name(state.project, state.index)
         self._state.content = f'<p class="carts-caption">{_dot(name)}<b>{name}</b>{keyframe}</p>'
         # Bright where the images say that there is something to accept.
-        good = state.verdict is not None and state.verdict.verdict == "good"
+        good = (
+            state.verdict is not None and state.verdict.verdict == "good" and review.state is not ReviewState.ACCEPTED
+        )
         self._accept.color = "teal" if good else "gray"
         if not self._waits(intents.SetNote):
             write(self._note, review.note)
