@@ -172,14 +172,11 @@ class OptimizerFactory(NetworkLoader):
         Args:
             sequence: Where joint positions are measured.
             calibration: Base frames and cameras; its joint positions do not matter.
-            frames: Which ones.
-            domain: Of the images.
-            cameras: Whose images count.
+            frames: Which ones; of a `domain`, seen by `cameras`.
             settings: Of the optimizer.
             direction: Where to begin.
             free: Which joints may move.
-            keyframes: Frame -> arm -> joint positions [rad, m] that stay.
-            keyframe_std: Frame -> arm -> their standard deviations [rad, m], where they are known.
+            keyframes: Frame -> arm -> joint positions [rad, m] that stay; `keyframe_std`: their standard deviations.
             target: What is fitted.
             ignore: Frame -> camera -> pixels that show something else.
 

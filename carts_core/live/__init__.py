@@ -1,5 +1,8 @@
 """Live streams: sources of frames, a tracker that follows the arms forwards, and where results go."""
 
+from .estimate import Effort as Effort
+from .estimate import LiveEstimate as LiveEstimate
+from .estimate import LiveVerdict as LiveVerdict
 from .loop import LiveStatistics as LiveStatistics
 from .loop import Results as Results
 from .loop import Tracked as Tracked
@@ -19,7 +22,4 @@ from .server import StreamServer as StreamServer
 from .sources import Camera as Camera
 from .sources import Folder as Folder
 from .sources import Replay as Replay
-from .tracker import Effort as Effort
-from .tracker import LiveEstimate as LiveEstimate
 from .tracker import LiveTracker as LiveTracker
-from .tracker import LiveVerdict as LiveVerdict

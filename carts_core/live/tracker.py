@@ -8,13 +8,11 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
-from ..model.scene import Scene, SceneState
+from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..optimization.counterfactual import Backgrounds
 from ..optimization.error_model import ErrorModel, Gaussian, combined
@@ -26,54 +24,14 @@ from ..recording import Frame
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.live import LiveSettings
 from ..settings.stages import Stage
+from .estimate import Effort, LiveEstimate, LiveVerdict
 from .moments import mounts_of
+from .resemblance import CHANGED, Picture, change, small_picture
 
 _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""
 _CONTRADICTS = 9.0
 """A correction three deviations off what was expected, on average, contradicts it."""
-_CHANGED = 0.5
-"""Change of small pictures from which they show something else: they correlate by less than a half [1]."""
-_SMALL = (32, 24)
-"""Width and height of these pictures [px]."""
-
-
-class LiveVerdict(StrEnum):
-    """How far an estimate can be relied on."""
-
-    GOOD = "good"
-    DOUBTFUL = "doubtful"
-    """The image does not fit for the moment: what is shown is what the frames before let expect."""
-    LOST = "lost"
-    """Nothing is known but the measured values and what they were off by when the arms were last seen."""
-
-
-class Effort(StrEnum):
-    """What was done with a frame."""
-
-    SMALL = "small"
-    FULL = "full"
-    SEARCH = "search"
-
-
-@dataclass(frozen=True)
-class LiveEstimate:
-    """One frame, in the light of those before it."""
-
-    frame_id: str
-    time: float
-    """When it was taken [s]."""
-    verdict: LiveVerdict
-    effort: Effort
-    loss: float
-    """Of the surface factor [1]."""
-    state: SceneState
-    joint_positions: Mapping[str, Float[np.ndarray, " dofs"]]
-    """Arm name -> [rad, m]."""
-    joint_std: Mapping[str, Float[np.ndarray, " dofs"]]
-    """Arm name -> standard deviation [rad, m]; NaN where a joint is not free."""
-    seconds: float
-    """Spent on it [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +54,7 @@ class _Recovery:
     """An attempt on a thread of its own."""
 
     attempt: _Attempt
-    picture: Float[np.ndarray, "cameras pixels"]
+    picture: Picture
     """Of its frame, small."""
     measurement: Future[Measurement]
     dropped: threading.Event
@@ -214,7 +172,7 @@ class LiveTracker:
         """With no more effort than it takes, and no more than the thread that calls is to have."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
-        picture = _picture(frame)
+        picture = small_picture(frame)
         self._drop_outdated(picture)
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
@@ -240,7 +198,7 @@ class LiveTracker:
         self._recovery = _Recovery(attempt, picture, self._pool.submit(more), dropped)
         return found
 
-    def _drop_outdated(self, picture: Float[np.ndarray, "cameras pixels"]) -> None:
+    def _drop_outdated(self, picture: Picture) -> None:
         """Give up a search in a frame that this one does not resemble: what hid the arms, say, has been taken away."""
         running = self._recovery
         if running is None or running.attempt.effort is not Effort.SEARCH or running.picture.shape != picture.shape:
@@ -248,7 +206,7 @@ class LiveTracker:
         # The one after it runs to its end, or arms that move fast before a plain wall would never be found.
         if self._gave_up:
             return
-        if _change(running.picture, picture) > _CHANGED:
+        if change(running.picture, picture) > CHANGED:
             running.dropped.set()
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 
@@ -311,16 +269,3 @@ class LiveTracker:
             priors = self._model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
             self._errors = ErrorModel(self._model, variables.expected(*priors).cpu().double().numpy())
         return self._errors
-
-
-def _picture(frame: Frame) -> Float[np.ndarray, "cameras pixels"]:
-    """The images, small and gray, each without its mean."""
-    small = [cv2.resize(image, _SMALL, interpolation=cv2.INTER_AREA) for image in frame.images.values()]
-    pixels = np.stack([image.reshape(_SMALL[0] * _SMALL[1], -1).mean(axis=1) for image in small]).astype(float)
-    return pixels - pixels.mean(axis=1, keepdims=True)
-
-
-def _change(before: Float[np.ndarray, "cameras pixels"], now: Float[np.ndarray, "cameras pixels"]) -> float:
-    """How much pictures have changed in the camera where they did most [1]: 0.7 where they have nothing in common."""
-    sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
-    return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())

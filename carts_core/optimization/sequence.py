@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..checkpoint import Checkpoint
 from ..errors import CartsError, SettingsError
@@ -17,8 +16,9 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
 from .counterfactual import Backgrounds
-from .error_model import ErrorModel, Gaussian, Information, combined, remove_measurement
+from .error_model import ErrorModel, Gaussian, combined, remove_measurement
 from .initialization import initial_correction
+from .keyframes import GivenPositions, Keyframes
 from .measurement import FrameSolver, Ignore, Measurement
 from .predictor import SurfacePredictor, predictor_of
 from .resumable import ResumableFrameSolver
@@ -74,8 +74,8 @@ class SequenceOptimizer:
         settings: SolverSettings | None = None,
         model: SequenceSettings | None = None,
         free: FreeParameters | None = None,
-        keyframes: Mapping[int, Mapping[str, ArrayLike]] | None = None,
-        keyframe_std: Mapping[int, Mapping[str, ArrayLike]] | None = None,
+        keyframes: GivenPositions | None = None,
+        keyframe_std: GivenPositions | None = None,
         ignore: Ignore | None = None,
         backgrounds: Backgrounds | None = None,
         cameras: Sequence[str] | None = None,
@@ -84,18 +84,7 @@ class SequenceOptimizer:
         self.settings, self.model = surface_solver(settings, "sequence mode"), model or SequenceSettings()
         self._scene, self._load, self._predictor = scene.with_cameras(cameras), load, predictor_of(networks)
         self._free = free or FreeParameters()
-        self._keyframes = {
-            index: {name: np.asarray(values, np.float64) for name, values in positions.items()}
-            for index, positions in (keyframes or {}).items()
-        }
-        for positions in self._keyframes.values():
-            self._scene.state(positions)
-        self._keyframe_std = {
-            index: {
-                name: _deviations((keyframe_std or {}).get(index, {}).get(name), values) for name, values in of.items()
-            }
-            for index, of in self._keyframes.items()
-        }
+        self._keyframes = Keyframes(self._scene, keyframes, keyframe_std)
         gaps = visiting_gaps(times, self.model)
         unknown = set(self._keyframes) - set(gaps)
         if unknown:
@@ -257,13 +246,10 @@ class SequenceOptimizer:
         return self._solver.warm(frame, variables, self._prior, self._initial_correction)
 
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
-        given = self._keyframes[frame.index]
-        correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
-        std = self._keyframe_std[frame.index]
-        farther = variables.joint_offsets([given[arm.name] + std[arm.name] for arm in self._scene.arms])
+        correction, known = self._keyframes.correction(frame.index, variables)
         here = np.where(np.isfinite(correction), correction, expected.mean)
         seen = self._solver.at(frame, variables, expected, here)
-        return replace(seen, information=Information.known(correction, farther - correction))
+        return replace(seen, information=known)
 
     def _open(self, index: int) -> tuple[Frame, Variables]:
         frame = self._load(index)
@@ -297,19 +283,4 @@ class SequenceOptimizer:
         return self._estimate(index, visit, combined(expected, measurement.information))
 
     def _estimate(self, index: int, visit: Visit, correction: Gaussian) -> FrameEstimate:
-        estimate = visit.estimate(self._scene, index, correction, self._prior)
-        if index not in self._keyframes:
-            return estimate
-        given = self._keyframes[index]
-        state = self._scene.state(given, self._predictor.device)
-        return replace(
-            estimate,
-            state=replace(estimate.state, joint_positions=state.joint_positions),
-            joint_positions={arm.name: given[arm.name].copy() for arm in self._scene.arms},
-            joint_std={arm.name: self._keyframe_std[index][arm.name].copy() for arm in self._scene.arms},
-        )
-
-
-def _deviations(given: ArrayLike | None, positions: np.ndarray) -> np.ndarray:
-    """Standard deviations of a keyframe's joint positions; 0 where none are known."""
-    return np.zeros_like(positions) if given is None else np.nan_to_num(np.asarray(given, np.float64))
+        return self._keyframes.as_given(visit.estimate(self._scene, index, correction, self._prior))

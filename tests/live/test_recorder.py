@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from moving import swing
 
+from carts_core.live.estimate import Effort, LiveEstimate, LiveVerdict
 from carts_core.live.loop import Tracked
 from carts_core.live.moments import Moment
 from carts_core.live.recorder import Recorder
-from carts_core.live.tracker import Effort, LiveEstimate, LiveVerdict
 from carts_core.project import Provenance, Source
 from carts_core.recording import Sequence
 

@@ -242,13 +242,14 @@ def test_a_search_in_a_picture_that_is_gone_is_given_up_for_the_next_one(
     until(LiveVerdict.GOOD)
     concurrent.predictor.hidden = True
     until(LiveVerdict.LOST)
-    begun.clear(), given_up.clear()
+    begun.clear()
+    given_up.clear()
     while not begun:
         concurrent.next(0.02)
     concurrent.predictor.hidden, concurrent.slip = False, float(np.deg2rad(4.0))
     shown = concurrent.time
     until(LiveVerdict.GOOD)
-    assert given_up == begun[:1] and given_up[0] <= shown and concurrent.overlap() > 0.97
+    assert given_up == begun[:1] and given_up[0] <= shown and concurrent.overlap() > 0.95
 
 
 def test_what_goes_wrong_in_a_search_beside_the_stream_is_raised(
