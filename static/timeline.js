@@ -95,10 +95,10 @@
       .join(" ");
     const rows = [
       ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving leaves it as it is"],
-      ["Bar", `the higher, the worse it fits; none where nothing is known yet. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
+      ["Bar", `the higher, the worse it fits; none where nothing is known of the frame as it is. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
       ["Stripe below", `the verdict on the fit: ${keys(FIT, VERDICTS)}`],
       ["Stripe below that", `where the joints come from: ${keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])}`],
-      ["Line at the bottom", "the whole sequence; the frame in it is what is shown above"],
+      ["Line at the bottom", "the whole sequence, in the colours of the verdict, or of the review where there is none; the frame in it is what is shown above"],
       ["Bands", "teal: the shown frame; pink: being solved; amber ends: the range, with what is outside dimmed"],
     ];
     card.innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");

@@ -63,7 +63,9 @@ def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, flo
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
     if scores and line:
-        line += "<small>Dice: overlap of the rendered arms with the recording's own mask, as a check.</small>"
+        line += (
+            "<small>Dice: overlap of the rendered arms with the mask that came with the recording, as a check.</small>"
+        )
     if verdict is None:
         name = "running" if running else "not checked"
         if busy is not None:
