@@ -143,7 +143,7 @@ def test_run_lets_the_loss_fall_and_the_overlay_follow(
     curves = app.state.run.curves
     loss = curves.loss
     assert min(loss[1:]) < loss[0]
-    expect(tab.page.get_by_text(app.state.run.reason or "")).to_be_visible()
+    expect(tab.page.get_by_text(app.state.run.reason or "").first).to_be_visible(timeout=30_000)
     expect(tab.page.get_by_text(f"result {loss[curves.best]:.3g}, iteration {curves.best}").first).to_be_visible()
     app.wait_until_shown()
     assert app.view.scene.sent("/overlay") != start
