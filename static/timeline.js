@@ -379,7 +379,7 @@
       if (message.whole || message.traced) window.carts.lanes.forget();
       dirty = true;
     },
-    timeline: () => ({ view, frames, here, range, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
+    timeline: () => ({ view, frames, here, range, solving, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
     showFrames: show,
   });
   everyFrame();

@@ -172,8 +172,7 @@ class LiveTracker:
         """With no more effort than it takes, and no more than the thread that calls is to have."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
-        picture = small_picture(frame)
-        self._drop_outdated(picture)
+        self._drop_outdated(frame)
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
@@ -182,9 +181,7 @@ class LiveTracker:
         effort = self._further(now)
         if found and (effort is Effort.SMALL or self._recovery):
             return found
-        attempt = self._known(errors, now, effort)
-
-        dropped = threading.Event()
+        attempt, dropped = self._known(errors, now, effort), threading.Event()
 
         def more() -> Measurement:
             if effort is Effort.SEARCH:
@@ -195,18 +192,17 @@ class LiveTracker:
             self._searched = now
         if self._pool is None or found is None:
             return attempt, more()
-        self._recovery = _Recovery(attempt, picture, self._pool.submit(more), dropped)
+        self._recovery = _Recovery(attempt, small_picture(frame), self._pool.submit(more), dropped)
         return found
 
-    def _drop_outdated(self, picture: Picture) -> None:
+    def _drop_outdated(self, frame: Frame) -> None:
         """Give up a search in a frame that this one does not resemble: what hid the arms, say, has been taken away."""
         running = self._recovery
-        if running is None or running.attempt.effort is not Effort.SEARCH or running.picture.shape != picture.shape:
-            return
         # The one after it runs to its end, or arms that move fast before a plain wall would never be found.
-        if self._gave_up:
+        if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
-        if change(running.picture, picture) > CHANGED:
+        picture = small_picture(frame)
+        if running.picture.shape == picture.shape and change(running.picture, picture) > CHANGED:
             running.dropped.set()
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 

@@ -71,12 +71,14 @@ class FrameSolver:
         self._scene, self._predictor, self._settings, self._ignore = scene, predictor, settings, ignore
         self._backgrounds = backgrounds
         self._share = (settings.noise / model.measurement_noise) ** 2
-        self._cold, self._warm = model.cold, model.warm
+        self._cold, self._warm, self._wide = model.cold, model.warm, model.wide
 
-    def warm(self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray) -> Measurement:
-        """Find the correction near `start` [n]."""
+    def warm(
+        self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
+    ) -> Measurement:
+        """Find the correction near `start` [n]; wide with more room around the arms, and more steps."""
         prior = _prior(expected, variables)
-        fit = self._run(frame, variables, prior, self._warm, start)
+        fit = self._run(frame, variables, prior, self._wide if wide else self._warm, start)
         assert fit.reached is not None
         seen = _information(fit.reached.offsets, fit.reached.evaluation, prior)
         correction = fit.reached.offsets

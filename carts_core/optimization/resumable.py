@@ -37,10 +37,12 @@ class ResumableFrameSolver(FrameSolver):
     def __init__(self, solver: FrameSolver, checkpoint: Checkpoint) -> None:
         self._solver, self._checkpoint = solver, checkpoint
 
-    def warm(self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray) -> Measurement:
+    def warm(
+        self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
+    ) -> Measurement:
         """As `FrameSolver.warm`."""
-        key = _key("warm", frame, expected, start)
-        return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start))
+        key = _key("warm", frame, expected, start, wide)
+        return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start, wide=wide))
 
     def cold(
         self,

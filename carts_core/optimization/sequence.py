@@ -232,6 +232,9 @@ class SequenceOptimizer:
         losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
         usual = self.model.cold_factor * statistics.median(losses or [math.inf])
         warm = self._solver.warm(frame, variables, expected, expected.mean)
+        if warm.loss > usual:
+            wide = self._solver.warm(frame, variables, expected, expected.mean, wide=True)
+            warm = replace(min(warm, wide, key=lambda found: found.loss), iterations=warm.iterations + wide.iterations)
         if warm.loss <= usual:
             return Origin.WARM, warm, False
         cold = self._solver.cold(frame, variables, self._prior)

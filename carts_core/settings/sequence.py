@@ -42,6 +42,8 @@ class SequenceSettings:
     """Stages from measured kinematics; `warm` follows."""
     warm: tuple[Stage, ...] = presets.WARM
     """Stages from the correction that the other frames predict."""
+    wide: tuple[Stage, ...] = presets.WARM_WIDE
+    """Stages where `warm` ends with an unusual loss, before a cold start."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():

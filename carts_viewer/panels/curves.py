@@ -80,7 +80,7 @@ class _Chart:
         if outdated != self._outdated:
             self._outdated = outdated
             self._plot.series = self._series()
-        text = self._newest_and_kept(values, curves.best)
+        text = self._newest_and_result(values, curves.best)
         self._title.content = _TITLE.format(" carts-outdated" if outdated else "", self._drawn, self._name, text)
         line = np.array([np.nan if value is None else value for value in values], float)
         numbers = np.arange(len(line))
@@ -107,7 +107,7 @@ class _Chart:
             uplot.Series(label="●", stroke=color, width=0, auto=False, points=full),
         )
 
-    def _newest_and_kept(self, series: Sequence[float | None], best: int) -> str:
+    def _newest_and_result(self, series: Sequence[float | None], best: int) -> str:
         newest, kept = series[-1], series[best]
         text = "" if newest is None else f"<b>{newest:.3g}</b>"
         return text if kept is None else f"{text} · result <b>{kept:.3g}</b>, iteration {best}"

@@ -1,7 +1,10 @@
 """A table of all joints: measured, shown, how far apart, and how far from the truth."""
 
+import math
+
 import viser
 
+from carts_core.settings import SurfaceSolver
 from carts_viewer.joint_range import JointRange
 from carts_viewer.panels.inputs import escaped, humanized
 from carts_viewer.panels.joints import to_shown
@@ -10,13 +13,17 @@ from carts_viewer.state import ViewState
 
 _UNSURE = 1.0
 """Standard deviation from which a joint's value is a guess [deg] and [mm]: less than half of what arms are off by."""
-_UNUSUAL = (5.0, 13.0)
+_EXPECTED = SurfaceSolver()
+_UNUSUAL = (
+    2.0 * _EXPECTED.prior_deg,
+    2e3 * math.radians(_EXPECTED.prior_deg) * _EXPECTED.length_scale,
+)
 """Corrections that are rare, twice the deviation that the solver expects of measured joints [deg] and [mm]."""
 _EXPLAINED = (
     f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
     "hardly show this joint. Its value is a guess; the mask hardly depends on it.<br>"
-    f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:g}° or {_UNUSUAL[1]:g} mm, which is rare "
-    "in real arms. Smaller changes are usual."
+    f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm, which is "
+    "rare in real arms. Smaller changes are usual."
 )
 
 

@@ -192,7 +192,7 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
     benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
     benchmark.run(QUIET)
     first = benchmark.measurements()
-    assert next(entry.stopped for entry in first) == "cold" and len(first) == 2
+    assert [entry.stopped for entry in first] == ["cold", "warm"]
     starts = [entry.start for entry in first]
     assert all(start and start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) for start in starts)
     lines = benchmark.results.path.path.read_bytes().splitlines(keepends=True)
