@@ -184,14 +184,14 @@ def test_exports_arrive_as_downloads_and_hold_what_is_shown(
 def test_any_format_of_chosen_frames_is_written_beside_the_project_and_can_be_cancelled(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
-    app = open_viewer(frames=40, width=320, height=240, domains=("regular",))
+    app = open_viewer(frames=120, width=320, height=240, domains=("regular",))
     tab = open_tab(app)
     tab.page.keyboard.press("g")
     eventually(lambda: app.state.index, lambda index: index == 1)
     tab.page.get_by_text("Export", exact=True).click()
     tab.choose("Format", "COCO")
     tab.choose("Frames", "Accepted")
-    expect(tab.page.get_by_text("1 of 40 frames")).to_be_visible()
+    expect(tab.page.get_by_text("1 of 120 frames")).to_be_visible()
     tab.button("Export")
     path = eventually(lambda: app.state.export and app.state.export.path, bool)
     assert path is not None
