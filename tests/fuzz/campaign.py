@@ -55,7 +55,8 @@ def wrong_input(kind: str, seed: int, content: bytes) -> bytes:
 def run(count: int, seed: int, kinds: tuple[str, ...] = tuple(KINDS)) -> Iterator[Outcome]:
     """The outcome of `count` inputs, the kinds in turn."""
     jobs = [(kinds[number % len(kinds)], seed + number // len(kinds)) for number in range(count)]
-    context = multiprocessing.get_context("fork")
+    # Not forked: threads of libraries that the calling process has used do not come along, and what waits for them dies.
+    context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory(prefix="carts-fuzz-") as name:
         folder = Path(name) / "files"
         os.environ["CARTS_CACHE"] = str(Path(name) / "cache")
@@ -90,9 +91,10 @@ def _work(folder: Path, jobs: list[tuple[str, int]], pipe: Connection) -> None:
     torch.set_num_threads(1)
     # What FFmpeg and libtiff say of wrong files is of no interest.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    address_space = 1024 * int(status["VmSize"].split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (address_space + 2 * MEMORY, resource.RLIM_INFINITY))
+    # Libraries and their threads take their memory with the first right input, however many processors there are.
+    for kind in dict.fromkeys(kind for kind, _ in jobs):
+        KINDS[kind].read(folder / KINDS[kind].file)
+    resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + 2 * MEMORY, resource.RLIM_INFINITY))
     right = {kind: (folder / entry.file).read_bytes() for kind, entry in KINDS.items()}
     for kind, seed in jobs:
         pipe.send(_outcome(folder, kind, seed, right[kind]))
