@@ -55,7 +55,7 @@ def wrong_input(kind: str, seed: int, content: bytes) -> bytes:
 def run(count: int, seed: int, kinds: tuple[str, ...] = tuple(KINDS)) -> Iterator[Outcome]:
     """The outcome of `count` inputs, the kinds in turn."""
     jobs = [(kinds[number % len(kinds)], seed + number // len(kinds)) for number in range(count)]
-    # Not forked: threads of libraries that the calling process has used do not come along, and what waits for them dies.
+    # Not forked: the threads of libraries in use do not come along, and what waits for them dies.
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory(prefix="carts-fuzz-") as name:
         folder = Path(name) / "files"
