@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,8 @@ class SequenceIdentity:
 
     def to_json(self) -> str:
         """As text; `from_json` reads it."""
-        return json.dumps(asdict(self))
+        # `dataclasses.asdict` would copy every frame's id.
+        return json.dumps(vars(self))
 
     @staticmethod
     def from_json(text: str) -> "SequenceIdentity":

@@ -13,6 +13,8 @@ from .table import Table, read_table
 from .toml_table import TomlTable, check_file_name
 from .video_index import index_video
 
+_FRAME_ALONE = "{frame}"
+"""The pattern of frames whose cells are their ids."""
 MOST_FRAMES = 1_000_000
 """Longest sequence; nine hours at 30 frames per second."""
 
@@ -54,7 +56,10 @@ class FrameNames:
         """
         key = f"{table.path}, column {self.column!r}"
         cells = table.text(self.column, self.asked_by)
-        ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
+        if self.pattern == _FRAME_ALONE:
+            ids = tuple(cells)
+        else:
+            ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
         lines: dict[str, int] = {}
         for frame_id, line in zip(ids, table.lines, strict=True):
             if not frame_id:
@@ -154,7 +159,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
 
 
 def _take_pattern(section: TomlTable) -> str:
-    pattern = section.take("frame_id", str, "{frame}")
+    pattern = section.take("frame_id", str, _FRAME_ALONE)
     if "{frame" not in pattern:
         raise section.error("frame_id", f'is {pattern!r}. It must contain {{frame}}, say "{{frame:03d}}".')
     return pattern

@@ -4,7 +4,9 @@ import csv
 import io
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +45,7 @@ class Table:
         Raises:
             SequenceError: there is no such column.
         """
-        if column not in self.header:
-            raise SequenceError(
-                f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
-                f"Its columns are: {listed(self.header)}."
-            )
-        index = self.header.index(column)
-        return [row[index].strip() for row in self.rows]
+        return [cell.strip() for cell in self._cells(column, asked_by)]
 
     def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
         """The values of a column.
@@ -57,19 +53,27 @@ class Table:
         Raises:
             SequenceError: there is no such column, or a cell is not a finite number.
         """
-        cells = self.text(column, asked_by)
         try:
-            values = np.fromiter(map(float, cells), np.float64, len(cells))
+            values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
         except ValueError:
             # Some cell is no number; this way, which is slower, says which.
-            values = np.fromiter(map(_number, cells), np.float64, len(cells))
+            values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
-            row = wrong[0]
+            row, cells = wrong[0], self.text(column, asked_by)
             raise SequenceError(
                 f"{self.path}, line {self.lines[row]}, column {column!r}: {shown(cells[row])} is not a finite number. "
                 "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
             )
         return values
+
+    def _cells(self, column: str, asked_by: str) -> Iterator[str]:
+        """The cells of a column as they stand in the file."""
+        if column not in self.header:
+            raise SequenceError(
+                f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
+                f"Its columns are: {listed(self.header)}."
+            )
+        return map(itemgetter(self.header.index(column)), self.rows)
 
 
 def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
