@@ -44,6 +44,7 @@ class Bench:
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
         from ..lab.benchmark.fingerprints import code_fingerprint
+        from ..lab.benchmark.hand_eye import known_hand_eye, measure_hand_eye
         from ..lab.benchmark.sources import (
             family_sources,
             real_source,
@@ -71,11 +72,12 @@ class Bench:
         benchmark = Benchmark(scope, sources, extractor, results, runs, baselines)
         if results.unreadable:
             console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
-        stages = folder / "stages.json"
+        stages, hand_eye = folder / "stages.json", folder / "hand_eye.json"
         if not self.report_only:
             with when_stopped(f"{results.path} holds what was measured; the same command goes on from there"):
                 benchmark.run(console)
                 measure_stages(stages, extractor)
+                measure_hand_eye(hand_eye, extractor, scope.hand_eye_starts, console.print)
         measurements = benchmark.measurements()
         if not measurements:
             raise CartsError(
@@ -89,7 +91,8 @@ class Bench:
             code=code_fingerprint(),
             version=version("carts"),
         )
-        page = write_report(folder, measurements, facts, known_stages(stages, extractor))
+        calibrations = known_hand_eye(hand_eye, extractor)
+        page = write_report(folder, measurements, facts, known_stages(stages, extractor), calibrations)
         console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")
 
     def _baselines(self) -> "dict[str, TrainedBaseline]":

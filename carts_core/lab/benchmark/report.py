@@ -15,6 +15,7 @@ from .accuracy_tables import error_tables, iteration_tables, main_tables
 from .figures import write_figures
 from .frame import TOLERANCE
 from .further_tables import calibration_table, camera_table, occlusion_table, room_table, sequence_table
+from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
 from .measurement import Measurement
 from .page import PAGE
 from .speed_tables import pair_table, speed_table, stage_table, worse_table
@@ -41,15 +42,28 @@ class Facts:
     version: str
 
 
-def write_report(folder: OutputPath, measurements: list[Measurement], facts: Facts, stages: dict[str, float]) -> Path:
+def write_report(
+    folder: OutputPath,
+    measurements: list[Measurement],
+    facts: Facts,
+    stages: dict[str, float],
+    hand_eye: list[HandEyeRun],
+) -> Path:
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
+
+    Args:
+        folder: where to.
+        measurements: the runs.
+        facts: where they come from.
+        stages: of an iteration -> milliseconds; may be empty.
+        hand_eye: calibrations of another robot; may be empty.
 
     Raises:
         CartsError: the folder cannot be written to.
     """
     data = Measurements(measurements)
     compared = data.compared()
-    verdicts = targets(data)
+    verdicts = [*targets(data), *hand_eye_targets(hand_eye)]
     sections: list[tuple[str, list[Table]]] = [
         ("Main table", main_tables(data)),
         ("Iterations", iteration_tables(data)),
@@ -60,6 +74,7 @@ def write_report(folder: OutputPath, measurements: list[Measurement], facts: Fac
         ("Sequence mode", _known(sequence_table(data))),
         ("Other rooms", _known(room_table(data))),
         ("Other instruments", _known(family_table(data))),
+        ("Hand-eye calibration", _known(hand_eye_table(hand_eye))),
         ("Verdicts and deviations", _known(verdict_table(data), deviation_table(data))),
         ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
         ("Stages", [stage_table(stages)] if stages else []),
@@ -74,6 +89,7 @@ def write_report(folder: OutputPath, measurements: list[Measurement], facts: Fac
         "targets": [asdict(target) for target in verdicts],
         "tables": [asdict(table) for _, tables in sections for table in tables],
         "stages_ms": stages,
+        "hand_eye": [asdict(run) for run in hand_eye],
         "paper": {
             "source": paper.SOURCE,
             "dice": paper.DICE,

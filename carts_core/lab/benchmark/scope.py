@@ -74,6 +74,8 @@ class Scope:
     """Only every so many rooms are measured."""
     family_frames: int
     """Frames of each instrument that no training has; 0 leaves them out."""
+    hand_eye_starts: int
+    """Starts of each hand-eye calibration of another robot."""
 
     def steps(self, run: Run) -> int:
         """Steps in the paper's setting for a run."""
@@ -112,6 +114,7 @@ QUICK = Scope(
     room_consecutive=0,
     room_share=8,
     family_frames=1,
+    hand_eye_starts=1,
 )
 FULL = Scope(
     frames=8,
@@ -132,4 +135,5 @@ FULL = Scope(
     room_consecutive=8,
     room_share=1,
     family_frames=6,
+    hand_eye_starts=10,
 )

@@ -32,6 +32,7 @@ TINY = Scope(
     room_consecutive=2,
     room_share=16,
     family_frames=0,
+    hand_eye_starts=0,
 )
 
 

@@ -78,7 +78,8 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     tiny_benchmark().run(QUIET)
     assert len(count_runs) == RUNS
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
-    assert f"{RUNS} of {RUNS}" in write_report(output_path(tmp_path, "bench"), measurements, facts, {}).read_text()
+    page = write_report(output_path(tmp_path, "bench"), measurements, facts, {}, [])
+    assert f"{RUNS} of {RUNS}" in page.read_text()
 
 
 def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdicts(

@@ -13,10 +13,12 @@ from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_repor
 from carts_core.lab.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
 from carts_core.lab.benchmark.accuracy_targets import accuracy_targets
 from carts_core.lab.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
+from carts_core.lab.benchmark.hand_eye import HandEyeRun
 from carts_core.lab.benchmark.speed_tables import pair_table, worse_table
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.synthesis import DOMAINS
 
+HAND_EYE = [HandEyeRun("masks, 15 degrees and 10 cm", 0, 0.05, 0.001, "good")]
 FACTS = Facts("quick", 200, {"synthetic": "seed 5 <b>"}, "abc", "def", "0.1")
 
 
@@ -60,7 +62,10 @@ class _Page(HTMLParser):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    assert write_report(output_path(folder), _measurements(), FACTS, {"render forward": 3.25}) == folder / "report.html"
+    assert (
+        write_report(output_path(folder), _measurements(), FACTS, {"render forward": 3.25}, HAND_EYE)
+        == folder / "report.html"
+    )
     return folder
 
 
@@ -94,14 +99,14 @@ def test_json_and_csv_have_a_row_per_run_and_the_same_verdicts_as_the_page(folde
 
 
 def test_the_same_measurements_give_the_same_report_byte_by_byte(folder: Path, tmp_path: Path) -> None:
-    write_report(output_path(tmp_path), _measurements(), FACTS, {"render forward": 3.25})
+    write_report(output_path(tmp_path), _measurements(), FACTS, {"render forward": 3.25}, HAND_EYE)
     files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
     assert len(files) == 7
     assert all((folder / path).read_bytes() == (tmp_path / path).read_bytes() for path in files)
 
 
 def test_a_report_of_a_single_run_is_written_too(tmp_path: Path) -> None:
-    page = write_report(output_path(tmp_path), [make_measurement((0.5, 0.6))], FACTS, {})
+    page = write_report(output_path(tmp_path), [make_measurement((0.5, 0.6))], FACTS, {}, [])
     assert "not measured" in page.read_text()
 
 

@@ -1,0 +1,56 @@
+"""Hand-eye calibrations of the benchmark: measured once, kept, and counted."""
+
+from pathlib import Path
+
+import pytest
+
+from carts_core.files import output_path
+from carts_core.lab.benchmark import hand_eye
+from carts_core.lab.benchmark.hand_eye import (
+    CONDITIONS,
+    HandEyeRun,
+    hand_eye_table,
+    hand_eye_targets,
+    known_hand_eye,
+    measure_hand_eye,
+)
+from carts_core.networks.extractor import FeatureExtractor
+
+
+@pytest.fixture
+def networks() -> FeatureExtractor:
+    return FeatureExtractor.load()
+
+
+def runs(count: int, angle_deg: float, verdict: str, condition: int = 0) -> list[HandEyeRun]:
+    return [HandEyeRun(CONDITIONS[condition].name, seed, angle_deg, 1e-3, verdict) for seed in range(count)]
+
+
+def test_one_start_is_measured_kept_and_not_measured_again(
+    tmp_path: Path, networks: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hand_eye, "CONDITIONS", CONDITIONS[:1])
+    file, said = output_path(tmp_path, "hand_eye.json"), list[str]()
+    (run,) = measure_hand_eye(file, networks, 1, said.append)
+    assert run.verdict == "good" and run.angle_deg < 0.3 and run.distance < 3e-3
+    assert len(said) == 1 and known_hand_eye(file, networks) == [run]
+    assert measure_hand_eye(file, networks, 1, said.append) == [run] and len(said) == 1
+    file.path.write_text(file.path.read_text().replace(networks.fingerprint, "other weights"))
+    assert known_hand_eye(file, networks) == []
+
+
+def test_nine_of_ten_starts_meet_the_target_and_eight_do_not() -> None:
+    for wrong, met in ((1, True), (2, False)):
+        target, *others = hand_eye_targets([*runs(10, 0.1, "good")[wrong:], *runs(wrong, 40.0, "doubtful")])
+        assert target.met is met and all(other.met is None for other in others)
+
+
+def test_without_masks_what_is_called_failed_is_right_and_wrong_ones_are_named() -> None:
+    failed = runs(10, 6.0, "failed", condition=2)
+    assert hand_eye_targets(failed)[2].met
+    assert not hand_eye_targets([*failed[1:], *runs(1, 6.0, "good", condition=2)])[2].met
+    table = hand_eye_table([*failed, *runs(1, 0.2, "good", condition=2)])
+    assert table is not None
+    assert [cell.text for cell in table.rows[0]][1:4] == ["1 of 11", "0.20", "1.0"]
+    assert table.rows[0][4].text == "10 failed"
+    assert hand_eye_table([]) is None
