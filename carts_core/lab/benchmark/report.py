@@ -62,24 +62,9 @@ def write_report(
         CartsError: the folder cannot be written to.
     """
     data = Measurements(measurements)
-    compared = data.compared()
     verdicts = [*targets(data), *hand_eye_targets(hand_eye)]
-    sections: list[tuple[str, list[Table]]] = [
-        ("Main table", main_tables(data)),
-        ("Iterations", iteration_tables(data)),
-        ("Error at the start", error_tables(compared)),
-        ("Occlusion", _known(occlusion_table(data))),
-        ("Several cameras", _known(camera_table(data))),
-        ("Calibration", _known(calibration_table(data))),
-        ("Sequence mode", _known(sequence_table(data))),
-        ("Other rooms", _known(room_table(data))),
-        ("Other instruments", _known(family_table(data))),
-        ("Hand-eye calibration", _known(hand_eye_table(hand_eye))),
-        ("Verdicts and deviations", _known(verdict_table(data), deviation_table(data))),
-        ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
-        ("Stages", [stage_table(stages)] if stages else []),
-    ]
-    figures = write_figures(compared, folder / "figures")
+    sections = _sections(data, stages, hand_eye)
+    figures = write_figures(data.compared(), folder / "figures")
     rows = [_row(measurement) for measurement in measurements]
     document = {
         "format": "carts-benchmark/1",
@@ -114,6 +99,28 @@ def write_report(
     path = folder / "report.html"
     write_text(path, page)
     return path.path
+
+
+def _sections(
+    data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]
+) -> list[tuple[str, list[Table]]]:
+    """Title -> tables."""
+    compared = data.compared()
+    return [
+        ("Main table", main_tables(data)),
+        ("Iterations", iteration_tables(data)),
+        ("Error at the start", error_tables(compared)),
+        ("Occlusion", _known(occlusion_table(data))),
+        ("Several cameras", _known(camera_table(data))),
+        ("Calibration", _known(calibration_table(data))),
+        ("Sequence mode", _known(sequence_table(data))),
+        ("Other rooms", _known(room_table(data))),
+        ("Other instruments", _known(family_table(data))),
+        ("Hand-eye calibration", _known(hand_eye_table(hand_eye))),
+        ("Verdicts and deviations", _known(verdict_table(data), deviation_table(data))),
+        ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
+        ("Stages", [stage_table(stages)] if stages else []),
+    ]
 
 
 def _known(*tables: Table | None) -> list[Table]:
