@@ -30,6 +30,7 @@ def test_one_start_is_measured_kept_and_not_measured_again(
     tmp_path: Path, networks: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hand_eye, "CONDITIONS", CONDITIONS[:1])
+    monkeypatch.setattr(hand_eye, "_VIEWS", 3)
     file, said = output_path(tmp_path, "hand_eye.json"), list[str]()
     (run,) = measure_hand_eye(file, networks, 1, said.append)
     assert run.verdict == "good" and run.angle_deg < 0.3 and run.distance < 3e-3
