@@ -100,7 +100,7 @@ class Stream:
         return found.verdict, found.effort, float(np.rad2deg(error))
 
     def come_round(self, seconds: float) -> None:
-        """Track frames until the next one shows the first pose but one, however many a search has taken."""
+        """Track frames until their number is even, so that the same poses follow however long a search has taken."""
         while self.count % 2:
             self.next(seconds)
 

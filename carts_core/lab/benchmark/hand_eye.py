@@ -24,9 +24,12 @@ from ...wording import counted
 from .fingerprints import code_fingerprint
 from .rooms import made_rooms
 from .seven_joint_arm import arm_views
+from .tables import NOTHING
 from .target import Target, make_target
 
 _VIEWS = 10
+_STARTS = 10
+"""Of each condition, before it can be called met."""
 _FREE = FreeParameters(joints=False, base_frames=True)
 _CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/seven_joint_arm.py", "lab/benchmark/rooms.py")
 
@@ -98,14 +101,12 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
     for condition in CONDITIONS:
         if found := [run for run in runs if run.condition == condition.name]:
             right = [run for run in found if _near(run, condition)]
-            largest = max(right, key=lambda run: run.angle_deg).angle_deg if right else None
-            farthest = max(run.distance for run in right) if right else None
             others = Counter(run.verdict for run in found if run not in right)
             cells = (
                 condition.name,
                 f"{len(right)} of {len(found)}",
-                "" if largest is None else f"{largest:.2f}",
-                "" if farthest is None else f"{1e3 * farthest:.1f}",
+                f"{max(run.angle_deg for run in right):.2f}" if right else NOTHING,
+                f"{1e3 * max(run.distance for run in right):.1f}" if right else NOTHING,
                 ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
             )
             rows.append(tuple(map(Cell, cells)))
@@ -132,7 +133,7 @@ def hand_eye_targets(runs: list[HandEyeRun]) -> list[Target]:
                 counted(len(own), "start"),
                 at_least=True,
                 text=lambda value: f"{100 * value:.0f} %",
-                complete=len(own) >= _VIEWS,
+                complete=len(own) >= _STARTS,
             )
         )
     return found
