@@ -12,16 +12,21 @@ from ..errors import SettingsError
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
+from ..recording.background import spread
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver, surface_solver
 from ..settings.stages import Descend
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
+from .familiarity import familiarity
 from .fit import Fit, Point, StopReason
 from .frame import Progress
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
 from .variables import Variables
 from .verdict import Assessment, Verdict
-from .verdict_of_many import assess_calibration, worse_in
+from .verdict_of_many import assess_calibration, without_knowledge, worse_in
+
+_TRIED = 4
+"""Most frames in which the network is tried on a rendering of the arms."""
 
 _STANDS = 1e-3
 """Mounts whose transforms differ by less are at the same place [rad, m]."""
@@ -121,8 +126,10 @@ class CalibrationOptimizer:
             raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
         self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)
-        predictor = predictor_of(networks)
-        self._problem = CalibrationProblem(self._scene, frames, predictor, self.free, settings, joint_prior_deg, ignore)
+        self._frames, self._predictor = frames, predictor_of(networks)
+        self._problem = CalibrationProblem(
+            self._scene, frames, self._predictor, self.free, settings, joint_prior_deg, ignore
+        )
         self.variables = self._problem.variables
         self._fit = Fit(self._problem, torch.zeros_like(self.variables.lower), settings.iterations)
         self._points = self._judged(run_stages(settings.stages, self._fit))
@@ -133,7 +140,7 @@ class CalibrationOptimizer:
         self.stop_reason: StopReason | None = None
         self.assessment: Assessment | None = None
         """At the end, how far the result can be relied on. What failed keeps the start, and so does what fits worse
-        than the start by any measure."""
+        than the start by any measure. What is doubtful has failed where the network does not know the robot."""
 
     def cancel(self) -> None:
         """Stop; what was reached stays in `best` and `history`."""
@@ -176,17 +183,25 @@ class CalibrationOptimizer:
             return
         start = torch.zeros_like(last.offsets)
         before, after = problem.evidence(start), problem.evidence(last.offsets)
-        self.assessment = assess_calibration(after)
+        self.assessment = self._with_knowledge(assess_calibration(after))
         if not bool(last.offsets.any()):
             return
         failed = self.assessment.verdict is Verdict.FAILED
         if not failed and not worse_in(before, after):
             return
         if not failed:
-            self.assessment = assess_calibration(before)
+            self.assessment = self._with_knowledge(assess_calibration(before))
         self._fit.offsets = start
         self._fit.stop_reason = StopReason.FAILED if failed else StopReason.START_KEPT
         yield replace(self._fit.evaluate(problem.present), objective_key=(*last.objective_key, "start"))
+
+    def _with_knowledge(self, found: Assessment) -> Assessment:
+        """A verdict that takes into account whether the network knows the arms; masks need no network."""
+        if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
+            return found
+        tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
+        known = [familiarity(self._scene, frame, self._predictor, self.settings) for frame in tried]
+        return without_knowledge(found, known)
 
     def __iter__(self) -> Iterator[CalibrationIterate]:
         """Step until the optimization stops."""

@@ -187,6 +187,11 @@ class CalibrationProblem:
         """Whether given masks are the target."""
         return all(part.problem.masked for part in self._parts)
 
+    @property
+    def some_masked(self) -> bool:
+        """Whether given masks are the target in some frames at least."""
+        return any(part.problem.masked for part in self._parts)
+
     def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
         """Mean overlap of silhouettes and masks (Dice), with joints as measured."""
         parts = self._some(_COMPARED)

@@ -21,11 +21,11 @@ _TISSUE = 0.75, 0.55, 0.45
 _NEAR = 40
 """How far from the arms as measured predictions count as theirs [px of the working image]."""
 
-_RECOGNIZED, _ELSEWHERE = 0.95, 0.05
+RECOGNIZED, _ELSEWHERE = 0.95, 0.05
 """Overlap from which a rendering is recognized as those of training are, and share of an image beyond which predictions
 mislead [1]."""
 
-_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
+UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Familiarity:
     elsewhere: float
     """Share of the image, far from the arms as measured, that the network takes for arms [1]."""
 
-    def warnings(self, where: str, remedy: str = _REMEDY, *, background: bool = False) -> list[str]:
+    def warnings(self, where: str, remedy: str = UNKNOWN_ROBOT_REMEDY, *, background: bool = False) -> list[str]:
         """What people should know before they solve; nothing where all is well.
 
         Args:
@@ -50,10 +50,10 @@ class Familiarity:
         if self.recognized is None:
             place = "Check T_camera_world, T_world_base and the units of the joints."
             found.append(f"{where}: no arm is in view as measured. {place}")
-        elif self.recognized < _RECOGNIZED:
+        elif self.recognized < RECOGNIZED:
             found.append(
                 f"{where}: the network recognizes a rendering of these arms with an overlap of {self.recognized:.2f} "
-                f"only ({_RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
+                f"only ({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(

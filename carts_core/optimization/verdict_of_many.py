@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from .evidence import Evidence
+from .familiarity import RECOGNIZED, UNKNOWN_ROBOT_REMEDY, Familiarity
 from .verdict import Assessment, Verdict, assess
 
 _MANY, _MOST = 0.1, 0.5
@@ -74,6 +75,23 @@ def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")
     reason = reason.replace("The image supports the fit only", "The images support the calibration only")
     return replace(found, reason=reason, remedy=found.remedy if found.nothing_there else _CALIBRATION_REMEDY)
+
+
+def without_knowledge(found: Assessment, known: Sequence[Familiarity]) -> Assessment:
+    """The verdict on a calibration by a network that may not know the robot: what is doubtful then has failed.
+
+    Args:
+        found: the verdict from the images.
+        known: how well the network knows the arms, in some of the frames.
+    """
+    recognized = [one.recognized for one in known if one.recognized is not None]
+    if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
+        return found
+    reason = (
+        f"{found.reason.rstrip('.')}, and the network recognizes a rendering of these arms with an overlap of "
+        f"{np.median(recognized):.2f} only ({RECOGNIZED} or more is usual)."
+    )
+    return replace(found, verdict=Verdict.FAILED, reason=reason, remedy=UNKNOWN_ROBOT_REMEDY)
 
 
 def median_evidence(frames: Sequence[Evidence]) -> Evidence:

@@ -7,8 +7,15 @@ from evidence import CONVINCING
 
 from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_counts
 from carts_core.optimization import Assessment, StopReason, Verdict
+from carts_core.optimization.familiarity import Familiarity
 from carts_core.optimization.verdict import assess
-from carts_core.optimization.verdict_of_many import assess_calibration, assess_sequence, median_evidence, worse_in
+from carts_core.optimization.verdict_of_many import (
+    assess_calibration,
+    assess_sequence,
+    median_evidence,
+    without_knowledge,
+    worse_in,
+)
 
 RIGHT = replace(CONVINCING, changed=None, overlap_with_change=None)
 WRONG = replace(RIGHT, loss=0.2, residual=0.8, agreement=0.4, unconditioned=0.1, predicted=0.1)
@@ -47,6 +54,18 @@ def test_a_calibration_is_judged_by_the_median_of_its_frames() -> None:
     assert failed.verdict is Verdict.FAILED and "calibration" in failed.reason and "--observe masks" in failed.remedy
     assert "kept as it was" in (calibration_hint(failed, StopReason.FAILED) or "")
     assert median_evidence([RIGHT, WRONG]).agreement == pytest.approx(0.675)
+
+
+def test_a_doubtful_calibration_fails_where_the_network_does_not_know_the_robot() -> None:
+    doubtful = Assessment(Verdict.DOUBTFUL, "The edges do not agree.", "Look at it.", 0.3, RIGHT)
+    stranger, friend, unseen = (Familiarity(recognized=value, elsewhere=0.0) for value in (0.9, 0.97, None))
+    found = without_knowledge(doubtful, [stranger, unseen, stranger])
+    assert found.verdict is Verdict.FAILED and "The edges do not agree, and the network recognizes" in found.reason
+    assert "overlap of 0.90" in found.reason and "--observe masks" in found.remedy
+    assert without_knowledge(doubtful, [friend, friend, stranger]) == doubtful
+    assert without_knowledge(doubtful, [unseen]) == doubtful and without_knowledge(doubtful, []) == doubtful
+    good = assess_calibration([RIGHT] * 5)
+    assert without_knowledge(good, [stranger]) == good
 
 
 def test_what_is_worse_beyond_chance_is_named() -> None:
