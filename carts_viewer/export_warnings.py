@@ -19,13 +19,16 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
         cameras: whose images and masks are exported.
     """
     found: list[str] = []
-    open_ones = sum(project.review(index).state is not ReviewState.ACCEPTED for index in frames)
+    # An hour has 100,000 frames, of which few have a record.
+    recorded = [index for index in frames if index in project.records]
+    accepted = sum(project.review(index).state is ReviewState.ACCEPTED for index in recorded)
+    open_ones = len(frames) - accepted
     if open_ones:
         found.append(f"{open_ones} of {len(frames)} frames {'is' if open_ones == 1 else 'are'} not accepted")
     for verdict, text in (("failed", "failed"), ("doubtful", "are doubtful")):
-        those = [i for i in frames if (known := project.verdict(i)) is not None and known.verdict == verdict]
+        those = [i for i in recorded if (known := project.verdict(i)) is not None and known.verdict == verdict]
         found += _line(project, those, f"of these frames {text}")
-    partly = [i for i in frames if i in project.records and not _seen_by_all(project, i, cameras)]
+    partly = [i for i in recorded if not _seen_by_all(project, i, cameras)]
     return found + _line(project, partly, "of these frames were fitted to fewer cameras than are exported")
 
 

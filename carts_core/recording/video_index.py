@@ -23,6 +23,8 @@ from ..files.reading import MIB, is_regular
 
 _EXACT = ("mp4", "matroska")
 """Containers that give every frame its presentation time and find it again."""
+_COMPLETE = ("mp4",)
+"""Of these, the ones that give every packet its times and say of each whether decoding may begin there."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -72,21 +74,26 @@ def index_video(path: Path) -> VideoIndex:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer, VideoStream]]:
     """A video file and its video stream.
+
+    Args:
+        path: the file.
+        parsed: look into packets for what the container does not say, which takes as long as reading them.
 
     Raises:
         SequenceError: it cannot be decoded.
     """
-    container, stream = open_video(path)
+    container, stream = open_video(path, parsed=parsed)
     with container:
         yield container, stream
 
 
-def open_video(path: Path) -> tuple[InputContainer, VideoStream]:
+def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
     """As `opened`; the caller closes the container."""
+    options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
-        container = av.open(str(path.absolute()), container_options=_OPTIONS, timeout=_SECONDS)
+        container = av.open(str(path.absolute()), container_options=options, timeout=_SECONDS)
     except (FFmpegError, OSError, ValueError) as error:
         raise SequenceError(f"video {path} cannot be decoded ({error}). {_remedy(path)}") from error
     stream = container.streams.best("video")
@@ -119,13 +126,15 @@ def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[V
 @lru_cache(maxsize=_REMEMBERED)
 def _index(path: Path, modified: int, size: int) -> VideoIndex:
     del modified, size  # They are part of the key.
-    index = _by_packets(path)
+    index = _by_packets(path, parsed=False) or _by_packets(path, parsed=True)
     return _by_decoding(path) if index is None else index
 
 
-def _by_packets(path: Path) -> VideoIndex | None:
+def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
     """The index as the container gives it, None where that is not to be relied on."""
-    with opened(path) as (container, stream):
+    with opened(path, parsed=parsed) as (container, stream):
+        if not parsed and not any(name in container.format.name for name in _COMPLETE):
+            return None
         exact = any(name in container.format.name for name in _EXACT)
         vp8 = stream.codec_context.name == "vp8"
         shown: list[int | None] = []

@@ -5,6 +5,7 @@ from collections import Counter
 import viser
 
 from carts_core.project import ProjectState, ReviewState
+from carts_core.project.keys import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.finding import BY_HAND, SOLVED, review_name
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
@@ -76,7 +77,10 @@ class ReviewPanel:
             self._count(state.project)
 
     def _count(self, project: ProjectState) -> None:
-        counts = Counter(review_name(project, index) for index in range(len(project.identity.frame_ids)))
+        # An hour has 100,000 frames, of which few have a record.
+        recorded = project.records.keys() - {WHOLE_PROJECT}
+        counts = Counter(review_name(project, index) for index in recorded)
+        counts[str(ReviewState.UNTOUCHED)] += len(project.identity.frame_ids) - len(recorded)
         known = " ".join(
             f'<span class="carts-key">{_dot(name)}{counts[name]} {name}</span>'
             for name in map(str, _COLORS)

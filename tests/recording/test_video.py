@@ -10,7 +10,7 @@ from av.video.frame import PictureType
 from videos import write_timed_video
 
 from carts_core.errors import SequenceError
-from carts_core.recording import Sequence
+from carts_core.recording import Sequence, video_index
 from carts_core.recording.images import read_image
 from carts_core.recording.video import Video
 from carts_core.recording.video_index import index_video, open_video
@@ -125,6 +125,16 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
     assert index_video(path).count == len(expected)
     video = Video(path, tuple(range(len(expected))))
     assert [number_of(video.read(index)) for index in range(len(expected))] == expected
+
+
+@pytest.mark.parametrize(
+    ("codec", "options"),
+    [("libx264", {"bf": "3", "g": "12", "x264-params": "open-gop=1"}), ("libx265", {"g": "12"}), ("mpeg4", {"bf": "2"})],
+)
+def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(codec, options, tmp_path):
+    path = write_numbered(tmp_path / "left.mp4", codec, options)
+    unparsed, parsed = video_index._by_packets(path, parsed=False), video_index._by_packets(path, parsed=True)
+    assert unparsed is not None and unparsed == parsed and unparsed.count == FRAMES
 
 
 def test_frames_of_vp8_that_are_only_referred_to_are_not_counted(tmp_path):
