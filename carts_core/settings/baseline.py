@@ -84,8 +84,9 @@ class BaselineTraining:
     """Weight decay of AdamW."""
     warmup: int = 50
     """Steps until the learning rate is at its peak."""
-    bfloat16: bool = True
-    """Compute in bfloat16 where torch can; weights stay float32."""
+    bfloat16: bool | None = None
+    """Compute in bfloat16; weights stay float32. Without it, on a GPU alone: a processor that has no instructions for
+    bfloat16 takes ten times as long with it."""
     checkpoint_every: int = 100
     """Steps between checkpoints."""
     threads: int = 2

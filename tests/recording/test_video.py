@@ -129,7 +129,11 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
 
 @pytest.mark.parametrize(
     ("codec", "options"),
-    [("libx264", {"bf": "3", "g": "12", "x264-params": "open-gop=1"}), ("libx265", {"g": "12"}), ("mpeg4", {"bf": "2"})],
+    [
+        ("libx264", {"bf": "3", "g": "12", "x264-params": "open-gop=1"}),
+        ("libx265", {"g": "12"}),
+        ("mpeg4", {"bf": "2"}),
+    ],
 )
 def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(codec, options, tmp_path):
     path = write_numbered(tmp_path / "left.mp4", codec, options)

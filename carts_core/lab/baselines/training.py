@@ -205,7 +205,8 @@ class _Run:
         return images.to(device).float() / 255, given.to(device), masks.to(device)
 
     def _logits(self, images: Tensor, given: Tensor) -> Tensor:
-        device = self.training.device
+        device, bfloat16 = self.training.device, self.training.bfloat16
         images = images.to(device).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(device.split(":")[0], torch.bfloat16, enabled=self.training.bfloat16):
+        enabled = device != "cpu" if bfloat16 is None else bfloat16
+        with torch.autocast(device.split(":")[0], torch.bfloat16, enabled=enabled):
             return self.network(images, given.to(device)).float()

@@ -84,6 +84,19 @@ def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp
         train_baseline(_smallest("unet"), other, _Frames(110), tmp_path)
 
 
+def test_on_a_processor_a_network_learns_in_float32_unless_bfloat16_is_asked_for(tmp_path: Path) -> None:
+    def weights(bfloat16: bool | None) -> dict[str, torch.Tensor]:
+        training = BaselineTraining(
+            augmentation="none", frames=104, steps=2, batch_size=2, warmup=0, threads=1, bfloat16=bfloat16
+        )
+        result = train_baseline(_smallest("unet"), training, _Frames(104), tmp_path / str(bfloat16))
+        return read_baseline(result.weights).network.state_dict()
+
+    default, single, half = weights(None), weights(False), weights(True)
+    assert all(torch.equal(default[key], single[key]) for key in default)
+    assert not all(torch.equal(default[key], half[key]) for key in default)
+
+
 @pytest.mark.parametrize("name", get_args(Augmentation))
 def test_every_augmentation_keeps_types_and_sizes_and_moves_the_mask_with_the_image(name: Augmentation) -> None:
     torch.manual_seed(0)
