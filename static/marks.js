@@ -53,9 +53,13 @@
         x: place.left, y: place.top, width: place.width, height: place.height,
         class: `carts-cell${active ? " active" : ""}`,
       });
-      const dice = camera.dice === null ? "" : ` · Dice ${camera.dice.toFixed(3)}`;
       const label = element(group, "text", { x: place.left + 24, y: place.top + 19, class: "carts-cell-label" });
-      label.textContent = `${camera.name}${camera.fit ? ` · ${camera.fit}` : ""}${dice}`;
+      const dice = camera.dice === null ? [] : [`Dice ${camera.dice.toFixed(3)}`];
+      // What a narrow picture has no room for; the circle's colour says the fit, too.
+      for (const texts of [[...(camera.fit ? [camera.fit] : []), ...dice], dice, []]) {
+        label.textContent = [camera.name, ...texts].join(" · ");
+        if (label.getComputedTextLength() < place.width - 30) break;
+      }
       element(group, "circle", {
         cx: place.left + 13, cy: place.top + 14, r: 5, class: `carts-fit ${camera.fit ?? "unknown"}`,
       });

@@ -29,6 +29,10 @@ _FIND = """() => {
         const box = one.getBoundingClientRect();
         if (box.left < -1 || box.right > innerWidth + 1) say('outside of the window');
     }
+    for (const one of document.querySelectorAll('.carts-cell-label')) {
+        const cell = one.parentElement.querySelector('.carts-cell').getBoundingClientRect();
+        if (one.getBoundingClientRect().right > cell.right) found.push(`${text(one)}: outside of its picture`);
+    }
     return found;
 }"""
 

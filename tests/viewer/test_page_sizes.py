@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 from cut_off import cut_off
+from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_viewer import intents
@@ -50,13 +51,13 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
 def test_the_curves_of_a_run_leave_the_panel_as_wide_as_it_is(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], window: tuple[int, int]
 ) -> None:
-    app = open_viewer()
+    app = open_viewer(cameras=("left", "right"))
     tab = open_tab(app, window)
     if window[0] < 600:
         tab.page.get_by_role("button", name="All controls").click()
         tab.page.get_by_text("Optimize · Review").click()
-    tab.place_in_viewer.put(intents.Step())
-    app.wait_until_shown(120)
+    tab.place_in_viewer.put(intents.Run())
+    eventually(lambda: tab.state.verdict, bool, timeout=120)
     tab.page.locator(".uplot").first.wait_for(state="visible")
     tab.page.wait_for_timeout(1000)
     assert cut_off(tab.page) == []
