@@ -74,7 +74,8 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int, baselines: Items[st
         domains, ours, papers, hard = ("regular",), scope.real_errors_deg, scope.real_errors_deg, ()
     runs += [Run(source.name, domain, frame, "ours", error) for error in ours for domain in domains]
     runs += [Run(source.name, "regular", frame, "paper", error) for error in papers]
-    runs += [Run(source.name, wrong, frame, "ours") for wrong in wrong_inputs(source.length, len(source.cameras))]
+    wrong = wrong_inputs(source.length, len(source.cameras), built_in=source.name == SYNTHETIC)
+    runs += [Run(source.name, kind, frame, "ours") for kind in wrong]
     for error in (None, *hard):
         runs += [Run(source.name, "regular", frame, "masks", error)]
         runs += [Run(source.name, OCCLUSION, frame, method, error) for method in _UNDER_OCCLUDERS]

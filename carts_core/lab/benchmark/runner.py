@@ -27,7 +27,7 @@ from .sources import Recording, Source
 from .store import ResultsFile
 from .temporal import correct_forwards
 from .together import calibrated_scene, correct_together
-from .wrong_inputs import WRONG, misled
+from .wrong_inputs import OTHER_INSTRUMENT, WRONG, misled, with_other_instruments
 
 _OCCLUDERS_SEED = 20
 
@@ -162,6 +162,9 @@ class SourceBench:
             backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
         ignore = {camera: truth.hidden} if method.occluders_given and truth.hidden is not None else None
         known = self._calibration(scope, extractor) if method.calibrated else recording.scene
+        if run.domain == OTHER_INSTRUMENT:
+            known = with_other_instruments(known, run.frame)
+            renderer = Renderer(known, cameras=[camera])
         scene = known.with_cameras(cameras)
         free = FreeParameters(extrinsics=method.poses, locked_cameras=(camera,))
         return optimize(run, scene, frame, backgrounds, networks, settings, free, truth, renderer, ignore)

@@ -29,11 +29,11 @@ from carts_core.lab.benchmark import (
 from carts_core.lab.benchmark.further_tables import sequence_table
 from carts_core.lab.benchmark.runner import SourceBench
 from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.wrong_inputs import NO_ARM, WRONG
+from carts_core.lab.benchmark.wrong_inputs import NO_ARM, OTHER_INSTRUMENT, WRONG
 
 QUIET = Console(quiet=True)
-RUNS = 61
-"""30 of the main table, 6 of the surface network alone, 2 with an error at the start, 3 with something wrong, 6 with
+RUNS = 62
+"""30 of the main table, 6 of the surface network alone, 2 with an error at the start, 4 with something wrong, 6 with
 occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode, 4 of TC-CaRTS."""
 
 
@@ -72,7 +72,9 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
             assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
     judged = [m for m in measurements if m.run.method in ("ours", "masks", "sequence")]
     assert all(m.verdict in ("good", "doubtful", "failed") and m.probability is not None for m in judged)
-    assert all(m.within and 0 <= m.within[1] <= m.within[2] <= m.within[0] == 7 for m in judged)
+    known, other = ([m for m in judged if (m.run.domain == OTHER_INSTRUMENT) is kind] for kind in (False, True))
+    assert all(m.within and 0 <= m.within[1] <= m.within[2] <= m.within[0] == 7 for m in known)
+    assert len(other) == 1 and other[0].within is None
     (nothing,) = [m for m in measurements if m.run.domain == NO_ARM]
     assert nothing.final.dice == 0.0 and nothing.verdict == "failed"
     tiny_benchmark().run(QUIET)

@@ -11,7 +11,15 @@ from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, p
 from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.verdicts import deviation_table, family_table, verdict_table
-from carts_core.lab.benchmark.wrong_inputs import NO_ARM, OTHER_CAMERA, OTHER_FRAME, misled, wrong_inputs
+from carts_core.lab.benchmark.wrong_inputs import (
+    NO_ARM,
+    OTHER_CAMERA,
+    OTHER_FRAME,
+    OTHER_INSTRUMENT,
+    misled,
+    with_other_instruments,
+    wrong_inputs,
+)
 from carts_core.recording import Sequence
 
 
@@ -88,7 +96,7 @@ def test_rooms_and_other_instruments_are_planned_without_real_frames() -> None:
     families = [run for run in runs if run.source.startswith("family")]
     assert {run.source for run in families} == {f"family {name}" for name in HELD_OUT}
     assert {run.domain for run in families} == {"regular", "smoke"} and {run.error_deg for run in families} == {2.0}
-    assert {run.domain for run in runs} >= {NO_ARM, OTHER_FRAME, OTHER_CAMERA}
+    assert {run.domain for run in runs} >= {NO_ARM, OTHER_FRAME, OTHER_CAMERA, OTHER_INSTRUMENT}
     assert len(set(runs)) == len(runs)
     assert len(family_sources(FULL)[0].frames) == FULL.family_frames
 
@@ -98,7 +106,7 @@ def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> No
     sequence = Sequence.open(path)
     right = sequence.frame(1, "regular")
     assert right.masks is not None
-    empty, joints, image = (misled(sequence, kind, 1, "left") for kind in wrong_inputs(4, 2))
+    empty, joints, image, instrument = (misled(sequence, kind, 1, "left") for kind in wrong_inputs(4, 2, built_in=True))
     assert empty.masks is not None and not empty.masks["left"].any()
     np.testing.assert_array_equal(empty.images["left"], sequence.background("left", "regular"))
     np.testing.assert_array_equal(joints.measured["PSM1"], sequence.frame(3, "regular").measured["PSM1"])
@@ -106,8 +114,14 @@ def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> No
     np.testing.assert_array_equal(image.images["left"], right.images["right"])
     assert image.masks is not None
     np.testing.assert_array_equal(image.masks["left"], right.masks["right"])
+    np.testing.assert_array_equal(instrument.images["left"], right.images["left"])
+    assert instrument.truth is None
+    (arm,), (other,) = sequence.scene.arms, with_other_instruments(sequence.scene, 1).arms
+    assert other.robot.name != arm.robot.name and other.robot.joint_names == arm.robot.joint_names
 
 
-@pytest.mark.parametrize(("frames", "cameras", "kinds"), [(1, 1, 1), (2, 1, 2), (2, 2, 3)])
-def test_what_a_recording_lacks_is_not_planned(frames: int, cameras: int, kinds: int) -> None:
-    assert len(wrong_inputs(frames, cameras)) == kinds
+@pytest.mark.parametrize(
+    ("frames", "cameras", "built_in", "kinds"), [(1, 1, False, 1), (2, 1, False, 2), (2, 2, False, 3), (2, 2, True, 4)]
+)
+def test_what_a_recording_lacks_is_not_planned(frames: int, cameras: int, built_in: bool, kinds: int) -> None:
+    assert len(wrong_inputs(frames, cameras, built_in=built_in)) == kinds
