@@ -9,12 +9,13 @@ import torch
 from jaxtyping import Float
 
 from ..errors import SettingsError
-from ..model.scene import Scene, SceneState
+from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..recording.background import spread
 from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver, surface_solver
 from ..settings.stages import Descend
+from .calibrated_scene import calibrated_scene
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
 from .familiarity import familiarity
 from .fit import Fit, Point, StopReason
@@ -166,7 +167,7 @@ class CalibrationOptimizer:
             stages=self._stages,
             loss=evaluation.loss,
             offsets=point.offsets.clone(),
-            scene=_calibrated(self._whole_scene, self._scene, self.variables, point.offsets),
+            scene=calibrated_scene(self._whole_scene, self._scene, self.variables, point.offsets),
             frame_losses=evaluation.frame_losses.numpy().copy(),
             seconds=time.perf_counter() - began,
         )
@@ -249,37 +250,6 @@ def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
     if not (every_base and free.extrinsics) or set(names) & set(free.locked_cameras):
         return free
     return replace(free, locked_cameras=(*free.locked_cameras, names[0]))
-
-
-def _calibrated(whole: Scene, part: Scene, variables: Variables, offsets: torch.Tensor) -> Scene:
-    """The whole scene with the calibration of its calibrated part; what did not move keeps its exact value."""
-    start, state = variables.start, variables.state(offsets)
-    arms = tuple(
-        replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
-        for index, arm in enumerate(whole.arms)
-    )
-    indices = {camera.name: index for index, camera in enumerate(part.cameras)}
-    cameras = []
-    for camera in whole.cameras:
-        if (index := indices.get(camera.name)) is not None:
-            T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
-            before, after = start.intrinsics[index], state.intrinsics[index]
-            fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
-            cameras.append(replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy)))
-        else:
-            cameras.append(camera)
-    return replace(whole, arms=arms, cameras=tuple(cameras))
-
-
-def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
-    before, after = getattr(start, name)[index], getattr(state, name)[index]
-    if torch.equal(before, after):
-        return given
-    import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second
-
-    result = after.cpu().double()
-    result[:3, :3] = roma.special_procrustes(result[:3, :3])
-    return result.numpy()
 
 
 def _changes(
