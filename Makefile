@@ -36,13 +36,11 @@ format: setup-dev ## Format the code and fix what can be fixed
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
 
-bench: setup-dev ## Run the slow tests and print the measurements
-	chromium=$$($(BIN)/python .ci/chromium.py) && \
-	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -m slow $(ARGS)
-	$(BIN)/python -m tools.bench_core
-	$(BIN)/python -m tools.bench_recordings
-	$(BIN)/python -m tools.bench_viewer
-	$(BIN)/carts bench --quick
+bench: setup-dev ## Print the measurements, then run the slow tests and the benchmark
+	chromium=$$($(BIN)/python .ci/chromium.py) && export CARTS_CHROMIUM=$$chromium && failed=0 && \
+	for measured in core recordings viewer; do $(BIN)/python -m tools.bench_$$measured || failed=1; done && \
+	{ $(BIN)/python -m pytest -m slow $(ARGS) || failed=1; } && \
+	{ $(BIN)/carts bench --quick || failed=1; } && exit $$failed
 
 pictures: setup-dev ## Take the pictures of the README, the tutorial and the examples again
 	chromium=$$($(BIN)/python .ci/chromium.py) && CARTS_CHROMIUM=$$chromium $(BIN)/python docs/pictures.py
