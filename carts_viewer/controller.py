@@ -209,7 +209,8 @@ class Controller:
         self._context.save()
 
     def say(self, text: str | None) -> None:
-        """Show the user what is being prepared; None when nothing is."""
+        """Show the user what is being prepared, and what the background has begun; None when nothing is."""
+        self._share()
         self._context.change(busy=text)
 
     def score(self) -> None:

@@ -10,7 +10,7 @@ NOT_CHECKED = "not checked"
 UNJUDGED = "unreviewed"
 """Of frames that nobody has judged, whatever made their joint positions."""
 BY_HAND = "moved by hand"
-SOLVED = "solved with other frames"
+SOLVED = "solved together"
 
 
 @dataclass(frozen=True)

@@ -41,20 +41,23 @@ class TimelineData:
         self._fps = (len(self._ids) - 1) / span if span > 0 else 0.0
         self._records: Mapping[int, Record] = {}
         self._codes: dict[int, int] = {}
+        self._draft: int | None = None
+        """The frame of which something was sent that is not saved yet."""
         self._solving: list[int] | None = None
         self._traces = Traces(session)
         page.call("setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:
-        """Send what has changed; a gesture that is not finished changes nothing."""
+        """Send what has changed; a gesture that is not finished changes its own frame alone."""
         solving = None
         if state.solve is not None and state.solving:
             solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]
-        changed = [] if state.unsaved else self._changed(state.project)
+        changed = self._drafted(state) if state.unsaved else self._changed(state.project)
         measured = self._traces.measure(self._session.sequence)
         if changed or measured or solving != self._solving:
             self._solving = solving
-            message = {"whole": False, "codes": changed, "solving": solving, "traced": bool(changed) or measured}
+            traced = measured or (bool(changed) and not state.unsaved)
+            message = {"whole": False, "codes": changed, "solving": solving, "traced": traced}
             self._page.call("setTimeline", message)
 
     def answer(self, text: str) -> None:
@@ -85,9 +88,18 @@ class TimelineData:
             "aspects": [camera.width / camera.height for camera in sequence.scene.cameras],
         }
 
+    def _drafted(self, state: ViewState) -> list[int]:
+        """As `_changed`, of the shown frame alone, while somebody or the optimizer moves it."""
+        self._draft, number = state.index, code(state.project, state.index)
+        if self._codes.get(state.index, 0) == number:
+            return []
+        self._codes[state.index] = number
+        return [state.index, number]
+
     def _changed(self, project: ProjectState) -> list[int]:
         """Frame and code, one after the other, of the frames whose code is another one than before."""
-        if project.records is self._records:
+        draft, self._draft = self._draft, None
+        if project.records is self._records and draft is None:
             return []
         before, self._records = self._records, project.records
         touched = [i for i, record in project.records.items() if i >= 0 and before.get(i) is not record]
@@ -95,6 +107,7 @@ class TimelineData:
         # What the calibration changes makes figures and verdicts of all frames void.
         indices = {i for i in project.records if i >= 0} if whole else set(touched)
         indices |= {i for i in before if i >= 0 and i not in project.records}
+        indices |= set() if draft is None else {draft}
         self._traces.follow(project, indices)
         changed: list[int] = []
         for index in sorted(indices):

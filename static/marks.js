@@ -53,15 +53,18 @@
         x: place.left, y: place.top, width: place.width, height: place.height,
         class: `carts-cell${active ? " active" : ""}`,
       });
-      const label = element(group, "text", { x: place.left + 24, y: place.top + 19, class: "carts-cell-label" });
+      // Of a picture that reaches out of the window, the part that is seen; its upper end lies below the tool bar.
+      const left = Math.max(place.left, 0);
+      const top = place.top < 0 ? Math.min(46, place.top + place.height - 28) : place.top;
+      const label = element(group, "text", { x: left + 24, y: top + 19, class: "carts-cell-label" });
       const dice = camera.dice === null ? [] : [`Dice ${camera.dice.toFixed(3)}`];
       // What a narrow picture has no room for; the circle's colour says the fit, too.
       for (const texts of [[...(camera.fit ? [camera.fit] : []), ...dice], dice, []]) {
         label.textContent = [camera.name, ...texts].join(" · ");
-        if (label.getComputedTextLength() < place.width - 30) break;
+        if (label.getComputedTextLength() < place.left + place.width - left - 30) break;
       }
       element(group, "circle", {
-        cx: place.left + 13, cy: place.top + 14, r: 5, class: `carts-fit ${camera.fit ?? "unknown"}`,
+        cx: left + 13, cy: top + 14, r: 5, class: `carts-fit ${camera.fit ?? "unknown"}`,
       });
     }
     let lowest = -1e4; // of the names so far, which must not lie over one another

@@ -458,6 +458,13 @@
     setTimeout(leave, 60);
   }, { capture: true });
 
+  // A field is left with Enter or Escape, too; what the field itself makes of the key comes first.
+  window.addEventListener("keydown", (event) => {
+    const field = event.target instanceof Element ? event.target.closest("input:not([aria-haspopup=listbox])") : null;
+    if (!field || !["Enter", "Escape"].includes(event.key) || event.isComposing || field.closest("[role=dialog]")) return;
+    setTimeout(() => field.blur(), 0);
+  });
+
   // ---- Say when nobody listens any more ------------------------------------------------------------------------------
 
   /** While there is no connection, viser's client replaces what sends by a function that only writes to the log. */

@@ -4,7 +4,7 @@
   "use strict";
 
   const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#e879f9"];
-  const NAMES = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved with other frames"];
+  const NAMES = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved together"];
   const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
   const VERDICTS = ["", "good", "doubtful", "failed"];
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
@@ -295,7 +295,7 @@
   }
 
   function say() {
-    readout.textContent = described(here);
+    readout.textContent = readout.title = described(here);
     tip.hidden = hover === null;
     if (hover !== null) {
       tip.textContent = described(hover);

@@ -12,7 +12,7 @@
       "images hardly show."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
     ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
-    [".carts-strip", "The timeline", "All frames: high bars fit badly, and frames without a bar are not fitted or checked as they are. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
+    [".carts-strip", "The timeline", "All frames: high bars fit badly, and of frames without a bar nothing is known yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "Legend explains colours and marks."],
     ["Review", "Review", "Accept (G) goes on to the next frame that nobody has reviewed. Here are also keyframes, Solve between, " +
       "search and history."],

@@ -81,7 +81,7 @@ class JobsHandler:
     def _(self, intent: intents.Solve) -> None:
         state, title = self._choices, "Solve all frames" if intent.whole else "Solve between keyframes"
         options = {**asdict(intent), "at": state.index}
-        if state.range is not None and (intent.whole or state.index in state.part):
+        if state.range is not None:
             options["range"] = list(state.range)
             title = f"Solve {'' if intent.whole else 'between keyframes, '}frames {self._from_to(state.range)}"
         self._queue("solve", title, options)

@@ -90,6 +90,11 @@ class PropagatingHandler:
         everything = range(len(self._session.sequence))
         if part is not None and (part.start not in everything or part.stop - 1 not in everything or not part):
             raise CartsError("The chosen range lies outside of the sequence. Choose another one in the timeline.")
+        if part is not None and not whole and at not in part:
+            raise CartsError(
+                "Solving between keyframes keeps to the range in the timeline, and the shown frame lies outside of it. "
+                "Show one of its frames, or choose no range (× in the timeline)."
+            )
         frames = (part or everything) if whole else between_kept(view, at, part)
         kept = [frame for frame in view.kept_frames if frame in frames]
         if not (whole or kept):
@@ -99,8 +104,14 @@ class PropagatingHandler:
         if len(kept) == len(frames):
             raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")
         self._before = view
-        self._context.change(playing=False, error=None)
-        self._run = self._make(frames, kept)
+        former = self._context.state.solve
+        self._context.change(playing=False, error=None, solve=SolveState(frames, text="Preparing"))
+        self._optimizers.report("Preparing to solve")
+        try:
+            self._run = self._make(frames, kept)
+        except Exception:
+            self._context.change(solve=former)
+            raise
         self._work = self._bits(self._run)
         self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 

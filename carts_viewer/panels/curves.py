@@ -46,7 +46,7 @@ def note(curves: Curves, outdated: bool) -> str:
     if outdated:
         return "Of the last run; the pose, the image or a setting was changed since."
     if curves.comparable:
-        return "○ a stage of the solver begins · ● the result"
+        return "○ a stage of the solver begins · ● the result. At the end losses are drawn anew, so that all compare."
     return "○ a stage of the solver begins; until the run has ended, losses only compare within a stage."
 
 

@@ -3,7 +3,7 @@
 import viser
 
 from carts_core.export import FORMATS
-from carts_core.project import ProjectState
+from carts_core.project import ProjectState, ReviewState
 from carts_viewer import intents
 from carts_viewer.export_warnings import export_warnings
 from carts_viewer.handlers.exporting import FRAME_CHOICES, frames_within
@@ -106,6 +106,12 @@ class ExportPanel:
         known = self._frames.value in FRAME_CHOICES
         frames = frames_within(state.project, self._frames.value, self._range) if known else []
         cameras = [state.camera] if self._cameras.value == "Shown one" else self._camera_names
-        notes = "".join(f"<br>⚠ {escaped(line)}" for line in export_warnings(state.project, frames, cameras))
+        warnings = export_warnings(state.project, frames, cameras)
+        outside = set(frames_within(state.project, self._frames.value, None)) - set(frames) if known else ()
+        accepted = sum(state.project.review(index).state is ReviewState.ACCEPTED for index in outside)
+        if accepted:
+            names = "frame outside of the range is" if accepted == 1 else "frames outside of the range are"
+            warnings.append(f"{accepted} accepted {names} left out")
+        notes = "".join(f"<br>⚠ {escaped(line)}" for line in warnings)
         total = len(state.project.identity.frame_ids)
         self._count.content = f'<p class="carts-caption"><b>{len(frames)}</b> of {total} frames{notes}</p>'

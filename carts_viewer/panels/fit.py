@@ -40,6 +40,7 @@ class FitPanel:
         # It stays where it is, so that nothing below it moves under the pointer.
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
+        self._check.label = "Check the fit" if state.verdict is None else "The fit is checked"
         self._text.content = fit_text(
             state.verdict, running=running, scores=_scores(state, self._cameras), busy=state.busy
         )

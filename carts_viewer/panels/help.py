@@ -21,7 +21,9 @@ class HelpPanel:
         own = {}
         for shortcut in shortcuts(layers):
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
-            command = gui.add_command(shortcut.label, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
+            # viser shows the keys that it listens to itself.
+            described = shortcut.key if hotkey is None else None
+            command = gui.add_command(shortcut.label, description=described, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             _listen(page, command, shortcut, perturb, emit)
             if hotkey is None and isinstance(shortcut.action, intents.Intent):
                 own[shortcut.hotkey] = shortcut.action

@@ -62,6 +62,10 @@ class KeyframesPanel:
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
         self._all.disabled = state.solving or not self._open
+        # A range is chosen for solving all of it, more often than not.
+        bright = self._between if self._solvable and state.range is None else self._all
+        for button in (self._between, self._all):
+            button.color = "teal" if button is bright else "gray"
         lines = [] if state.solving else [self._plan, _MEANING]
         if state.solve is not None:
             done, total = state.solve.progress
@@ -96,21 +100,27 @@ class KeyframesPanel:
         if self._seen == seen or (state.unsaved and self._seen[1:] == seen[1:]):
             return
         self._seen = seen
+        self._plan = f"{self._between_here(state)}<br>{self._all_here(state)}"
+
+    def _between_here(self, state: ViewState) -> str:
+        name = "<b>Solve between</b>"
         frames = between_kept(state.project, state.index, state.part)
-        kept = set(state.project.kept_frames)
-        if state.index in state.part:
-            kept &= set(state.part)
+        kept = set(state.project.kept_frames) & set(state.part)
         count = sum(frame not in kept for frame in frames)
-        self._solvable = bool(kept) and count > 0
-        first, last = (escaped(self._ids[frame]) for frame in (frames[0], frames[-1]))
-        where = "in the range" if state.range is not None and state.index in state.part else "yet"
-        done = f"<b>Solve between</b>, {first} to {last}: every frame is kept"
-        plan = f"<b>Solve between</b>, {first} to {last}: {_frames(count)} would be fitted, {len(frames) - count} kept"
-        none = f"<b>Solve between</b> needs a kept frame; none is kept {where}"
-        open_frames = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
-        self._open = open_frames > 0
-        rest = f"{_frames(open_frames)} would be fitted" if open_frames else "every frame is kept"
-        self._plan = f"{none if not kept else plan if count else done}<br><b>{_whole(state)}</b>: {rest}"
+        self._solvable = state.index in state.part and bool(kept) and count > 0
+        if state.index not in state.part:
+            return f"{name} keeps to the range, and this frame lies outside of it"
+        if not kept:
+            return f"{name} needs a kept frame; none is kept {'yet' if state.range is None else 'in the range'}"
+        where = f"{name}, {escaped(self._ids[frames[0]])} to {escaped(self._ids[frames[-1]])}"
+        return f"{where}: " + (
+            f"{_frames(count)} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"
+        )
+
+    def _all_here(self, state: ViewState) -> str:
+        count = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
+        self._open = count > 0
+        return f"<b>{_whole(state)}</b>: " + (f"{_frames(count)} would be fitted" if count else "every frame is kept")
 
 
 def _whole(state: ViewState) -> str:
