@@ -463,7 +463,7 @@
     const field = event.target instanceof Element ? event.target.closest("input:not([aria-haspopup=listbox])") : null;
     if (!field || !["Enter", "Escape"].includes(event.key) || event.isComposing || field.closest("[role=dialog]")) return;
     setTimeout(() => field.blur(), 0);
-  });
+  }, { capture: true });
 
   // ---- Say when nobody listens any more ------------------------------------------------------------------------------
 
