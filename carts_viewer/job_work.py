@@ -97,14 +97,14 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     )
     most = CALIBRATION_SETTINGS.iterations
     while (iterate := optimizer.step()) is not None:
-        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
+        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; {most} iterations at most"
         yield Progress(iterate.index, most, text, text)
     result = optimizer.result()
     for change in result.unknowns:
         line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f} {change.unit}"
         yield Progress(most, most, "Comparing", line)
     found = result.assessment
-    verdict = "" if found is None else f"{found.verdict.value}: {found.reason} {found.remedy}"
+    verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}"
     provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free, target)
     edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
     if not edits:

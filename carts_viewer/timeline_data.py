@@ -119,7 +119,7 @@ class TimelineData:
 
 
 def code(project: ProjectState, frame: int) -> int:
-    """Review, verdict, source, whether it is kept, and how badly it fits (0 to 255), each in its own bits."""
+    """Review, verdict, source, whether it is kept, and how badly it fits (1 to 255, 0 unknown), in bits."""
     record = project.records.get(frame)
     if record is None:
         return 0
@@ -127,7 +127,7 @@ def code(project: ProjectState, frame: int) -> int:
     verdict, figures = project.verdict(frame), project.figures(frame)
     source = next((number for number, source in enumerate(_SOURCES, start=1) if source in record.sources), 0)
     dice = None if figures is None else figures.dice
-    badness = verdict.failure if dice is None and verdict is not None else 0.0 if dice is None else 1.0 - dice
+    badness = 1.0 - dice if dice is not None else None if verdict is None else verdict.failure
     return review + 8 * _fit(verdict) + 32 * source + 128 * int(record.is_kept) + 256 * _height(badness)
 
 
@@ -135,5 +135,5 @@ def _fit(verdict: FitVerdict | None) -> int:
     return 0 if verdict is None else 1 + VERDICTS.index(verdict.verdict)
 
 
-def _height(badness: float) -> int:
-    return min(round(255 * badness / _FULL), 255)
+def _height(badness: float | None) -> int:
+    return 0 if badness is None else min(max(round(255 * badness / _FULL), 1), 255)

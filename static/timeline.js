@@ -95,7 +95,7 @@
       .join(" ");
     const rows = [
       ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving leaves it as it is"],
-      ["Bar", `the higher, the worse it fits; none where nothing is known of the frame as it is. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
+      ["Bar", `the higher, the worse it fits; low and faint where the fit of the frame as it is is not known, none where nothing is known at all. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
       ["Stripe below", `the verdict on the fit: ${keys(FIT, VERDICTS)}`],
       ["Stripe below that", `where the joints come from: ${keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])}`],
       ["Line at the bottom", "the whole sequence, in the colours of the verdict, or of the review where there is none; the frame in it is what is shown above"],
@@ -213,8 +213,10 @@
     if (!code) return;
     const bad = (code >> 8) / 255;
     const tallness = Math.max(3, bad * height);
+    context.globalAlpha = code >> 8 ? 1 : 0.4; // what is not known looks unlike what fits well
     context.fillStyle = REVIEW[code & 7];
     context.fillRect(x, top + height - tallness, wide, tallness);
+    context.globalAlpha = 1;
   }
 
   function draw() {

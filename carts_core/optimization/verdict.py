@@ -107,7 +107,10 @@ _REMEDY = (
     "Look at the overlay. Run the optimizer, set the arm by hand, or fit the frame together with its neighbours "
     "(sequence mode; Solve in the page)."
 )
-_REMEDY_FAILED = "Set the arm roughly by hand and run again, check the calibration, or give an image of the background."
+_REMEDY_FAILED = (
+    "Run the optimizer, or if it has run, set the arm roughly by hand and run again, check the calibration, or name an "
+    "image of the empty scene in the recording's file (background)."
+)
 
 
 def _weakest(found: Evidence) -> str:

@@ -29,7 +29,7 @@ FRAME_CHOICES = {
     "All": frozenset(ReviewState),
     "All but rejected": frozenset(ReviewState) - {ReviewState.REJECTED},
     "Accepted": frozenset({ReviewState.ACCEPTED}),
-    "Accepted and optimized": frozenset({ReviewState.ACCEPTED, ReviewState.OPTIMIZED}),
+    "Accepted or optimized": frozenset({ReviewState.ACCEPTED, ReviewState.OPTIMIZED}),
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
     "Unreviewed": UNREVIEWED,
 }

@@ -11,10 +11,11 @@ from viewer_canvas import decoded, eventually
 from viewer_desk import Desk
 from viewer_tab import Tab
 
-from carts_core.project import Figures
+from carts_core.project import Figures, Key, Review, ReviewState
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.thumbnails import HEIGHT
+from carts_viewer.timeline_data import code
 from carts_viewer.traces import Traces
 
 # ---- Curves --------------------------------------------------------------------------------------------------------
@@ -72,6 +73,14 @@ def test_a_range_is_marked_frame_by_frame_and_the_whole_sequence_is_none(desk: D
     assert desk.do(intents.ShowFrame(0), intents.MarkRange(end=True)).range == (0, 0)
     assert desk.do(intents.SetRange((-3, 10**8))).range is None
     assert desk.do(intents.SetRange((1, 2)), intents.SetRange(None)).range is None
+
+
+def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_well_has_some(desk: Desk) -> None:
+    editor = desk.session.editor
+    editor.apply("Accept", {Key.review(1): Review(ReviewState.ACCEPTED), Key.review(2): Review(ReviewState.ACCEPTED)})
+    assert [code(editor.project.state, frame) >> 8 for frame in (0, 1, 2)] == [0, 0, 0]
+    editor.project.record_figures({1: Figures(dice=1.0), 2: Figures(dice=0.5)}, editor.project.state)
+    assert [code(editor.project.state, frame) >> 8 for frame in (0, 1, 2)] == [0, 1, 255]
 
 
 # ---- In the page ---------------------------------------------------------------------------------------------------
