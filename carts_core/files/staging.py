@@ -9,6 +9,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -43,10 +44,20 @@ class Staging:
     mark: _Mark
 
     def remove(self) -> None:
-        """Remove it with all that it holds; links in it are removed, not followed."""
+        """Remove it with all that it holds; links in it are removed, not followed.
+
+        The mark goes last, so what a kill leaves of it is found again.
+        """
         found = status(self.parent, self.name)
-        if found is not None and found.st_ino == self.mark.inode:
-            shutil.rmtree(self.name, ignore_errors=True, dir_fd=self.parent)
+        if found is None or found.st_ino != self.mark.inode:
+            return
+        for name in os.listdir(self.descriptor):
+            if name != _MARK:
+                _remove(self.descriptor, name)
+        with suppress(OSError):
+            if os.listdir(self.descriptor) == [_MARK]:
+                os.unlink(_MARK, dir_fd=self.descriptor)
+            os.rmdir(self.name, dir_fd=self.parent)
 
     def close(self) -> None:
         """Let go of it."""
@@ -88,9 +99,12 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
             continue
         mark = _read_mark(descriptor)
         if mark is None:
-            # Killed before it was marked. This removes empty folders only.
+            # Killed before it was marked. This removes empty folders only, and such with an empty mark.
             with suppress(OSError):
                 if try_lock(descriptor):
+                    found = status(descriptor, _MARK)
+                    if found is not None and stat.S_ISREG(found.st_mode) and found.st_size == 0:
+                        os.unlink(_MARK, dir_fd=descriptor)
                     os.rmdir(name, dir_fd=parent)
         elif mark.output == output:
             if not try_lock(descriptor):
@@ -99,6 +113,16 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
             yield Staging(parent, name, descriptor, mark)
             continue
         os.close(descriptor)
+
+
+def _remove(folder: int, name: str) -> None:
+    """Remove a file, a link or a folder in an open folder, as far as it can be."""
+    with suppress(OSError):
+        found = status(folder, name)
+        if found is not None and stat.S_ISDIR(found.st_mode):
+            shutil.rmtree(name, ignore_errors=True, dir_fd=folder)
+        else:
+            os.unlink(name, dir_fd=folder)
 
 
 def _write_mark(staging: Staging) -> None:

@@ -125,3 +125,51 @@ def test_a_draft_is_told_apart(tmp_path: Path) -> None:
         assert isinstance(path, OutputPath) and path.draft and not resumable.draft
         write_text(path, "a")
         write_text(resumable, "b")
+
+
+_KILLED_AT_REMOVAL = """
+import os, signal, sys
+from pathlib import Path
+from carts_core.files import MARKER, published, write_text
+
+steps = int(sys.argv[2])
+
+def counted(step):
+    def do(*arguments, **named):
+        global steps
+        if steps == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        steps -= 1
+        return step(*arguments, **named)
+    return do
+
+with published(Path(sys.argv[1]), overwrite=True) as path:
+    for name in ("a", "z", MARKER):
+        write_text(path / name, name)
+    os.unlink, os.rmdir = counted(os.unlink), counted(os.rmdir)
+"""
+
+
+def test_a_kill_at_any_moment_of_tidying_up_leaves_nothing_for_good(tmp_path: Path) -> None:
+    kills, returned = 0, -9
+    while returned == -9:
+        with published(tmp_path / "out", overwrite=True) as path:
+            write_text(path / MARKER, "old")
+        command = [sys.executable, "-c", _KILLED_AT_REMOVAL, tmp_path / "out", str(kills)]
+        returned = subprocess.run(command, check=False).returncode
+        kills += returned == -9
+        assert (tmp_path / "out" / "z").read_text() == "z"
+        with published(tmp_path / "out", overwrite=True) as path:
+            write_text(path / MARKER, "new")
+        assert os.listdir(tmp_path) == ["out"], kills
+    # The old export's file and folder, the mark, and the staging folder.
+    assert returned == 0 and kills >= 4
+
+
+def test_what_was_killed_while_it_was_marked_is_tidied_up(tmp_path: Path) -> None:
+    left = tmp_path / f".carts-{'f' * 32}"
+    left.mkdir()
+    (left / "carts-unfinished.json").touch()
+    with published(tmp_path / "out") as path:
+        write_text(path / MARKER, "new")
+    assert os.listdir(tmp_path) == ["out"]
