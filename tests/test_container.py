@@ -97,10 +97,15 @@ def test_its_steps_install_a_command_that_starts_and_asks_for_the_token(tmp_path
 
     program = tmp_path / "venv" / "bin" / "carts"
     assert str(tmp_path) in program.read_text().splitlines()[0]
-    arguments = [*command()[1:-1], "0"]
-    with subprocess.Popen(
-        [program, *arguments], cwd=data, env=environment, stdout=subprocess.PIPE, text=True
-    ) as server:
+    # As the container does, which shows the start page; and with a recording, whose project is kept in the volume.
+    _start_and_stop([program, *command()[1:-1], "0"], data, environment)
+    (sample,) = site_packages.rglob("sample_data/sequence/sequence.toml")
+    _start_and_stop([program, *command()[1:-1], "0", sample], data, environment)
+    assert list(data.rglob("*.carts"))
+
+
+def _start_and_stop(arguments: list[str | Path], data: Path, environment: dict[str, str]) -> None:
+    with subprocess.Popen(arguments, cwd=data, env=environment, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         lines = (line for line in server.stdout if "http://" in line)
         (address,) = re.findall(r"http://\S+", next(lines))
@@ -111,4 +116,3 @@ def test_its_steps_install_a_command_that_starts_and_asks_for_the_token(tmp_path
         assert status(f"http://127.0.0.1:{port}/?token={token}") == 200
         server.send_signal(signal.SIGINT)
         assert server.wait(60) in (0, 130)
-    assert list(data.glob("*.carts")) or list(data.rglob("*.carts"))
