@@ -1,6 +1,8 @@
 """Puts states on the page: pictures into the stage, values into the panels, only what changed and only when asked."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
@@ -16,6 +18,12 @@ from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState
 from carts_viewer.strokes import Tool
 from carts_viewer.transport.tab_page import TabPage
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """As many as cameras are shown beside one another; the renderer lets several run at once."""
+    return ThreadPoolExecutor(4, thread_name_prefix="overlay")
 
 
 class PageDisplay:
@@ -48,7 +56,7 @@ class PageDisplay:
         new_frame = old is None or state.frame is not old.frame
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
-            overlays = {name: self._overlay(state, name) for name in self._seen(state)}
+            overlays = self._overlays(state, self._seen(state))
             # Together, or a new frame would be seen for a moment under the old frame's overlay.
             with self._page.atomic():
                 if new_frame:
@@ -73,6 +81,12 @@ class PageDisplay:
         """The cameras whose images are shown: those that the frame has, the active one first."""
         others = [camera.name for camera in self._scene.cameras if camera.name != state.camera]
         return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
+
+    def _overlays(self, state: ViewState, cameras: list[str]) -> dict[str, Rgba]:
+        """By camera; those of several are rendered at the same time."""
+        if len(cameras) == 1:
+            return {cameras[0]: self._overlay(state, cameras[0])}
+        return dict(zip(cameras, _threads().map(lambda camera: self._overlay(state, camera), cameras), strict=True))
 
     def _overlay(self, state: ViewState, camera: str) -> Rgba:
         correction = state.mask_correction_of(camera)

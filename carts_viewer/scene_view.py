@@ -65,6 +65,7 @@ class SceneView:
         self._others: dict[str, tuple[tuple[Camera, Camera], viser.ImageHandle]] = {}
         self._world = shown.add_frame(WORLD, show_axes=False)
         self._measured: list[list[viser.FrameHandle]] = []
+        self._places: dict[str, bytes] = {}
         self._add_arms()
         self._add_cameras()
         self._add_grid()
@@ -137,10 +138,11 @@ class SceneView:
         extrinsics = {
             own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
         }
-        _place(self._world, extrinsics[camera])
-        for name, outline in self._outlines.items():
-            _place(outline, np.linalg.inv(extrinsics[name]))
-            outline.visible = name != camera
+        if not self._stays(WORLD, camera.encode() + b"".join(T.tobytes() for T in extrinsics.values())):
+            _place(self._world, extrinsics[camera])
+            for name, outline in self._outlines.items():
+                _place(outline, np.linalg.inv(extrinsics[name]))
+                outline.visible = name != camera
         self._place_arms(self._links, state)
 
     def show_measured(self, state: SceneState) -> None:
@@ -150,9 +152,16 @@ class SceneView:
     def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
         bases = state.T_world_base.numpy().astype(float)
         for arm, nodes, T_world_base, joints in zip(self._scene.arms, arms, bases, state.joint_positions, strict=True):
+            if self._stays(nodes[0].name, T_world_base.tobytes() + joints.detach().numpy().tobytes()):
+                continue
             Ts_base_link = arm.robot.forward_kinematics(joints).detach().numpy().astype(float)
             for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
                 _place(node, T_world_base @ T_base_link)
+
+    def _stays(self, name: str, place: bytes) -> bool:
+        """Whether what has this name is at this very place already."""
+        before, self._places[name] = self._places.get(name), place
+        return before == place
 
     def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
         """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
