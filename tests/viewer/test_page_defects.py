@@ -71,6 +71,7 @@ def test_the_page_says_what_is_so(open_viewer: Callable[..., ViewerApp], open_ta
     eventually(lambda: app.state.run, lambda run: run.phase is Phase.IDLE and run.reason is not None, timeout=90)
     said = eventually(lambda: app.state.verdict, lambda found: found is not None)
     assert said is not None
+    app.wait_until_shown()
     expect(verdict).to_contain_text(said.verdict.capitalize())
     expect(tab.page.get_by_text("Converged")).to_have_count(0)
     # The curve compares every iterate with the same image, is named, and says so when it is out of date.
