@@ -49,6 +49,8 @@ def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(
     eventually(lambda: app.state.camera, lambda camera: camera == "right")
     # Rings have names, and do not grow with the zoom.
     expect(tab.page.locator(".carts-point text").first).not_to_be_empty()
+    # The image changes places with the other one; the page may be between the two.
+    tab.page.wait_for_function("carts.imageOnScreen(1)")
     width = "document.querySelector('.carts-point circle').getBoundingClientRect().width"
     before, shown = tab.page.evaluate(width), tab.page.evaluate("carts.imageOnScreen(1).width")
     tab.page.evaluate("carts.zoomAt(4, 0.5, 0.5)")

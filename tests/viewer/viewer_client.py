@@ -85,8 +85,10 @@ class Client:
     def _edit(self) -> None:
         number, dice, frame = next(self.unique), self.random.random(), self.frame
         if dice < 0.4:
-            # Never twice the same, so that an old value cannot pass for a new one.
-            value = 5.0 - 0.002 * (number % 5000)
+            # Never twice the same, nor what an earlier life left (their numbers lie a million apart, and all begin with
+            # this edit), so that an old value cannot pass for a new one and each is a step.
+            life, edit = divmod(number, 10**6)
+            value = 5.0 - 0.002 * ((edit + 211 * life) % 5000)
             self._ask(self.ids.joint, value, "Move PSM1 yaw", lambda state: _has_joint(state, frame, value))
         elif dice < 0.6:
             note = f"note {number}"
