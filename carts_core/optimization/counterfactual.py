@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn import functional
 
 from ..errors import SequenceError
 from ..imaging.haze import dehazed, transmission
@@ -23,7 +22,7 @@ from ..model.scene import Scene
 from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..recording import MeanBackground
 from ..threads import total
-from .inputs import pixel_weights, smoothed, stacked_images
+from .inputs import box_mean, pixel_weights, smoothed, stacked_images
 from .predictor import FramePredictor
 
 _PATCH = 3
@@ -98,8 +97,7 @@ class Background:
         """How surely each pixel differs from the background under the image's light, in [0, 1], and whether an arm
         would."""
         difference = (image - _lit_as(background, image)).abs().amax(0, keepdim=True)
-        side = 2 * round(_PATCH * scale / 2) + 1
-        difference = functional.avg_pool2d(difference, side, stride=1, padding=side // 2, count_include_pad=False)
+        difference = box_mean(difference, 2 * round(_PATCH * scale / 2) + 1)
         usual = float(difference.median())
         if usual > _FOREIGN:
             return torch.ones_like(difference), False

@@ -2,8 +2,9 @@
 
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..imaging.window import Window
@@ -70,12 +71,13 @@ def evidence(
         for given in (maps, torch.zeros_like(maps))
     )
     rendered, weight = window.of(covered), window.of(images.weight)
+    labels = images.renderer.segment(end)
     change = None
     if images.change is not None:
         change = window.of(images.change.telling), window.of(images.change.surely)
     found = [
         _of_arm(here, rendered, conditioned, alone, change)
-        for here in _places(images, end, window, weight, whole=predictor.masked)
+        for here in _places(images, labels, len(end.joint_positions), window, weight, whole=predictor.masked)
     ]
     worst = max(found, key=lambda arm: log_odds_of_failure(loss, arm, predictor.masked))
     rendered = rendered * weight
@@ -86,17 +88,19 @@ def evidence(
         loss=loss,
         predicted=_share(alone, rendered),
         changed=_share_of_told(rendered, change),
-        still_in_view=_still_in_view(images, start, end),
-        elsewhere=_elsewhere(images, end, predictor),
+        still_in_view=_still_in_view(images.renderer.segment(start), labels, len(end.joint_positions)),
+        elsewhere=_elsewhere(images, labels, len(end.joint_positions), predictor),
         masked=predictor.masked,
     )
 
 
-def _elsewhere(images: FrameImages, state: SceneState, predictor: FramePredictor) -> float:
+def _elsewhere(
+    images: FrameImages, arm_ids: Int[np.ndarray, "cameras h w"], arms: int, predictor: FramePredictor
+) -> float:
     """See `Evidence.elsewhere`."""
-    labels = torch.from_numpy(images.renderer.segment(state)).to(images.weight.device)[:, None]
-    if predictor.masked or all(bool((labels == arm).any()) for arm in range(len(state.joint_positions))):
+    if predictor.masked or all((arm_ids == arm).any() for arm in range(arms)):
         return 0.0
+    labels = torch.from_numpy(arm_ids).to(images.weight.device)[:, None]
     nothing = images.images.new_zeros(len(labels), SURFACE_CHANNELS, *labels.shape[-2:])
     seen = predictor.predict(images.images, nothing, Window(0, 0, *images.size))[:, COVERAGE].sum(1, keepdim=True)
     if images.change is not None:
@@ -106,11 +110,17 @@ def _elsewhere(images: FrameImages, state: SceneState, predictor: FramePredictor
 
 
 def _places(
-    images: FrameImages, state: SceneState, window: Window, weight: Float[Tensor, "cameras 1 h w"], *, whole: bool
+    images: FrameImages,
+    arm_ids: Int[np.ndarray, "cameras h w"],
+    count: int,
+    window: Window,
+    weight: Float[Tensor, "cameras 1 h w"],
+    *,
+    whole: bool,
 ) -> list[Float[Tensor, "cameras 1 h w"]]:
     """Weights of the pixels at and around each arm that is in view, as the only arm there; all pixels if `whole`."""
-    labels = window.of(torch.from_numpy(images.renderer.segment(state)).to(weight.device))[:, None]
-    arms = [labels == arm for arm in range(len(state.joint_positions))]
+    labels = window.of(torch.from_numpy(arm_ids).to(weight.device))[:, None]
+    arms = [labels == arm for arm in range(count)]
     shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * images.renderer.width * images.renderer.height]
     if whole or len(shown) < 2:
         silhouette = (labels >= 0).to(weight)
@@ -152,11 +162,10 @@ def _share_of_told(rendered: Tensor, change: tuple[Tensor, Tensor] | None) -> fl
     return _share(change[1], rendered * change[0])
 
 
-def _still_in_view(images: FrameImages, start: SceneState, end: SceneState) -> float:
+def _still_in_view(before: Int[np.ndarray, "cameras h w"], after: Int[np.ndarray, "cameras h w"], arms: int) -> float:
     """See `Evidence.still_in_view`."""
-    before, after = (images.renderer.segment(state) for state in (start, end))
     shares = [1.0]
-    for arm in range(len(start.joint_positions)):
+    for arm in range(arms):
         if (was := int((before == arm).sum())) >= OUT_OF_VIEW * before.size:
             shares.append(int((after == arm).sum()) / was)
     return min(shares)

@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ..errors import SettingsError
 from ..model.scene import Scene
-
-_CHANNELS = 96
-"""Channels that OpenCV filters at a time; it allows 128."""
 
 
 def stacked_images(
@@ -91,12 +89,22 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
     kernel = cv2.getGaussianKernel(2 * kernel_radius(deviation) + 1, deviation, cv2.CV_32F)
-    planes = flat.permute(1, 2, 0).clone(memory_format=torch.contiguous_format).numpy()
-    for first in range(0, planes.shape[2], _CHANNELS):
-        part = np.ascontiguousarray(planes[:, :, first : first + _CHANNELS])
-        result = cv2.sepFilter2D(part, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-        planes[:, :, first : first + _CHANNELS] = result.reshape(part.shape)
-    return torch.from_numpy(planes).permute(2, 0, 1).reshape(images.shape)
+    planes = flat.numpy()
+    result = np.empty(planes.shape, np.float32)
+    for plane, target in zip(planes, result, strict=True):
+        cv2.sepFilter2D(plane, cv2.CV_32F, kernel, kernel, dst=target, borderType=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(result).view(images.shape)
+
+
+def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]:
+    """The mean around each pixel, over what a square of an odd side [px] has in common with the image."""
+    if image.device.type != "cpu":
+        return avg_pool2d(image, side, stride=1, padding=side // 2, count_include_pad=False)
+    sums, counts = (
+        cv2.boxFilter(values, cv2.CV_32F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for values in (image[0].contiguous().numpy(), np.ones(image.shape[1:], np.float32))
+    )
+    return torch.from_numpy(sums / counts)[None]
 
 
 def kernel_radius(deviation: float) -> int:

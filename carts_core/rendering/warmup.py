@@ -5,6 +5,7 @@ Both are kept on disk, so that the first picture does not wait for them.
 
 import numpy as np
 
+from ..imaging.edges_numba import nearest_edges
 from ..model.camera import Camera
 from ..model.robot import Robot
 from ..model.scene import Arm, Scene
@@ -24,6 +25,8 @@ def main() -> None:
     around = np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))
     rendering = Renderer(scene).surface(scene.state({"arm": around}), 2 * step)
     assert rendering.jacobian, "what is not seen compiles nothing"
+    image, pixel, samples = (np.zeros(shape, np.float32) for shape in ((1, 2, 2, 6), (2, 1), 3))
+    nearest_edges(image, np.zeros(1, np.int64), pixel, pixel, samples, samples)
 
 
 if __name__ == "__main__":

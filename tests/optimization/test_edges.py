@@ -175,3 +175,17 @@ def test_edges_bring_masks_nearer_to_the_truth(domain: str) -> None:
             assert optimizer.best is not None and frame.masks is not None
             dices.append(dice(renderer.segment(optimizer.best.state)[0] >= 0, frame.masks[camera]))
     assert np.mean(found[8]) > np.mean(found[0]) + 0.001
+
+
+def test_the_compiled_kernel_finds_the_same_edges_as_torch(sequence: Sequence) -> None:
+    frame = sequence.frame(0)
+    start = sequence.scene.state({ARM: (frame.truth or {})[ARM] + OFF})
+    variables = Variables(sequence.scene, start, FreeParameters(), 0.15)
+    device = torch.device("cpu")
+    edges = EdgeFactor(sequence.scene, frame.images, variables, {}, working_width=320, dehaze=0.0, device=device)
+    outline = edges.near(torch.zeros(len(variables)), torch.ones(1, 360, 480), 0.3)._outline
+    compiled, plain = edges._nearest(outline), edges._nearest_torch(outline)
+    assert len(outline.camera) > 500 and 0.2 < float(plain[1].mean()) < 1.0
+    # Where two edges are as strong but for the last bits, either may be found.
+    same = (compiled[0] - plain[0]).abs() < 1e-3
+    assert float(same.float().mean()) > 0.99 and torch.equal(compiled[1][same], plain[1][same])

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from ...imaging.edges_numba import nearest_edges
 from ...imaging.haze import certainty, dehazed, transmission
 from ...model.scene import Scene
 from ...rendering import Outline, Renderer
@@ -82,6 +83,8 @@ class EdgeFactor:
         clear = dehazed(stacked, through)
         down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
         self._gradient = torch.cat([right, down], 1)
+        # The compiled kernel reads all colours of a pixel at once.
+        self._interleaved = self._gradient.permute(0, 2, 3, 1).contiguous()
         # An outline beside an occluder would find the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
         self._shown = (1.0 - attention(hidden, math.ceil(_REACH))) * certainty(through)
@@ -127,6 +130,14 @@ class EdgeFactor:
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Distance to the edge along the outward normal [px], and 1 where there is one, 0 elsewhere."""
+        if self._gradient.device.type != "cpu":
+            return self._nearest_torch(outline)
+        values = outline.camera, outline.position, outline.normal, self._samples, self._expected
+        near = nearest_edges(self._interleaved.numpy(), *(value.contiguous().numpy() for value in values))
+        return torch.from_numpy(near[0]), torch.from_numpy(near[1])
+
+    def _nearest_torch(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+        """The same without the compiled kernel, for any device."""
         strength = self._strength(outline) * self._expected[:, None]
         best, last = strength.argmax(0), len(self._samples) - 1
         middle = best.clamp(1, last - 1)
