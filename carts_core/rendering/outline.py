@@ -7,6 +7,7 @@ motion of the surface point that is seen there is all that is needed.
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -14,6 +15,7 @@ from torch.nn import functional
 
 from ..threads import one_thread
 from .jacobian import Tangents
+from .outline_numba import keep_outline, move_along_normal, place_outline
 from .points import VisiblePoints
 
 _BEHIND = 0.01
@@ -72,6 +74,15 @@ def outline_pixels(inverse_depth: Float[Tensor, "cameras height width"]) -> Bool
     return rim
 
 
+def outline_faces(
+    face_ids: Int[Tensor, "cameras height width"], inverse_depth: Float[Tensor, "cameras height width"]
+) -> Int[Tensor, "cameras height width"]:
+    """The faces that `outline_pixels` see, -1 elsewhere."""
+    if face_ids.device.type != "cpu":
+        return torch.where(outline_pixels(inverse_depth), face_ids, -1)
+    return torch.from_numpy(keep_outline(face_ids.numpy(), inverse_depth.numpy(), 1.0 - _BEHIND, BORDER))
+
+
 def outline_position(
     inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
 ) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
@@ -81,6 +92,20 @@ def outline_position(
         inverse_depth: 1 / depth [1/m], 0 for background.
         pixel: of the outlines, as indices into the flattened images.
     """
+    if pixel.device.type != "cpu":
+        return outline_position_torch(inverse_depth, pixel)
+    radius, kernels = _kernels(pixel.device)
+    position, normal = np.empty((2, len(pixel)), np.float32), np.empty((2, len(pixel)), np.float32)
+    side = 2 * radius + 1
+    planes = kernels.view(3, side, side).numpy()
+    place_outline(inverse_depth.numpy(), pixel.numpy(), planes, 1.0 - _BEHIND, position, normal)
+    return torch.from_numpy(position), torch.from_numpy(normal)
+
+
+def outline_position_torch(
+    inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
+) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
+    """The same without the compiled kernel, for any device."""
     height, width = inverse_depth.shape[1:]
     radius, kernels = _kernels(inverse_depth.device)
     reach = torch.arange(-radius, radius + 1, device=pixel.device)
@@ -112,6 +137,32 @@ def normal_motion(
         Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
         tangents: derivatives of both by the unknowns.
     """
+    if normal.device.type != "cpu":
+        return normal_motion_torch(points, normal, Ts_camera_link, intrinsics, tangents)
+    ends = np.cumsum([0, *(count for _, _, count in points.groups)])
+    runs = [(view, link, ends[i], ends[i + 1]) for i, (view, link, _) in enumerate(points.groups)]
+    motion = np.empty((len(tangents.intrinsics), normal.shape[1]), np.float32)
+    move_along_normal(
+        np.array(runs, np.int64).reshape(-1, 4),
+        points.point_link.contiguous().numpy(),
+        normal.contiguous().numpy(),
+        Ts_camera_link.contiguous().numpy(),
+        intrinsics.contiguous().numpy(),
+        tangents.Ts_camera_link.contiguous().numpy(),
+        tangents.intrinsics.contiguous().numpy(),
+        motion,
+    )
+    return torch.from_numpy(motion)
+
+
+def normal_motion_torch(
+    points: VisiblePoints,
+    normal: Float[Tensor, "2 K"],
+    Ts_camera_link: Float[Tensor, "cameras links 4 4"],
+    intrinsics: Float[Tensor, "cameras 4"],
+    tangents: Tangents,
+) -> Float[Tensor, "unknowns K"]:
+    """The same without the compiled kernel, for any device."""
     view, link = points.owners()
     T, K = Ts_camera_link[view, link], intrinsics[view].T
     point = points.point_link

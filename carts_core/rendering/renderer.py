@@ -13,7 +13,7 @@ from ..model.surface import SURFACE_CHANNELS
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .jacobian import Tangents, map_jacobian
 from .motion import carry_motion
-from .outline import Outline, normal_motion, outline_pixels, outline_position
+from .outline import Outline, normal_motion, outline_faces, outline_position
 from .points import visible_points
 from .shading import phong
 from .surface import SurfaceRendering, scattered, surface_values
@@ -183,7 +183,7 @@ class Renderer:
         """The outlines of one state (no batch), and how they move with the unknowns."""
         Ts, intrinsics = self._views(state)
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
-        rim = torch.where(outline_pixels(inverse_depth), face_ids, -1)
+        rim = outline_faces(face_ids, inverse_depth)
         points = visible_points(self.geometry, rim, inverse_depth, Ts, intrinsics)
         position, normal = outline_position(inverse_depth, points.pixel)
         return Outline(

@@ -22,9 +22,11 @@ def main() -> None:
     camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), T_camera_world)
     scene = Scene((Arm("arm", robot, np.eye(4)),), (camera,))
     step = 1e-3
-    around = np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))
-    rendering = Renderer(scene).surface(scene.state({"arm": around}), 2 * step)
+    around = scene.state({"arm": np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))})
+    renderer = Renderer(scene)
+    rendering = renderer.surface(around, 2 * step)
     assert rendering.jacobian, "what is not seen compiles nothing"
+    renderer.outline(around.map(lambda values: values[0]), renderer.tangents(around, 2 * step))
     image, pixel, samples = (np.zeros(shape, np.float32) for shape in ((1, 2, 2, 6), (2, 1), 3))
     nearest_edges(image, np.zeros(1, np.int64), pixel, pixel, samples, samples)
 

@@ -11,6 +11,7 @@ from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Outline, Renderer
+from carts_core.rendering import outline as outlines
 from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
@@ -109,3 +110,23 @@ def test_an_empty_view_has_no_outline(scene_and_state: tuple[Scene, SceneState])
     parameters = Variables(scene, away, FreeParameters(), 0.15)
     found = outline(Renderer(scene), parameters, torch.zeros(len(parameters)))
     assert found.position.shape == (2, 0) and found.motion.shape == (len(parameters), 0)
+
+
+def test_compiled_kernels_find_what_torch_finds(
+    scene_and_state: tuple[Scene, SceneState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, state = scene_and_state
+    parameters = Variables(scene, state, FreeParameters(extrinsics=True, intrinsics=True), 0.15)
+    zero, renderer = torch.zeros(len(parameters)), Renderer(scene)
+    compiled = outline(renderer, parameters, zero)
+    monkeypatch.setattr(
+        outlines, "keep_outline", lambda faces, near, *_: np.where(outline_pixels(torch.from_numpy(near)), faces, -1)
+    )
+    for name in ("outline_position", "normal_motion"):
+        monkeypatch.setattr(f"carts_core.rendering.renderer.{name}", getattr(outlines, f"{name}_torch"))
+    plain = outline(renderer, parameters, zero)
+    assert len(plain.camera) > 500
+    assert torch.equal(compiled.camera, plain.camera) and torch.equal(compiled.parts, plain.parts)
+    for name in ("position", "normal", "motion"):
+        found, expected = getattr(compiled, name), getattr(plain, name)
+        torch.testing.assert_close(found, expected, atol=1e-3 * float(expected.abs().max()), rtol=1e-3)
