@@ -35,6 +35,10 @@ class SequenceRun:
         """At the end, how far all frames together can be relied on; None before, and of a run that was stopped."""
         return self._optimizer.assessment
 
+    def base_frame_gain(self) -> float | None:
+        """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
+        return self._optimizer.base_frame_gain()
+
     def status(self) -> str:
         """How it goes, for people."""
         done, total = self._optimizer.progress

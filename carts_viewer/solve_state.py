@@ -1,6 +1,10 @@
 """How solving many frames together goes, and what came of it."""
 
 from dataclasses import dataclass
+from typing import Any
+
+from carts_core.project import ProjectState
+from carts_core.project.keys import WHOLE_PROJECT
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,15 @@ class SolveState:
     """How it goes, for people."""
     listed: tuple[ListedFrame, ...] = ()
     """Frames whose fit became worse, or is doubtful."""
+    base_frame_gain: float | None = None
+    """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
+    calibration: Any = None
+    """The project's calibration that this is about."""
+
+    def suspicion(self, project: ProjectState) -> float | None:
+        """`base_frame_gain`, as long as nothing runs and the project's calibration is the same."""
+        same = project.records.get(WHOLE_PROJECT) is self.calibration
+        return self.base_frame_gain if same and not self.running else None
 
     @property
     def progress(self) -> tuple[int, int]:

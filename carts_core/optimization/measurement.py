@@ -11,9 +11,10 @@ from torch import Tensor
 
 from ..model.scene import Scene
 from ..recording import Frame
-from ..settings import SequenceSettings, SurfaceSolver
+from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.presets import COMPARE, reduced
-from ..settings.stages import FINEST, Stage, first_observe
+from ..settings.stages import FINEST, Observe, Stage, first_observe
+from .base_frame_gain import base_frame_gain
 from .counterfactual import Backgrounds
 from .error_model import Gaussian, Information
 from .evaluation import Evaluation
@@ -130,6 +131,21 @@ class FrameSolver:
         """What the images say for and against a correction [n] whose loss is known."""
         offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
         return self._problem(frame, variables, None).evidence(offsets, loss)
+
+    def base_frame_gain(
+        self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters
+    ) -> float:
+        """Share of the surface residual at a correction [n] that free base frames would explain [1].
+
+        Args:
+            frame, variables: the frame, and its unknowns.
+            correction: where.
+            free: the unknowns, by kind.
+        """
+        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        problem = self._problem(frame, variables, None)
+        problem.observe(Observe(), offsets)
+        return base_frame_gain(problem, offsets, free)
 
     def _problem(self, frame: Frame, variables: Variables, prior: Prior | None) -> FrameProblem:
         return FrameProblem(

@@ -10,6 +10,7 @@ from ..checkpoint import Checkpoint
 from ..files import OutputPath
 from ..fingerprints import fingerprint
 from ..recording import Frame
+from ..settings import FreeParameters
 from .error_model import Gaussian, Information
 from .evidence import Evidence
 from .measurement import FrameSolver, Measurement
@@ -71,6 +72,12 @@ class ResumableFrameSolver(FrameSolver):
         """As `FrameSolver.evidence`."""
         key = _key("evidence", frame, correction, loss)
         return self._checkpoint.value(key, lambda: self._solver.evidence(frame, variables, correction, loss))
+
+    def base_frame_gain(
+        self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters
+    ) -> float:
+        """As `FrameSolver.base_frame_gain`; a few frames, so it is not kept."""
+        return self._solver.base_frame_gain(frame, variables, correction, free)
 
 
 def _key(method: str, frame: Frame, *arguments: Any) -> str:

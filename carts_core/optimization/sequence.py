@@ -23,7 +23,7 @@ from .measurement import FrameSolver, Ignore, Measurement
 from .predictor import SurfacePredictor, predictor_of
 from .resumable import ResumableFrameSolver
 from .sequence_estimate import FrameEstimate, Origin, Visit
-from .sequence_verdict import assessed_estimates, assessed_sequence
+from .sequence_verdict import assessed_estimates, assessed_sequence, sequence_base_frame_gain
 from .smoother import Smoother
 from .variables import Variables
 from .verdict_of_many import SequenceAssessment
@@ -181,6 +181,12 @@ class SequenceOptimizer:
         )
         self.stop_reason = "finished"
         return None
+
+    def base_frame_gain(self) -> float | None:
+        """As `FrameOptimizer.base_frame_gain`, of a few frames; None before the end, or where base frames are free."""
+        if self.assessment is None or self._free.base_frames:
+            return None
+        return sequence_base_frame_gain(self._smoother.smoothed(), self._solver, self._open, self._free)
 
     def _solve_alone(self, index: int) -> FrameEstimate | None:
         """What a frame alone measures; None if it is not usable, which is reported when its turn comes."""

@@ -1,17 +1,44 @@
 """How far the estimates of a sequence can be relied on, and what becomes of those that failed."""
 
+import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 from ..model.scene import Scene
 from ..recording import Frame
+from ..recording.background import spread
+from ..settings import FreeParameters
 from .error_model import Gaussian
 from .measurement import FrameSolver
 from .sequence_estimate import FrameEstimate, Origin, Visit
 from .variables import Variables
 from .verdict import Verdict, assess
 from .verdict_of_many import SequenceAssessment, assess_sequence
+
+_LOOKED_AT = 3
+"""Frames that tell whether base frames are off."""
+
+
+def sequence_base_frame_gain(
+    corrections: Mapping[int, Gaussian],
+    solver: FrameSolver,
+    opened: Callable[[int], tuple[Frame, Variables]],
+    free: FreeParameters,
+) -> float:
+    """What free base frames would explain of the residual that is left: the median of a few frames [1].
+
+    Args:
+        corrections: position -> the correction of the measured values that was found; at least one.
+        solver: that knows the images.
+        opened: gives the frame at a position, and its unknowns.
+        free: the unknowns, by kind.
+    """
+    indices = sorted(corrections)
+    chosen = [indices[place] for place in spread(len(indices), min(_LOOKED_AT, len(indices)))]
+    return statistics.median(
+        [solver.base_frame_gain(*opened(index), corrections[index].mean, free) for index in chosen]
+    )
 
 
 def assessed_estimates(

@@ -156,6 +156,11 @@ class PropagatingHandler:
                     self._check_calibration()
                 self._report(compared=number, text=f"Comparing with how it was, frame {number} of {run.done}")
                 yield
+            if outcomes and not run.cancelled:
+                self._report(text="Checking the calibration")
+                yield
+                gain = run.base_frame_gain()
+                self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
         finally:
             # An image that is missing in the end does not cost what was solved before it.
             if self._run is run:

@@ -6,6 +6,7 @@ from carts_core.project import ProjectState, between_kept
 from carts_core.settings import Direction
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.optimize import calibration_line
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -73,7 +74,9 @@ class KeyframesPanel:
             text = escaped(state.solve.text)
             lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
         self._show_listed(state)
-        self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
+        text = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
+        gain = None if state.solve is None else state.solve.suspicion(state.project)
+        self._text.content = text + calibration_line(gain)
 
     def _take_shown(self) -> intents.Intent:
         return intents.TakeSolved(self._index)

@@ -91,7 +91,7 @@ class OptimizePanel:
         write(self._masks, next(label for label, masks in MASKS.items() if masks == state.observed.masks))
         self._masks.visible = state.observed.what != "network"
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        lines = f"{undetermined_lines(state, self._session)}{calibration_line(state)}"
+        lines = f"{undetermined_lines(state, self._session)}{calibration_line(state.run.base_frame_gain)}"
         self._status.content = f'<p class="carts-status">{status_line(state)}</p>{lines}'
 
 
@@ -142,9 +142,12 @@ def _moved(unknown: str, state: ViewState, session: Session) -> str:
     return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{'°' if revolute else ' mm'})"
 
 
-def calibration_line(state: ViewState) -> str:
-    """That base frames may be wrong, if the residual of the run says so, and what to do, as HTML."""
-    gain = state.run.base_frame_gain
+def calibration_line(gain: float | None) -> str:
+    """That base frames may be wrong, if the residual of a run says so, and what to do, as HTML.
+
+    Args:
+        gain: what free base frames would explain of that residual [1]; None where it is not known.
+    """
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (

@@ -6,7 +6,7 @@ import pytest
 
 from carts_core.evaluation import start_positions
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer
+from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, SequenceOptimizer
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 
@@ -33,3 +33,21 @@ def test_base_frames_that_are_right_are_not_suspected(domain: str) -> None:
 @pytest.mark.usefixtures("shared_dir")
 def test_the_real_right_camera_contradicts_its_base_frame() -> None:
     assert gain(Sequence.open(REAL), 0, "regular", "right", 0.0) > 2 * BASE_FRAME_GAIN
+
+
+@pytest.mark.usefixtures("shared_dir")
+def test_a_sequence_tells_which_camera_contradicts_its_base_frame() -> None:
+    sequence, extractor = Sequence.open(REAL), FeatureExtractor.load()
+    gains = {}
+    for camera in ("left", "right"):
+        optimizer = SequenceOptimizer(
+            sequence.scene,
+            lambda index, camera=camera: sequence.frame(index, "regular", [camera]),
+            dict.fromkeys(range(3)),
+            extractor,
+            cameras=[camera],
+        )
+        assert optimizer.base_frame_gain() is None, "nothing is known before the end"
+        list(optimizer)
+        gains[camera] = optimizer.base_frame_gain()
+    assert gains["left"] < BASE_FRAME_GAIN < gains["right"]

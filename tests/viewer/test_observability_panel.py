@@ -39,5 +39,5 @@ def test_nothing_is_said_while_running_or_by_losses_that_cannot_say() -> None:
 
 def test_base_frames_are_named_only_above_the_threshold() -> None:
     for gain, said in ((None, False), (BASE_FRAME_GAIN - 0.01, False), (BASE_FRAME_GAIN + 0.01, True)):
-        line = calibration_line(SimpleNamespace(run=RunState(base_frame_gain=gain)))  # pyright: ignore
+        line = calibration_line(gain)
         assert ("13 %" in line) == said and bool(line) == said

@@ -9,9 +9,10 @@ from viewer_desk import Desk
 
 from carts_core.errors import CartsError, ProjectError
 from carts_core.evaluation.metrics import dice
-from carts_core.optimization import SurfaceSolver
+from carts_core.optimization import SequenceOptimizer, SurfaceSolver
 from carts_core.project import (
     CorrectedIntrinsics,
+    CorrectedTransform,
     IgnoreRegion,
     Key,
     Keyframe,
@@ -23,6 +24,7 @@ from carts_core.project import (
 )
 from carts_core.recording import Sequence
 from carts_viewer import intents
+from carts_viewer.panels.optimize import calibration_line
 from carts_viewer.running import OptimizerFactory
 
 FRAMES = 5
@@ -227,3 +229,28 @@ def test_dice_of_a_solved_frame_is_that_of_its_corrected_mask(desk: Desk) -> Non
     found = [figure.dice for figure in figures if figure is not None]
     assert found[1] == pytest.approx(dice(everything, masks["left"]))
     assert min(value for value in (found[0], *found[2:]) if value is not None) > 0.8 > (found[1] or 0.0)
+
+
+def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_the_calibration_changes(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said() -> str:
+        assert desk.state.solve is not None
+        return calibration_line(desk.state.solve.suspicion(desk.state.project))
+
+    desk.do(intents.Solve(whole=True))
+    desk.finish()
+    assert desk.state.solve is not None and desk.state.solve.suspicion(desk.state.project) is not None
+    assert said() == "", "the base frame is right"
+    monkeypatch.setattr(SequenceOptimizer, "base_frame_gain", lambda self: 0.4)
+    desk.do(intents.Solve(whole=True))
+    desk.advance()
+    assert said() == "", "not before the end"
+    desk.finish()
+    assert "reduce the remaining residual by 40 %" in said()
+    moved = desk.session.scene.arms[0].T_world_base.copy()
+    moved[0, 3] += 0.01
+    corrected = CorrectedTransform(tuple(map(tuple, moved.tolist())), Provenance(Source.HAND))
+    desk.session.editor.apply("Move the base", {Key.base_frame("PSM1"): corrected})
+    desk.do(intents.ShowFrame(1))
+    assert said() == "", "it was about another calibration"
