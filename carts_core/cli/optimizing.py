@@ -244,7 +244,12 @@ class Optimizing:
         else:
             self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
         assessed = {estimate.frame_id: estimate.assessment for estimate in optimizer.estimates.values()}
-        print_hints(self._console, sequence_hint(part.name, optimizer.assessment), *verdict_hints(part.name, assessed))
+        print_hints(
+            self._console,
+            sequence_hint(part.name, optimizer.assessment),
+            base_frame_hint(part.name, [optimizer.base_frame_gain()]),
+            *verdict_hints(part.name, assessed),
+        )
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
         """Position -> joint positions of the chosen frames that a person set."""
