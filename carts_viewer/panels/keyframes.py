@@ -37,6 +37,7 @@ class KeyframesPanel:
             self._all = gui.add_button("Solve all", color="gray")
             page.row(self._between, self._all, weights=(13, 10))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
+            self._suspicion = gui.add_html("", visible=False)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
             self._take = gui.add_button("Take it as solved", color="gray", visible=False)
@@ -74,9 +75,9 @@ class KeyframesPanel:
             text = escaped(state.solve.text)
             lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
         self._show_listed(state)
-        text = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
-        gain = None if state.solve is None else state.solve.suspicion(state.project)
-        self._text.content = text + calibration_line(gain)
+        self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
+        suspicion = calibration_line(None if state.solve is None else state.solve.suspicion(state.project))
+        self._suspicion.content, self._suspicion.visible = suspicion, bool(suspicion)
 
     def _take_shown(self) -> intents.Intent:
         return intents.TakeSolved(self._index)
