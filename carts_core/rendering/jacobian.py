@@ -86,11 +86,7 @@ def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int]
     """Unknowns that move common links, with all the visible links that they move."""
     moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
     moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
-    runs: list[_Run] = []
-    begin = 0
-    for view, link, count in points.groups:
-        runs.append((view, link, slice(begin, begin + count)))
-        begin += count
+    runs = points.runs()
     families: list[tuple[list[int], set[int]]] = []
     for unknown, moved in enumerate(moves.cpu().numpy()):
         mine = {index for index, (view, link, _) in enumerate(runs) if moved[view, link]}

@@ -139,8 +139,7 @@ def normal_motion(
     """
     if normal.device.type != "cpu":
         return normal_motion_torch(points, normal, Ts_camera_link, intrinsics, tangents)
-    ends = np.cumsum([0, *(count for _, _, count in points.groups)])
-    runs = [(view, link, ends[i], ends[i + 1]) for i, (view, link, _) in enumerate(points.groups)]
+    runs = [(view, link, here.start, here.stop) for view, link, here in points.runs()]
     motion = np.empty((len(tangents.intrinsics), normal.shape[1]), np.float32)
     move_along_normal(
         np.array(runs, np.int64).reshape(-1, 4),

@@ -5,6 +5,7 @@ of their links, so that a link's points move by one product.
 """
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float, Int
@@ -28,6 +29,13 @@ class VisiblePoints:
     """The surface point, in the frame of its link [m]."""
     normal_link: Float[Tensor, "3 K"]
     """Interpolated normal there, in the frame of its link."""
+
+    def runs(self) -> list[tuple[int, int, slice]]:
+        """View, link, and where the points are, of each run of points on the same link in the same view."""
+        ends = list(accumulate(count for _, _, count in self.groups))
+        return [
+            (view, link, slice(end - count, end)) for (view, link, count), end in zip(self.groups, ends, strict=True)
+        ]
 
     def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
         """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""

@@ -82,9 +82,8 @@ class EdgeFactor:
         through = transmission(stacked, dehaze)
         clear = dehazed(stacked, through)
         down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
-        self._gradient = torch.cat([right, down], 1)
         # The compiled kernel reads all colours of a pixel at once.
-        self._interleaved = self._gradient.permute(0, 2, 3, 1).contiguous()
+        self._gradient = torch.cat([right, down], 1).contiguous(memory_format=torch.channels_last)
         # An outline beside an occluder would find the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
         self._shown = (1.0 - attention(hidden, math.ceil(_REACH))) * certainty(through)
@@ -133,7 +132,9 @@ class EdgeFactor:
         if self._gradient.device.type != "cpu":
             return self._nearest_torch(outline)
         values = outline.camera, outline.position, outline.normal, self._samples, self._expected
-        near = nearest_edges(self._interleaved.numpy(), *(value.contiguous().numpy() for value in values))
+        near = nearest_edges(
+            self._gradient.permute(0, 2, 3, 1).contiguous().numpy(), *(value.contiguous().numpy() for value in values)
+        )
         return torch.from_numpy(near[0]), torch.from_numpy(near[1])
 
     def _nearest_torch(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
