@@ -1,18 +1,19 @@
 """Which frames a video file has, when each is shown, and at which of them decoding may begin. Nothing is decoded for it
 where the container says enough."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import av
 import numpy as np
 from av.container import InputContainer
 from av.error import FFmpegError
+from av.index import IndexEntry
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from jaxtyping import Float
@@ -25,6 +26,8 @@ _EXACT = ("mp4", "matroska")
 """Containers that give every frame its presentation time and find it again."""
 _COMPLETE = ("mp4",)
 """Of these, the ones that give every packet its times and say of each whether decoding may begin there."""
+_COMPARED = 16
+"""Places, and packets at each of them, at which the container's table is compared with what the file holds."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -126,8 +129,48 @@ def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[V
 @lru_cache(maxsize=_REMEMBERED)
 def _index(path: Path, modified: int, size: int) -> VideoIndex:
     del modified, size  # They are part of the key.
-    index = _by_packets(path, parsed=False) or _by_packets(path, parsed=True)
+    index = _by_table(path) or _by_packets(path, parsed=False) or _by_packets(path, parsed=True)
     return _by_decoding(path) if index is None else index
+
+
+def _by_table(path: Path) -> VideoIndex | None:
+    """The index from the container's own table, without reading the packets; None where that is not to be relied on.
+
+    The table has decoding times, which are presentation times only where frames are shown in the order in which they
+    are decoded; it lacks what a file's later fragments hold, and has what was cut off its end. So packets here and
+    there, and all from the last key frame on, are compared with it.
+    """
+    with opened(path, parsed=False) as (container, stream):
+        complete = any(name in container.format.name for name in _COMPLETE) and not stream.codec_context.has_b_frames
+        entries, time_base = tuple(stream.index_entries) if complete else (), stream.time_base
+        times = tuple(entry.timestamp for entry in entries)
+        keys = [row for row, entry in enumerate(entries) if entry.is_keyframe]
+        if not keys or time_base is None or keys[0] != 0 or any(entry.is_discard for entry in entries):
+            return None
+        if any(earlier >= later for earlier, later in pairwise(times)):
+            return None
+        some = keys[:-1][:: max(len(keys) // _COMPARED, 1)]
+        if not all(_as_in_table(container, stream, entries[row : row + _COMPARED]) for row in some):
+            return None
+        if not _as_in_table(container, stream, entries[keys[-1] :], to_end=True):
+            return None
+    return VideoIndex(len(times), times, time_base, tuple((row, times[row]) for row in keys))
+
+
+def _as_in_table(
+    container: InputContainer, stream: VideoStream, entries: Sequence[IndexEntry], *, to_end: bool = False
+) -> bool:
+    """Whether the packets from the first of these entries on are the ones that the entries tell of."""
+    try:
+        container.seek(entries[0].timestamp, stream=stream)
+        packets = (packet for packet in container.demux(stream) if packet.size)
+        found = [
+            (packet.pts, packet.dts, packet.pos, packet.size, packet.is_keyframe)
+            for packet in islice(packets, len(entries) + to_end)
+        ]
+    except FFmpegError:
+        return False
+    return found == [(entry.timestamp, entry.timestamp, entry.pos, entry.size, entry.is_keyframe) for entry in entries]
 
 
 def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:

@@ -141,6 +141,53 @@ def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(co
     assert unparsed is not None and unparsed == parsed and unparsed.count == FRAMES
 
 
+@pytest.mark.parametrize(
+    ("codec", "options", "times"),
+    [
+        ("libx264", {"bf": "0", "g": "12"}, TIMES),
+        ("libx264", {"bf": "0", "g": "500"}, TIMES),
+        ("libx264", {"bf": "0", "g": "1"}, 40 * np.arange(FRAMES)),
+        ("mpeg4", {"bf": "0", "g": "30"}, TIMES),
+    ],
+)
+def test_an_mp4_without_reordered_frames_has_the_index_of_its_table(codec, options, times, tmp_path):
+    path = write_numbered(tmp_path / "left.mp4", codec, options, times)
+    by_table = video_index._by_table(path)
+    assert by_table is not None and by_table == video_index._by_packets(path, parsed=True)
+    assert by_table == index_video(path) and by_table.count == FRAMES
+
+
+def test_a_table_that_does_not_say_all_is_not_relied_on(timed_video):
+    assert video_index._by_table(timed_video) is None
+
+
+@pytest.mark.parametrize("flags", ["frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+empty_moov+dash"])
+def test_frames_of_all_fragments_are_counted(flags, tmp_path):
+    path = remuxed(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "0", "g": "12"}), {"movflags": flags})
+    assert index_video(path) == video_index._by_packets(path, parsed=True) and index_video(path).count == FRAMES
+
+
+def test_frames_whose_pictures_were_cut_off_are_not_counted(tmp_path):
+    path = write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "0", "g": "12"})
+    path = remuxed(path, {"movflags": "faststart"})
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size * 2 // 3)
+    index = index_video(path)
+    assert FRAMES // 3 < index.count < FRAMES and index == video_index._by_packets(path, parsed=True)
+
+
+def remuxed(path: Path, options: dict[str, str]) -> Path:
+    """The same packets, written with other options of the container."""
+    copy = path.with_stem(path.stem + "-again")
+    with av.open(str(path)) as source, av.open(str(copy), "w", options=options) as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                target.mux(packet)
+    return copy
+
+
 def test_frames_of_vp8_that_are_only_referred_to_are_not_counted(tmp_path):
     path = write_numbered(tmp_path / "left.webm", "libvpx", {"g": "10", "auto-alt-ref": "0"})
     with av.open(str(path)) as container:
