@@ -7,12 +7,15 @@ import viser
 from carts_viewer import intents
 from carts_viewer.jobs import Job, JobState
 from carts_viewer.networks import STARTED
+from carts_viewer.panels.calibration_hint import newest_calibration
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.keyframes import whole_label
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"
-_FRAMES = {"Unreviewed": "unreviewed", "Found (Review, Find)": "found", "Range in the timeline": "range", "All": "all"}
+_UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
+_FRAMES = {_UNREVIEWED: "unreviewed", "Found (Review, Find)": "found", _RANGE: "range", "All": "all"}
 
 
 class JobsPanel:
@@ -21,12 +24,17 @@ class JobsPanel:
     def __init__(self, page: TabPage, emit: Emit) -> None:
         gui = page.gui
         self._numbers: dict[str, int] = {}
-        self._shown: tuple[Job, ...] | None = None
+        self._range: tuple[int, int] | None = None
         with gui.add_folder("New job"):
             self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
             optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
             self._count = gui.add_number(
-                "Calibrate on", 20, min=1, max=500, step=1, hint="Spread evenly over the sequence"
+                "Calibrate on [frames]",
+                intents.Calibrate().frames,
+                min=1,
+                max=500,
+                step=1,
+                hint="Spread evenly over the whole sequence, whatever the range",
             )
             calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
             self._minutes = gui.add_number(
@@ -40,14 +48,16 @@ class JobsPanel:
             )
             gui.add_html(
                 '<p class="carts-caption"><b>Optimize each alone</b> is Run on every frame by itself; to fit '
-                "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits base frames, or what is "
-                "ticked under Free parameters. All masks move with it: solve again afterwards; accepted frames have to "
-                "be accepted again. Solving and exports queue up here, too.</p>"
+                "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the "
+                "arms' bases (base frames), or what is ticked under Free parameters, to frames of the whole sequence. "
+                "All masks move with it: solve again afterwards; accepted frames have to be accepted again. Solving "
+                "and exports queue up here, too.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="For everybody; remembered")
         self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)
         with gui.add_folder("Jobs"):
             self._list = gui.add_html("")
+            self._solve = gui.add_button("Solve all", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal", visible=False)
             self._chosen = gui.add_dropdown("Job", [_NONE])
             self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
             self._again = gui.add_button("Start again", icon=viser.Icon.REFRESH, color="gray")
@@ -59,6 +69,7 @@ class JobsPanel:
         on_click(adapt, lambda _: intents.Adapt(int(self._minutes.value)), emit)
         on_input(self._network, intents.UseNetwork, emit)
         on_click(self._newest, lambda _: intents.UseNetwork(self._network.options[-1]), emit)
+        on_click(self._solve, lambda _: intents.Solve(whole=True), emit)
         on_click(self._cancel, lambda _: intents.CancelJob(self._number()), emit)
         on_click(self._again, lambda _: intents.RepeatJob(self._number()), emit)
         on_click(self._forget, lambda _: intents.ForgetJobs(), emit)
@@ -67,6 +78,10 @@ class JobsPanel:
     def show(self, state: ViewState) -> None:
         """Bring the list up to date; the newest job is chosen when it comes."""
         self._show_networks(state)
+        self._follow_range(state)
+        calibration = newest_calibration(state.jobs)
+        self._solve.label = whole_label(state)
+        self._solve.visible = calibration is not None and calibration.state is JobState.DONE
         jobs = tuple(reversed(state.jobs))
         numbers = {f"{job.number}. {job.kind.capitalize()}": job.number for job in jobs}
         if numbers != self._numbers:
@@ -86,6 +101,16 @@ class JobsPanel:
         lines = "<br>".join(escaped(line) for line in (job.log[-12:] if job else ()))
         self._log.content = f'<p class="carts-caption carts-log" role="log">{lines}</p>'
 
+    def _follow_range(self, state: ViewState) -> None:
+        """A range that is chosen is chosen here, too, and one that is dropped is not."""
+        if (state.range is None) == (self._range is None):
+            return
+        if state.range is not None and self._frames.value == _UNREVIEWED:
+            self._frames.value = _RANGE
+        elif state.range is None and self._frames.value == _RANGE:
+            self._frames.value = _UNREVIEWED
+        self._range = state.range
+
     def _show_networks(self, state: ViewState) -> None:
         names = state.networks or (STARTED,)
         if tuple(self._network.options) != names:
@@ -101,7 +126,10 @@ class JobsPanel:
 def job_line(job: Job, now: float) -> str:
     """One job with its progress and the time that is left, as HTML."""
     left = job.seconds_left(now)
-    eta = "" if left is None else f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
+    about = "at most" if job.kind == "calibrate" else "about"  # It stops when nothing is gained any more.
+    eta = (
+        "" if left is None else f", {about} {left:.0f} s left" if left < 100 else f", {about} {left / 60:.0f} min left"
+    )
     running = job.state is JobState.RUNNING
     # What a solve says itself has frames and time.
     steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""

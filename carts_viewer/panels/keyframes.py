@@ -5,8 +5,8 @@ import viser
 from carts_core.project import ProjectState, between_kept
 from carts_core.settings import Direction
 from carts_viewer import intents
+from carts_viewer.panels.calibration_hint import CalibrationHint
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
-from carts_viewer.panels.optimize import calibration_line
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -37,7 +37,7 @@ class KeyframesPanel:
             self._all = gui.add_button("Solve all", color="gray")
             page.row(self._between, self._all, weights=(13, 10))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
-            self._suspicion = gui.add_html("", visible=False)
+            self._calibration = CalibrationHint(page, emit)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
             self._take = gui.add_button("Take it as solved", color="gray", visible=False)
@@ -58,7 +58,7 @@ class KeyframesPanel:
         """Bring the widgets up to date."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
-        self._all.label = _whole(state)
+        self._all.label = whole_label(state)
         self._direction.disabled = state.solving
         self._progress.visible = self._stop.visible = state.solving
         self._plan_ahead(state)
@@ -76,8 +76,7 @@ class KeyframesPanel:
             lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
         self._show_listed(state)
         self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
-        suspicion = calibration_line(None if state.solve is None else state.solve.suspicion(state.project))
-        self._suspicion.content, self._suspicion.visible = suspicion, bool(suspicion)
+        self._calibration.show(None if state.solve is None else state.solve.suspicion(state.project), state)
 
     def _take_shown(self) -> intents.Intent:
         return intents.TakeSolved(self._index)
@@ -124,10 +123,13 @@ class KeyframesPanel:
     def _all_here(self, state: ViewState) -> str:
         count = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
         self._open = count > 0
-        return f"<b>{_whole(state)}</b>: " + (f"{_frames(count)} would be fitted" if count else "every frame is kept")
+        return f"<b>{whole_label(state)}</b>: " + (
+            f"{_frames(count)} would be fitted" if count else "every frame is kept"
+        )
 
 
-def _whole(state: ViewState) -> str:
+def whole_label(state: ViewState) -> str:
+    """What solving all frames, or those of the range, is called."""
     return "Solve all" if state.range is None else "Solve range"
 
 

@@ -4,10 +4,10 @@ import math
 
 import viser
 
-from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.project import ReviewState
 from carts_core.settings import SolverName
 from carts_viewer import intents
+from carts_viewer.panels.calibration_hint import CalibrationHint
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
@@ -52,6 +52,7 @@ class OptimizePanel:
         self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
         page.row(self._step, self._reset)
         self._status = gui.add_html("")
+        self._calibration = CalibrationHint(page, emit)
         self._unfamiliar = gui.add_html("", visible=False)
         self._adapt = gui.add_button("Adapt the network to this recording", icon=viser.Icon.SCHOOL, visible=False)
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
@@ -91,8 +92,9 @@ class OptimizePanel:
         write(self._masks, next(label for label, masks in MASKS.items() if masks == state.observed.masks))
         self._masks.visible = state.observed.what != "network"
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        lines = f"{undetermined_lines(state, self._session)}{calibration_line(state.run.base_frame_gain)}"
+        lines = undetermined_lines(state, self._session)
         self._status.content = f'<p class="carts-status">{status_line(state)}</p>{lines}'
+        self._calibration.show(state.run.base_frame_gain, state)
 
 
 def status_line(state: ViewState) -> str:
@@ -140,22 +142,6 @@ def _moved(unknown: str, state: ViewState, session: Session) -> str:
     revolute = found[places[0]].revolute
     by = math.degrees(now - before) if revolute else 1e3 * (now - before)
     return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{'°' if revolute else ' mm'})"
-
-
-def calibration_line(gain: float | None) -> str:
-    """That base frames may be wrong, if the residual of a run says so, and what to do, as HTML.
-
-    Args:
-        gain: what free base frames would explain of that residual [1]; None where it is not known.
-    """
-    if gain is None or gain < BASE_FRAME_GAIN:
-        return ""
-    return (
-        '<p class="carts-caption">The calibration (base frames or the camera\'s pose) may be off: free base frames '
-        f"would reduce the remaining residual by {100 * gain:.0f} %. A good mask can be accepted as it is. Masks and "
-        "joint values become better if you calibrate (<b>Jobs</b>, <b>Calibrate</b>) and run or solve again, best "
-        "before you accept frames: a calibration moves all masks, so it takes their acceptance back.</p>"
-    )
 
 
 def _spoken(unknown: str) -> str:

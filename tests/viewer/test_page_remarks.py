@@ -8,6 +8,7 @@ from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
 
+from carts_core.optimization import SequenceOptimizer
 from carts_core.project import ReviewState
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
@@ -151,3 +152,72 @@ def test_nothing_in_the_window_covers_or_cuts_off_what_stands_beside_it(
     tab.page.keyboard.type("range at this")
     found = tab.page.locator("[class*=Spotlight-action]").filter(has_text="Begin the range at this frame")
     expect(found.first).to_contain_text("(")
+
+
+def test_a_range_begins_at_the_very_edge_of_the_strip_and_panels_are_still_resized(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(frames=12, width=160, height=120)
+    tab = open_tab(app)
+    mouse, strip = tab.page.mouse, tab.page.locator(".carts-strip canvas")
+    box = strip.bounding_box()
+    assert box is not None
+    y, right = box["y"] + box["height"] / 2, box["x"] + box["width"] - 1
+    tab.page.keyboard.down("Shift")
+    mouse.move(box["x"] + 1, y)
+    mouse.down()
+    mouse.move(right - 20, y, steps=4)
+    mouse.move(right, y)
+    mouse.up()
+    tab.page.keyboard.up("Shift")
+    expect(tab.page.locator(".carts-range")).to_have_text("001 – 012")
+    assert strip.bounding_box() == box
+    for edge, side in ((box["x"] - 2, 1), (box["x"] + box["width"] + 2, -1)):
+        before = strip.bounding_box()
+        mouse.move(edge, 400)
+        mouse.down()
+        mouse.move(edge + 60 * side, 400, steps=4)
+        mouse.up()
+        eventually(lambda before=before: strip.bounding_box()["width"] < before["width"] - 30, bool)  # type: ignore[index]
+
+
+def test_a_suspected_calibration_is_mended_where_it_is_said_and_frames_are_solved_again_where_it_ends(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = open_viewer(width=160, height=120)
+    tab = open_tab(app)
+    monkeypatch.setattr(SequenceOptimizer, "base_frame_gain", lambda self: 0.4)
+    tab.page.get_by_role("tab", name="Review", exact=True).click()
+    expect(tab.page.get_by_text("The calibration may be off")).to_have_count(0)
+    tab.button("Solve all")
+    expect(tab.page.get_by_text("The calibration may be off")).to_be_visible(timeout=120_000)
+    tab.button("Calibrate on 20 frames")
+    expect(tab.page.get_by_text("The calibration may be off")).to_have_count(0, timeout=120_000)
+    said = tab.page.get_by_role("status").get_by_text("run or solve again what was fitted before")
+    expect(said.locator("visible=true")).to_have_count(1)
+    tab.page.get_by_role("tab", name="Jobs", exact=True).click()
+    solved = len(app.state.jobs)
+    tab.button("Solve all")
+    jobs = eventually(lambda: app.state.jobs, lambda jobs: len(jobs) > solved and jobs[-1].over, timeout=120)
+    assert jobs[-1].kind == "solve"
+    expect(tab.page.get_by_role("button", name="Solve all", exact=True)).to_have_count(0)
+
+
+def test_jobs_take_the_range_that_is_chosen_until_it_is_dropped_or_something_else_is_chosen(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(frames=12, width=160, height=120)
+    tab = open_tab(app)
+    tab.page.get_by_role("tab", name="Jobs", exact=True).click()
+    frames = tab.page.get_by_role("textbox", name="Which frames").or_(
+        tab.page.locator(f"[id='{app.page.element_id(tab.find('Which frames'))}']")
+    )
+    expect(frames.first).to_have_value("Unreviewed")
+    tab.place_in_viewer.put(intents.SetRange((4, 7)))
+    expect(frames.first).to_have_value("Range in the timeline")
+    tab.place_in_viewer.put(intents.SetRange(None))
+    expect(frames.first).to_have_value("Unreviewed")
+    tab.choose("Which frames", "All")
+    tab.place_in_viewer.put(intents.SetRange((4, 7)))
+    expect(tab.page.locator(".carts-range")).to_have_text("005 – 008")
+    expect(frames.first).to_have_value("All")

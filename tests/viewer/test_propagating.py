@@ -24,7 +24,7 @@ from carts_core.project import (
 )
 from carts_core.recording import Sequence
 from carts_viewer import intents
-from carts_viewer.panels.optimize import calibration_line
+from carts_viewer.panels.calibration_hint import calibration_line
 from carts_viewer.running import OptimizerFactory
 
 FRAMES = 5
@@ -247,7 +247,7 @@ def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_t
     desk.advance()
     assert said() == "", "not before the end"
     desk.finish()
-    assert "reduce the remaining residual by 40 %" in said()
+    assert "remaining residual would be 40 % smaller" in said()
     moved = desk.session.scene.arms[0].T_world_base.copy()
     moved[0, 3] += 0.01
     corrected = CorrectedTransform(tuple(map(tuple, moved.tolist())), Provenance(Source.HAND))
