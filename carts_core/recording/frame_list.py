@@ -15,6 +15,8 @@ from .video_index import index_video
 
 _FRAME_ALONE = "{frame}"
 """The pattern of frames whose cells are their ids."""
+_SHORT = 50
+"""No id of so many digits is too long for a name."""
 MOST_FRAMES = 1_000_000
 """Longest sequence; nine hours at 30 frames per second."""
 
@@ -60,6 +62,8 @@ class FrameNames:
             ids = tuple(cells)
         else:
             ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
+        if all(map(str.isdecimal, ids)) and max(map(len, ids)) <= _SHORT and len(set(ids)) == len(ids):
+            return ids  # Numbers have no fault but to be there twice, and an hour has a hundred thousand.
         lines: dict[str, int] = {}
         for frame_id, line in zip(ids, table.lines, strict=True):
             if not frame_id:

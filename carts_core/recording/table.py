@@ -85,14 +85,14 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
     try:
         with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8-sig", newline="") as handle:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
-            filled = _filled_rows(reader, path, what)
+            rows, lines = _filled_rows(reader, path, what)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
     except (OSError, ValueError, csv.Error) as error:
         raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
-    if len(filled) < 2:
+    if len(rows) < 2:
         raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
-    header = tuple(name.strip() for name in filled[0][1])
+    header = tuple(name.strip() for name in rows[0])
     if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
         raise SequenceError(
             f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
@@ -101,25 +101,27 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
     repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:
         raise SequenceError(f"{path} has several columns called {listed(map(repr, repeated))}. Rename all but one.")
-    for line, row in filled[1:]:
-        if len(row) != len(header):
-            raise SequenceError(
-                f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
-            )
-    return Table(path, header, tuple(row for _, row in filled[1:]), tuple(line for line, _ in filled[1:]))
+    if set(map(len, rows)) != {len(header)}:
+        line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != len(header))
+        raise SequenceError(
+            f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
+        )
+    return Table(path, header, tuple(rows[1:]), tuple(lines[1:]))
 
 
-def _filled_rows(reader: Any, path: Path, what: str) -> list[tuple[int, tuple[str, ...]]]:
-    """Number of the last line, and cells, of every row that is not empty."""
-    filled: list[tuple[int, tuple[str, ...]]] = []
+def _filled_rows(reader: Any, path: Path, what: str) -> tuple[list[tuple[str, ...]], list[int]]:
+    """Cells, and number of the last line, of every row that is not empty."""
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
     cells = 0
     for row in reader:
         if any(row):
-            filled.append((reader.line_num, tuple(row)))
+            rows.append(tuple(row))  # Which Python's collector looks at once, and at a list again and again.
+            lines.append(reader.line_num)
             cells += len(row)
             if cells > MOST_CELLS:
                 raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
-    return filled
+    return rows, lines
 
 
 def _number(cell: str) -> float:
