@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from carts_core.errors import CartsError
+from carts_core.evaluation.calibration import moved_frames
 from carts_core.model.scene import Scene
 from carts_core.optimization.calibration import CalibrationOptimizer
 from carts_core.project import (
@@ -101,7 +102,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         yield Progress(iterate.index, most, text, text)
     result = optimizer.result()
     for change in result.unknowns:
-        line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f} {change.unit}"
+        unit = "°" if change.unit == "deg" else f" {change.unit}"
+        line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f}{unit}"
         yield Progress(most, most, "Comparing", line)
     found = result.assessment
     verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}"
@@ -118,7 +120,14 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     context.refresh()
     again = " All masks have moved: run or solve again what was fitted before." if solved else ""
     again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
-    yield Progress(most, most, f"Calibrated on {len(indices)} frames, one step of undo. {verdict}{again}")
+    done = f"Calibrated on {len(indices)} frames, one step of undo.{_moved(scene, result.scene)}"
+    yield Progress(most, most, f"{done} {verdict}{again}")
+
+
+def _moved(before: Scene, after: Scene) -> str:
+    """Which poses a calibration has moved, and by how much, for people; empty if none."""
+    found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
+    return f" Moved: {', '.join(found)}." if found else ""
 
 
 def _count(project: ProjectState, states: Container[ReviewState]) -> int:

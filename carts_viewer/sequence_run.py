@@ -46,6 +46,8 @@ class SequenceRun:
             return "Solving a few frames alone, for a first estimate of the error of all"
         if done == total:
             return f"All {total} frames estimated, revising those that disagree and judging the fit"
+        if done < 2 < total:
+            return f"Frame {done} of {total}"  # The first takes longer than others.
         seconds = self._optimizer.seconds_left
         left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         return f"Frame {done} of {total}, about {left} left"

@@ -16,7 +16,7 @@ HINTS = {
     "Camera": "The camera that is painted on and exported alone; a click on its image chooses it, too",
     # Overlay
     "Layer": "What is drawn over the image (the number keys)",
-    "Opacity %": "Of the overlay: 0 is invisible, 100 hides the image [%]",
+    "Opacity %": "Of the overlay: 0 is invisible, 100 hides what is below it [%]",
     "Swipe %": "Up to where the other pose is shown, from the left [% of the image's width]",
     # Paint
     "Off": "No tool: drag moves the picture again (Esc)",
