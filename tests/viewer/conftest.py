@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 from viewer_canvas import Canvas, mark_frames
 from viewer_desk import Desk
 from viewer_tab import Tab
@@ -27,6 +27,11 @@ FLAGS = (
     "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync"
 ).split()
+
+# Without a graphics card, and with others at work, a page may need long for what a person sees at once.
+_LONGEST, _LONGEST_EXPECTED = 90_000, 20_000
+"""Waits for the page, and for what a test expects of it [ms]."""
+expect.set_options(timeout=_LONGEST_EXPECTED)
 
 
 @pytest.fixture(scope="session")
@@ -88,6 +93,7 @@ def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
         ) -> Tab:
             context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
             stack.callback(context.close)
+            context.set_default_timeout(_LONGEST)
             if not new:
                 context.add_init_script("localStorage.setItem('carts-tour', 'seen')")
             page = context.new_page()
