@@ -9,6 +9,11 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
+def spoken_time(seconds: float) -> str:
+    """A time as people read it: "40 s", "3 min"."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 def listed(names: Iterable[str], most: int = 40) -> str:
     """Names for an error: joined by commas, the first ones where there are many."""
     names = iter(names)

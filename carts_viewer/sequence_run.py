@@ -2,6 +2,7 @@
 
 from carts_core.optimization import FrameEstimate, SequenceAssessment, SequenceOptimizer
 from carts_core.project import Provenance
+from carts_core.wording import spoken_time
 
 
 class SequenceRun:
@@ -48,6 +49,4 @@ class SequenceRun:
             return f"All {total} frames estimated, revising those that disagree and judging the fit"
         if done < 2 < total:
             return f"Frame {done} of {total}"  # The first takes longer than others.
-        seconds = self._optimizer.seconds_left
-        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-        return f"Frame {done} of {total}, about {left} left"
+        return f"Frame {done} of {total}, about {spoken_time(self._optimizer.seconds_left)} left"

@@ -27,7 +27,7 @@ _EXACT = ("mp4", "matroska")
 _COMPLETE = ("mp4",)
 """Of these, the ones that give every packet its times and say of each whether decoding may begin there."""
 _COMPARED = 16
-"""Places, and packets at each of them, at which the container's table is compared with what the file holds."""
+"""Places at most, and packets at each of them, at which the container's table is compared with what the file holds."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -149,7 +149,7 @@ def _by_table(path: Path) -> VideoIndex | None:
             return None
         if any(earlier >= later for earlier, later in pairwise(times)):
             return None
-        some = keys[:-1][:: max(len(keys) // _COMPARED, 1)]
+        some = keys[:-1][:: -(-len(keys) // _COMPARED)]
         if not all(_as_in_table(container, stream, entries[row : row + _COMPARED]) for row in some):
             return None
         if not _as_in_table(container, stream, entries[keys[-1] :], to_end=True):

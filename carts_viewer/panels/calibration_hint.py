@@ -4,6 +4,7 @@ from carts_core.optimization import BASE_FRAME_GAIN
 from carts_viewer import intents
 from carts_viewer.jobs import Job, JobState
 from carts_viewer.panels.inputs import Emit, escaped, on_click
+from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
@@ -11,16 +12,17 @@ from carts_viewer.transport.tab_page import TabPage
 class CalibrationHint:
     """Stands below what found the suspicion, and is not there without one."""
 
-    def __init__(self, page: TabPage, emit: Emit) -> None:
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        frames = min(intents.Calibrate().frames, len(session.sequence))
         self._text = page.gui.add_html("", visible=False)
         self._calibrate = page.gui.add_button(
-            f"Calibrate on {intents.Calibrate().frames} frames",
+            f"Calibrate on {frames} frames",
             color="gray",
             visible=False,
             hint="A job: the page stays usable. One step of undo. Jobs, Calibrate takes another number of frames.",
         )
         self._watched: int | None = None
-        on_click(self._calibrate, lambda _: intents.Calibrate(), emit)
+        on_click(self._calibrate, lambda _: intents.Calibrate(frames), emit)
 
     def show(self, gain: float | None, state: ViewState) -> None:
         """Bring it up to date.
@@ -30,8 +32,10 @@ class CalibrationHint:
             state: with the jobs.
         """
         job = newest_calibration(state.jobs)
-        going = job is not None and not job.over
-        line = "" if going else calibration_line(gain)
+        if job is not None and not job.over:
+            self._watched, line = job.number, ""
+        else:
+            line = calibration_line(gain)
         self._calibrate.visible = bool(line)
         self._text.content = f"{line}{self._progress_line(job)}"
         self._text.visible = bool(self._text.content)
@@ -43,7 +47,6 @@ class CalibrationHint:
         text, title = escaped(job.text), f"<b>{escaped(job.title)}</b>"
         match job.state:
             case JobState.WAITING | JobState.RUNNING:
-                self._watched = job.number
                 line = f"{title}: {text or job.state}"
             case JobState.DONE if job.number == self._watched:
                 line = text
@@ -55,8 +58,9 @@ class CalibrationHint:
 
 
 def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
-    """The calibration that no other job has followed."""
-    return jobs[-1] if jobs and jobs[-1].kind == "calibrate" else None
+    """The calibration that waits or runs, or that has ended and no other job has followed."""
+    found = (job for job in reversed(jobs) if job.kind == "calibrate" and (not job.over or job is jobs[-1]))
+    return next(found, None)
 
 
 def calibration_line(gain: float | None) -> str:

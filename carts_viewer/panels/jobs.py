@@ -4,6 +4,7 @@ import time
 
 import viser
 
+from carts_core.wording import spoken_time
 from carts_viewer import intents
 from carts_viewer.jobs import Job, JobState
 from carts_viewer.networks import STARTED
@@ -24,7 +25,7 @@ class JobsPanel:
     def __init__(self, page: TabPage, emit: Emit) -> None:
         gui = page.gui
         self._numbers: dict[str, int] = {}
-        self._range: tuple[int, int] | None = None
+        self._ranged = False
         with gui.add_folder("New job"):
             self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
             optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
@@ -103,13 +104,11 @@ class JobsPanel:
 
     def _follow_range(self, state: ViewState) -> None:
         """A range that is chosen is chosen here, too, and one that is dropped is not."""
-        if (state.range is None) == (self._range is None):
-            return
-        if state.range is not None and self._frames.value == _UNREVIEWED:
-            self._frames.value = _RANGE
-        elif state.range is None and self._frames.value == _RANGE:
-            self._frames.value = _UNREVIEWED
-        self._range = state.range
+        ranged = state.range is not None
+        before, now = (_UNREVIEWED, _RANGE) if ranged else (_RANGE, _UNREVIEWED)
+        if ranged != self._ranged and self._frames.value == before:
+            self._frames.value = now
+        self._ranged = ranged
 
     def _show_networks(self, state: ViewState) -> None:
         names = state.networks or (STARTED,)
@@ -127,9 +126,7 @@ def job_line(job: Job, now: float) -> str:
     """One job with its progress and the time that is left, as HTML."""
     left = job.seconds_left(now)
     about = "at most" if job.kind == "calibrate" else "about"  # It stops when nothing is gained any more.
-    eta = (
-        "" if left is None else f", {about} {left:.0f} s left" if left < 100 else f", {about} {left / 60:.0f} min left"
-    )
+    eta = "" if left is None else f", {about} {spoken_time(left)} left"
     running = job.state is JobState.RUNNING
     # What a solve says itself has frames and time.
     steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""

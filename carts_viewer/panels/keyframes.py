@@ -37,7 +37,7 @@ class KeyframesPanel:
             self._all = gui.add_button("Solve all", color="gray")
             page.row(self._between, self._all, weights=(13, 10))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
-            self._calibration = CalibrationHint(page, emit)
+            self._calibration = CalibrationHint(page, session, emit)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
             self._take = gui.add_button("Take it as solved", color="gray", visible=False)

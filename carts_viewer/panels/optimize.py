@@ -52,7 +52,7 @@ class OptimizePanel:
         self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
         page.row(self._step, self._reset)
         self._status = gui.add_html("")
-        self._calibration = CalibrationHint(page, emit)
+        self._calibration = CalibrationHint(page, session, emit)
         self._unfamiliar = gui.add_html("", visible=False)
         self._adapt = gui.add_button("Adapt the network to this recording", icon=viser.Icon.SCHOOL, visible=False)
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
