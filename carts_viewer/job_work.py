@@ -106,7 +106,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f}{unit}"
         yield Progress(most, most, "Comparing", line)
     found = result.assessment
-    verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}"
+    verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}".strip()
     provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free, target)
     edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
     if not edits:

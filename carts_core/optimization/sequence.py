@@ -139,8 +139,11 @@ class SequenceOptimizer:
         """Position -> estimate of every frame visited so far, given all of them; ordered as visited."""
         if self._estimates is None:
             corrections = self._smoother.smoothed()
+            certain = self._smoother.cautious(self.model.shared_seconds).smoothed()
             self._estimates = {
-                index: self._estimate(index, self._visits[index], correction)
+                index: self._estimate(
+                    index, self._visits[index], replace(correction, covariance=certain[index].covariance)
+                )
                 for index, correction in corrections.items()
             }
         return dict(self._estimates)
@@ -172,7 +175,8 @@ class SequenceOptimizer:
         if self._revisits:
             return self._visit_again(*self._revisits.pop())
         if self._judging is None:
-            self._judging = assessed_estimates(self.estimates, self._smoother.smoothed(), self._solver, self._open)
+            found = self.estimates, self._smoother.smoothed()
+            self._judging = assessed_estimates(*found, self._scene, self._solver, self._open)
         if (judged := next(self._judging, None)) is not None:
             self._estimates = self.estimates | {judged.index: judged}
             return judged

@@ -1,6 +1,6 @@
 """The estimate of a frame of a sequence, and what is kept of a frame that was visited."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -53,6 +53,17 @@ class FrameEstimate:
     assessment: Assessment | None = None
     """How far it can be relied on; None before all frames were visited."""
 
+    def judged(self, assessment: Assessment, scene: Scene) -> "FrameEstimate":
+        """The same with a verdict, and deviations that allow for a wrong fit.
+
+        Those that a person gave stay, and those that come from other frames, because this image shows nothing of an arm
+        or was left out.
+        """
+        if assessment.nothing_there or self.start in (Origin.KEYFRAME, Origin.CARRIED):
+            return replace(self, assessment=assessment)
+        known = assessment.of(self.uncertainty)
+        return replace(self, assessment=assessment, uncertainty=known, joint_std=_joint_std(known, scene))
+
 
 @dataclass(frozen=True)
 class Visit:
@@ -85,10 +96,14 @@ class Visit:
             frame_id=self.frame_id,
             state=state,
             joint_positions={arm.name: values for arm, values in zip(scene.arms, joints, strict=True)},
-            joint_std={arm.name: uncertainty.joint_std(arm.name, arm.robot.joint_names) for arm in scene.arms},
+            joint_std=_joint_std(uncertainty, scene),
             uncertainty=uncertainty,
             loss=self.measurement.loss,
             start=self.start,
             iterations=self.measurement.iterations,
             seconds=self.seconds,
         )
+
+
+def _joint_std(known: Uncertainty, scene: Scene) -> dict[str, Float[np.ndarray, " dofs"]]:
+    return {arm.name: known.joint_std(arm.name, arm.robot.joint_names) for arm in scene.arms}

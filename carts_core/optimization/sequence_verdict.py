@@ -44,6 +44,7 @@ def sequence_base_frame_gain(
 def assessed_estimates(
     estimates: Mapping[int, FrameEstimate],
     corrections: Mapping[int, Gaussian],
+    scene: Scene,
     solver: FrameSolver,
     opened: Callable[[int], tuple[Frame, Variables]],
 ) -> Iterator[FrameEstimate]:
@@ -52,6 +53,7 @@ def assessed_estimates(
     Args:
         estimates: position -> final estimate.
         corrections: position -> the correction of the measured values that it is.
+        scene: of the sequence.
         solver: that knows the images.
         opened: gives the frame at a position, and its unknowns.
     """
@@ -59,7 +61,8 @@ def assessed_estimates(
         began = time.perf_counter()
         frame, variables = opened(index)
         found = assess(solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
-        yield replace(estimate, assessment=found, seconds=estimate.seconds + time.perf_counter() - began)
+        seconds = estimate.seconds + time.perf_counter() - began
+        yield replace(estimate.judged(found, scene), seconds=seconds)
 
 
 def assessed_sequence(

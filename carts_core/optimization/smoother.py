@@ -60,6 +60,12 @@ class Smoother:
         own = {index: self._measured[index].scaled(1.0 - self._shares[index]) for index in self._order}
         return {index: combined(state, own[index]) for index, state in zip(self._order, states, strict=True)}
 
+    def cautious(self, correlation_seconds: float) -> "Smoother":
+        """The same measurements, if errors of images were alike for longer [s]."""
+        other = Smoother(self._errors, self._gaps, correlation_seconds, self._exact)
+        other._order, other._measured = self._order, self._measured
+        return other
+
     def _predicted(self, place: int, index: int) -> Gaussian:
         """The state of the frame at a place in the order, before its measurement."""
         if place == 0:

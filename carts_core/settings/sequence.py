@@ -29,6 +29,9 @@ class SequenceSettings:
     correlation_seconds: float = 0.5
     """Time constant of the autocorrelation of image errors; frames that follow each other faster count less for the
     others [s]."""
+    shared_seconds: float = 5.0
+    """The same for the reported deviations: a network errs alike for as long as an instrument is seen from one side,
+    and deviations are not to count on more than that [s]."""
     initial_frames: int = 5
     """How many frames, evenly spread, are solved alone to find where the first one starts; 1 takes the first frame
     only [1]."""
@@ -58,6 +61,7 @@ _RANGES = {
     "jitter_deg": (1e-3, 360.0),
     "measurement_noise": (1e-3, 100.0),
     "correlation_seconds": (1e-6, 1e6),
+    "shared_seconds": (1e-6, 1e6),
     "initial_frames": (1, 20),
     "cold_factor": (1.0, 100.0),
     "frame_seconds": (1e-6, 1e6),
