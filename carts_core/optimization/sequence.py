@@ -161,7 +161,7 @@ class SequenceOptimizer:
         """Visit the next frame; None once all is done.
 
         The first steps solve a few frames alone, and what they return is not among `estimates`. After them the
-        estimate knows the frames visited before it; those in `estimates` know all others.
+        estimate knows the frames visited before it, with the filter's deviations; those in `estimates` know all others.
         """
         if self.stop_reason is not None:
             return None

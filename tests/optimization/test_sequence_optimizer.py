@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from perfect_predictor import PerfectPredictor
+from short_sequence import ALONE, ARM, FRAMES, Truths, optimizer
 
 from carts_core.errors import RobotError, SequenceError, SettingsError
 from carts_core.optimization import (
@@ -22,44 +22,18 @@ from carts_core.optimization import (
 from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.initialization import initial_correction
 from carts_core.optimization.measurement import FrameSolver, Measurement
-from carts_core.optimization.sequence_estimate import Origin
 from carts_core.optimization.variables import Variables
-from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import presets
 from carts_core.settings.stages import AlignEdges
 
-FRAMES = 6
-ALONE = SequenceSettings(initial_frames=1)
-ARM = "PSM1"
 WRIST_PITCH = 4
-
-
-class Truths(PerfectPredictor):
-    """Sees the truth of the frame that was read last."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self.sequence = sequence
-        truths = [sequence.scene.state(sequence.frame(index).truth or {}) for index in range(len(sequence))]
-        self.all = [PerfectPredictor(sequence, truth).maps for truth in truths]
-        self.blind: set[int] = set()
-        self.read: list[int] = []
-
-    def load(self, index: int) -> Frame:
-        self.read.append(index)
-        self.maps = torch.zeros_like(self.all[index]) if index in self.blind else self.all[index]
-        return self.sequence.frame(index)
 
 
 @pytest.fixture
 def truths(tiny_sequence: Callable[..., Path]) -> Truths:
     return Truths(Sequence.open(tiny_sequence(frames=FRAMES, width=320, height=240)))
-
-
-def optimizer(truths: Truths, **arguments) -> SequenceOptimizer:
-    times = {index: float(index) / 10 for index in range(FRAMES)}
-    return SequenceOptimizer(truths.sequence.scene, truths.load, times, truths, **arguments)
 
 
 def error(truths: Truths, index: int, joint_positions: dict[str, np.ndarray]) -> np.ndarray:
@@ -261,48 +235,6 @@ def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths,
     solver = FrameSolver(scene, truths, settings, SequenceSettings(), lambda _: {})
     found = initial_correction({0: wrong, 2: right, 4: right}, solver, open_frame, allowance=2.0)
     assert np.array_equal(found, wrong if jumped else right)
-
-
-def test_frames_in_quick_succession_inform_others_less(truths: Truths) -> None:
-    """Errors of images are alike for a while, and the longer that is, the less many frames know."""
-    stds = []
-    for memory in (0.01, 1.0):
-        sequence = optimizer(truths, model=replace(ALONE, correlation_seconds=memory, shared_seconds=memory))
-        last = [step for step in sequence if step.index == FRAMES - 1][-1]
-        end = sequence.estimates
-        stds.append(end[3].joint_std[ARM])
-        # The last frame knew all others when it was visited, and for itself it counts whole.
-        np.testing.assert_allclose(last.joint_std[ARM], end[FRAMES - 1].joint_std[ARM], rtol=1e-3)
-    assert (stds[1] > 1.2 * stds[0]).any() and (stds[1] > 0.99 * stds[0]).all()
-
-
-def test_deviations_count_on_no_more_than_images_that_differ(truths: Truths) -> None:
-    """A network that errs alike in all frames is not averaged out; what is estimated does not depend on that."""
-    ends = []
-    for shared in (0.5, 5.0):
-        sequence = optimizer(truths, model=replace(ALONE, correlation_seconds=0.5, shared_seconds=shared))
-        list(sequence)
-        ends.append(sequence.estimates)
-    for index in range(FRAMES):
-        narrow, wide = (end[index] for end in ends)
-        assert np.array_equal(narrow.joint_positions[ARM], wide.joint_positions[ARM])
-        assert (wide.joint_std[ARM] > 0.999 * narrow.joint_std[ARM]).all()
-    assert (ends[1][3].joint_std[ARM] > 1.1 * ends[0][3].joint_std[ARM]).any()
-
-
-@pytest.mark.parametrize("start", list(Origin))
-def test_a_doubtful_frame_is_less_certain_unless_its_values_come_from_elsewhere(truths: Truths, start: Origin) -> None:
-    sequence = optimizer(truths)
-    list(sequence)
-    estimate, scene = replace(sequence.estimates[2], start=start), truths.sequence.scene
-    assert estimate.assessment is not None
-    doubtful = replace(estimate.assessment, verdict=Verdict.DOUBTFUL, probability=0.4)
-    judged = estimate.judged(doubtful, scene)
-    assert judged.assessment is doubtful
-    elsewhere = start in (Origin.KEYFRAME, Origin.CARRIED)
-    known, before = judged.joint_std[ARM], estimate.joint_std[ARM]
-    assert np.array_equal(known, before) if elsewhere else (known > 1.1 * before).any()
-    np.testing.assert_array_equal(known, judged.uncertainty.joint_std(ARM, scene.arms[0].robot.joint_names))
 
 
 def test_a_keyframe_at_the_start_needs_no_other_frames(truths: Truths) -> None:
