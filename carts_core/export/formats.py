@@ -93,7 +93,16 @@ def export(
 def _summary(dataset: Dataset, name: FormatName) -> str:
     """What an exported folder says about itself."""
     views = [
-        {"name": name, "frame": frame.frame_id, "index": frame.index, "camera": camera.name, "source": frame.source}
+        {
+            "name": name,
+            "frame": frame.frame_id,
+            "index": frame.index,
+            "camera": camera.name,
+            "source": frame.source,
+            "verdict": frame.verdict,
+            "review": frame.review,
+            "dice": frame.dice,
+        }
         for name, frame, camera in dataset.steps
     ]
     content = {"format": name, "sequence": dataset.sequence.name, "domain": dataset.domain, "views": views}

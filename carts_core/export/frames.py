@@ -17,6 +17,10 @@ class ExportFrame(KinematicsRow):
 
     index: int = field(kw_only=True)
     """0-based position in the sequence."""
+    review: str | None = field(default=None, kw_only=True)
+    """What a person said of the frame, such as accepted; None where nobody could."""
+    dice: float | None = field(default=None, kw_only=True)
+    """Dice with the masks that the recording has, the least of its cameras [1]; None where not known."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> where arms are visible, at the camera's size; a camera without an entry gets the rendered mask."""
     part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)

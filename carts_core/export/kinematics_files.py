@@ -32,9 +32,10 @@ def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -
 def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """NumPy's archive without pickles.
 
-    Arrays: `frame_id` and `source` (text) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
-    `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a `joint_std` that is not known
-    is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] and `camera` (text) say where they were.
+    Arrays: `frame_id`, `source`, `verdict` (text, empty where nobody said) and `index` [frames]; `column` (`ARM.JOINT`)
+    and `unit` [columns]; `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a
+    `joint_std` that is not known is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] and `camera`
+    (text) say where they were.
     """
     frames = list(monitor.track(dataset.frames))
     moving, poses = _camera_poses(dataset, frames), {}
@@ -46,6 +47,7 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
             frame_id=np.array([frame.frame_id for frame in frames]),
             index=np.array([frame.index for frame in frames]),
             source=np.array([frame.source for frame in frames]),
+            verdict=np.array([frame.verdict or "" for frame in frames]),
             column=np.array(joint_columns(dataset.scene)),
             unit=np.array(joint_units(dataset.scene)),
             joint_positions=np.array([position_values(dataset.scene, frame) for frame in frames]),
@@ -62,6 +64,7 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
             "frame": frame.frame_id,
             "index": frame.index,
             "source": frame.source,
+            "verdict": frame.verdict,
             "joint_positions": dict(zip(columns, position_values(dataset.scene, frame).tolist(), strict=True)),
             "joint_std": {
                 column: None if math.isnan(value) else value

@@ -222,12 +222,16 @@ def export_frame(
     known = {name: value.standard_deviations for name, value in project.joints(index).items()}
     painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
     labels = {camera: project.get(Key.part_labels(index, camera)) for camera in cameras}
+    verdict, figures = project.verdict(index), project.figures(index)
     return ExportFrame(
         frame.frame_id,
         _SOURCES[pose.source],
         session.joints(pose.scene),
         {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
+        None if verdict is None else verdict.verdict,
         index=index,
+        review=project.review(index).state.value,
+        dice=None if figures is None else figures.dice,
         part_labels={name: value.labels() for name, value in labels.items() if value is not None},
         masks=CorrectedMasks(renderer, pose.scene, {name: p for name, p in painted.items() if p is not None}),
     )

@@ -51,7 +51,9 @@ def test_images_lie_beside_their_labels_and_can_be_left_out(dataset: Dataset, tm
 
 
 def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
-    summary = json.loads((export(dataset, "coco", tmp_path / "out") / "export.json").read_text(encoding="utf-8"))
+    said = replace(dataset.frames[2], verdict="doubtful", review="accepted", dice=0.93)
+    told = replace(dataset, frames=(*dataset.frames[:2], said))
+    summary = json.loads((export(told, "coco", tmp_path / "out") / "export.json").read_text(encoding="utf-8"))
     assert (summary["format"], summary["sequence"], summary["domain"]) == ("coco", "tiny", "regular")
     assert summary["views"][2] == {
         "name": dataset.steps[2][0],
@@ -59,7 +61,11 @@ def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
         "index": 2,
         "camera": CAMERA,
         "source": SOURCES[2],
+        "verdict": "doubtful",
+        "review": "accepted",
+        "dice": 0.93,
     }
+    assert [summary["views"][0][key] for key in ("verdict", "review", "dice")] == [None] * 3
 
 
 def _read_supervision(read: supervision.DetectionDataset) -> Masks:

@@ -104,6 +104,14 @@ def test_json_comes_back_with_null_for_what_is_not_known(dataset: Dataset, tmp_p
     np.testing.assert_array_equal(np.array(deviations, dtype=float), _std(dataset))
 
 
+def test_npz_and_json_have_the_verdict_of_every_frame(dataset: Dataset, tmp_path: Path) -> None:
+    judged = replace(dataset, frames=(replace(dataset.frames[0], verdict="good"), *dataset.frames[1:]))
+    with np.load(export(judged, "npz", tmp_path / "out.npz"), allow_pickle=False) as archive:
+        assert archive["verdict"].tolist() == ["good", "", ""]
+    content = json.loads(export(judged, "json", tmp_path / "out.json").read_text(encoding="utf-8"))
+    assert [frame["verdict"] for frame in content["frames"]] == ["good", None, None]
+
+
 def test_a_file_gets_the_suffix_of_its_format(dataset: Dataset, tmp_path: Path) -> None:
     assert export(dataset, "npz", tmp_path / "v1.2") == tmp_path / "v1.2.npz"
     assert export(dataset, "json", tmp_path / "OUT.JSON") == tmp_path / "OUT.JSON"

@@ -14,7 +14,16 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, ExportFormat, FormatName, read_kinematics_csv
 from carts_core.export.formats import FORMATS as REGISTERED
-from carts_core.project import JointCorrection, Key, MaskCorrection, Provenance, ReviewState, Source
+from carts_core.project import (
+    Figures,
+    FitVerdict,
+    JointCorrection,
+    Key,
+    MaskCorrection,
+    Provenance,
+    ReviewState,
+    Source,
+)
 from carts_viewer import archive, intents
 from carts_viewer.handlers import exporting
 
@@ -80,6 +89,18 @@ def test_only_frames_of_the_chosen_review_state_and_camera_are_written(desk: Des
     assert [file.name for file in (path / "binary").iterdir()] == ["right_002.png"]
     with pytest.raises(SettingsError, match="No frame is in this choice"):
         desk.do(intents.Export("masks", "Needs work"))
+
+
+def test_an_export_says_what_the_project_knows_of_each_frame(desk: Desk) -> None:
+    project = desk.session.editor.project
+    desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.REJECTED))
+    project.record_verdict(1, FitVerdict("doubtful", "it may be another one", "look at it", 0.4))
+    project.record_figures({1: Figures(dice=0.91)}, project.state)
+    views = json.loads((exported(desk, intents.Export("masks", "All")) / "export.json").read_text())["views"]
+    known = [(view["verdict"], view["review"], view["dice"]) for view in views if view["camera"] == "left"]
+    assert known[1] == ("doubtful", "rejected", 0.91) and known[2] == (None, "untouched", None)
+    header, *rows = exported(desk, intents.Export("csv", "All")).read_text().splitlines()
+    assert header.endswith(",verdict") and [row.rsplit(",", 1)[1] for row in rows] == ["", "doubtful", ""]
 
 
 def test_only_frames_of_the_timelines_range_are_written(desk: Desk) -> None:
