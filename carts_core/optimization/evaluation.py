@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .factors import Prior
-from .observability import Uncertainty, expected_scale, uncertainty
+from .observability import Uncertainty, uncertainty_after
 from .variables import Variables
 
 
@@ -37,16 +37,19 @@ class Evaluation:
     common: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
     """What the gradient is off by for one standard deviation of an error that all pixels share; None as the hessian."""
 
-    def final_uncertainty(self, offsets: Float[Tensor, " n"], variables: Variables, prior: Prior) -> Uncertainty | None:
+    def final_uncertainty(
+        self, offsets: Float[Tensor, " n"], variables: Variables, prior: Prior, start_share: float
+    ) -> Uncertainty | None:
         """Deviations where a fit has ended, for errors of the start as large as what it has corrected makes likely.
 
         Args:
             offsets: where it has ended, near this point.
             variables: the unknowns.
             prior: of their offsets.
+            start_share: share of an error of the start that is left in what the image seems to show [1].
         """
         if self.hessian is None or self.common is None or self.uncertainty is None:
             return None
-        scale = expected_scale(offsets - prior.mean, self.hessian - prior.precision, prior.precision)
-        later = uncertainty(variables, prior, self.hessian, self.common, scale)
+        moved = offsets - prior.mean
+        later = uncertainty_after(variables, prior, self.hessian, self.common, moved, start_share)
         return later and self.uncertainty.scaled(later)

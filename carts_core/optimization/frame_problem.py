@@ -25,7 +25,7 @@ from .factors.edges import EdgeFactor
 from .factors.surface import SurfaceFactor
 from .frame_images import FrameImages
 from .ignore import propose_ignore
-from .observability import uncertainty
+from .observability import Uncertainty, uncertainty
 from .observation import Observation, observe
 from .predictor import FramePredictor
 from .silhouettes import SilhouetteComparison, search_silhouettes
@@ -177,6 +177,11 @@ class FrameProblem:
     def other_costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
         """The cost of all factors but the surface factor at each of a batch of points."""
         return torch.stack([factor.costs(offsets) for factor in self._other_factors]).sum(0)
+
+    def uncertainty_after(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Uncertainty | None:
+        """Deviations where a fit has ended, near an evaluation with a gradient."""
+        start_share = 0.0 if self.predictor.masked else self.settings.start_share
+        return evaluation.final_uncertainty(offsets, self.variables, self.prior, start_share)
 
     @torch.no_grad()
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:

@@ -64,9 +64,9 @@ class Uncertainty:
 
 
 def uncertainty(
-    variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], common: Float[Tensor, " n"], scale: float = 1.0
+    variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], common: Float[Tensor, " n"]
 ) -> Uncertainty | None:
-    """From the second derivative of an objective in units of its noise; None where the prior leaves an unknown open.
+    """For errors of the start as large as expected, from the second derivative of an objective in units of its noise.
 
     Args:
         variables: the unknowns.
@@ -74,39 +74,90 @@ def uncertainty(
         curvature: J^T J / noise^2 and the prior's precision, per offset.
         common: what the gradient would be off by for one standard deviation of an error that all pixels share. Pixels
             cannot average it out, so it comes on top of what their noise does, but never above what was expected.
-        scale: how many times as large as the prior says errors at the start are [1].
+
+    Returns:
+        None where the prior leaves an unknown open.
     """
     if not prior.informs_all:
         return None
+    covariance = torch.linalg.inv(curvature.double())
+    return _uncertainty(variables, prior, covariance, covariance @ common.double())
+
+
+def uncertainty_after(
+    variables: Variables,
+    prior: Prior,
+    curvature: Float[Tensor, "n n"],
+    common: Float[Tensor, " n"],
+    moved: Float[Tensor, " n"],
+    start_share: float,
+) -> Uncertainty | None:
+    """For errors of the start as large as what a fit has corrected makes likely.
+
+    The fit is the optimum under a prior of the expected size, so more is left of larger errors than its curvature says:
+    of an error e of the start, (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and
+    a the share of the start in what the network predicts. Noise comes on top of it.
+
+    Args:
+        variables: the unknowns.
+        prior: of their offsets, before the image was used.
+        curvature: J^T J / noise^2 and the prior's precision, per offset.
+        common: as in `uncertainty`.
+        moved: offsets at the optimum, less the prior's mean.
+        start_share: share of an error of the start that is left in what the image seems to show [1].
+
+    Returns:
+        None where the prior leaves an unknown open.
+    """
+    if not prior.informs_all:
+        return None
+    precision, curvature = prior.precision.double(), curvature.double()
+    information, inverse = curvature - precision, torch.linalg.inv(curvature)
+    scale = expected_scale(moved, information, precision, start_share)
+    left = inverse @ (precision + start_share * information)
+    covariance = scale**2 * left @ torch.linalg.inv(precision) @ left.T + inverse @ information @ inverse
+    return _uncertainty(variables, prior, covariance, inverse @ common.double(), scale)
+
+
+def _uncertainty(
+    variables: Variables, prior: Prior, covariance: Float[Tensor, "n n"], common: Float[Tensor, " n"], scale: float = 1
+) -> Uncertainty:
     scales = variables.scales.double()
-    covariance = torch.linalg.inv((curvature + (scale**-2 - 1.0) * prior.precision).double())
     expected = scale * prior.marginal_precision.double().rsqrt() * scales
-    variance = covariance.diagonal().clamp(min=0) + (covariance @ common.double()).square()
-    std = (variance.sqrt() * scales).minimum(expected)
-    return Uncertainty(tuple(variables.names), tuple(std.tolist()), tuple(expected.tolist()))
+    std = (covariance.diagonal().clamp(min=0) + common.square()).sqrt() * scales
+    return Uncertainty(tuple(variables.names), tuple(std.minimum(expected).tolist()), tuple(expected.tolist()))
 
 
-_ROUNDS = 20
-"""Of the fixed point of `expected_scale`, which is near after a few [1]."""
+_SQUARES = torch.logspace(-3, 2, 241, dtype=torch.float64)
+"""Squares of the scales that `expected_scale` weighs, in steps of 5 % [1]."""
+_SHOWN = 1e-4
+"""Directions of which the image tells less, in units of the prior's precision, tell nothing of the scale [1]."""
 
 
-def expected_scale(moved: Float[Tensor, " n"], information: Float[Tensor, "n n"], prior: Float[Tensor, "n n"]) -> float:
+def expected_scale(
+    moved: Float[Tensor, " n"], information: Float[Tensor, "n n"], prior: Float[Tensor, "n n"], start_share: float = 0.0
+) -> float:
     """How many times as large as expected the errors of the start probably were, from what a fit has corrected [1].
 
-    Errors of one frame are about as large for joints that it shows as for those that it does not show. This is the
-    evidence approximation (MacKay, Bayesian Interpolation, 1992, equation 4.6): the mean square of the corrections,
-    over the number of unknowns that the image determines. One more that was as wrong as expected is added, so that an
-    image which determines nothing changes nothing.
+    Errors of one frame are about as large for joints that it shows as for those that it does not show. The square of
+    the scale is lognormal beforehand, of mean 1 and a deviation of 1 of its logarithm; corrections are Gaussian in each
+    direction, given the scale. This is the root of the square's mean afterwards (a hierarchical prior; Gelman et al.,
+    Bayesian Data Analysis, 2013, chapter 5). An image which determines nothing changes nothing.
 
     Args:
         moved: offsets at the optimum, less the prior's mean.
         information: curvature of the image's part of the objective.
         prior: inverse covariance of the offsets before the image was used.
+        start_share: as in `uncertainty_after`.
     """
-    information, prior, moved = information.double(), prior.double(), moved.double()
-    square, found = float(moved @ prior @ moved), 1.0
-    for _ in range(_ROUNDS):
-        covariance = torch.linalg.inv(information + prior / found)
-        determined = len(moved) - float((covariance @ prior).trace()) / found
-        found = (square + 1.0) / (determined + 1.0)
-    return found**0.5
+    root = torch.linalg.cholesky(torch.linalg.inv(prior.double()))
+    shown, axes = torch.linalg.eigh(root.T @ information.double() @ root)
+    corrected = axes.T @ torch.linalg.solve_triangular(root, moved.double()[:, None], upper=False)
+    shown, corrected = shown[shown > _SHOWN], corrected[shown > _SHOWN, 0]
+    if not len(shown):
+        return 1.0
+    variance = _SQUARES[:, None] * ((1.0 - start_share) * shown / (1.0 + shown)).square()
+    variance += shown / (1.0 + shown).square()
+    likelihood = -0.5 * (variance.log() + corrected.square() / variance).sum(1)
+    probability = (likelihood - 0.5 * (_SQUARES.log() + 0.5).square()).softmax(0)
+    return float(probability @ _SQUARES) ** 0.5

@@ -133,8 +133,7 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient)
         if isinstance(fit.problem, FrameProblem):
-            deviations = before.final_uncertainty(fit.offsets, fit.problem.variables, fit.problem.prior)
-            evaluation = replace(evaluation, uncertainty=deviations)
+            evaluation = replace(evaluation, uncertainty=fit.problem.uncertainty_after(fit.offsets, before))
         point = replace(point, evaluation=evaluation)
     # It is what counts in the end, whatever its loss, in which edges have no part.
     yield replace(point, objective_key=(*point.objective_key, "end"))

@@ -70,6 +70,9 @@ class SurfaceSolver:
     outline_error: float = 0.3
     """Expected error that all outlines in an image have in common, outwards or inwards [px of the working image].
     It widens the reported deviations of what moves an arm along the line of sight."""
+    start_share: float = 0.1
+    """Share of an error of the start that is left in what the network predicts, which is given a rendering of the start
+    [1]. It widens the reported deviations and changes no estimate; given masks have no such share."""
     prior_deg: float = 2.5
     """Expected error of a joint position at the start [deg]; `length_scale` turns it into metres."""
     frame_prior_deg: float = 0.5
@@ -91,6 +94,7 @@ class SurfaceSolver:
         require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
         require(0 <= self.dehaze <= 1, "dehaze", self.dehaze, "0 to 1")
         require(0 <= self.outline_error <= 100, "outline_error", self.outline_error, "0 to 100 px")
+        require(0 <= self.start_share <= 1, "start_share", self.start_share, "0 to 1")
         require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
         require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
         require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
