@@ -123,7 +123,7 @@ class CalibrationOptimizer:
             raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
         if not 1e-3 <= joint_prior_deg <= 360:
             raise SettingsError(f"joint_prior_deg is {joint_prior_deg!r}; allowed is 0.001 to 360 deg.")
-        if not (free.base_frames or free.extrinsics or free.intrinsics):
+        if free.joints_only:
             raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
         self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)

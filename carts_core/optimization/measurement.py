@@ -22,9 +22,11 @@ from .evidence import Evidence
 from .factors import Linearization, Prior
 from .fit import Fit
 from .frame_problem import FrameProblem
+from .observability import Uncertainty
 from .predictor import SurfacePredictor
 from .stages import run_stages
 from .variables import Variables
+from .verdict import Assessment
 
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
@@ -46,6 +48,20 @@ class Measurement:
     def left_out(self) -> "Measurement":
         """Without the information of its image."""
         return replace(self, information=Information.nothing(len(self.correction)))
+
+
+@dataclass(frozen=True)
+class SolvedAlone:
+    """What the whole solver of single frames makes of one frame, without the others."""
+
+    correction: Float[np.ndarray, " n"]
+    """[rad]"""
+    uncertainty: Uncertainty | None
+    """With the verdict allowed for; None where it is not known."""
+    loss: float
+    iterations: int
+    assessment: Assessment | None
+    """None for stages without `RejectFailed`."""
 
 
 class FrameSolver:
@@ -109,6 +125,14 @@ class FrameSolver:
         end = self.warm(frame, variables, expected, _double(fit.reached.offsets))
         return replace(end, iterations=fit.used + end.iterations)
 
+    def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
+        """Solve a frame as `FrameOptimizer` does, by the stages of the settings; None if they evaluate nothing."""
+        fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
+        if fit.best is None:
+            return None
+        found, used = fit.best.evaluation, fit.used
+        return SolvedAlone(_double(fit.best.offsets), found.uncertainty, found.loss, used, fit.assessment)
+
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
         """Evaluate a given correction [n], no more."""
         problem = self._problem(frame, variables, _prior(expected, variables))
@@ -164,7 +188,7 @@ class FrameSolver:
         self,
         frame: Frame,
         variables: Variables,
-        prior: Prior,
+        prior: Prior | None,
         stages: tuple[Stage, ...],
         start: np.ndarray,
         cancelled: Callable[[], bool] = lambda: False,

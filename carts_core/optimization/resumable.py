@@ -13,7 +13,7 @@ from ..recording import Frame
 from ..settings import FreeParameters
 from .error_model import Gaussian, Information
 from .evidence import Evidence
-from .measurement import FrameSolver, Measurement
+from .measurement import FrameSolver, Measurement, SolvedAlone
 from .variables import Variables
 
 
@@ -57,6 +57,10 @@ class ResumableFrameSolver(FrameSolver):
         """As `FrameSolver.cold`."""
         key, options = _key("cold", frame, expected, quick), {"quick": quick, "cancelled": cancelled}
         return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, **options))
+
+    def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
+        """As `FrameSolver.alone`; frames that failed only, so it is not kept."""
+        return self._solver.alone(frame, variables)
 
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
         """As `FrameSolver.at`."""

@@ -39,8 +39,9 @@ class SequenceOptimizer:
     A few frames, evenly spread, are solved alone first, and what suits all of them best is where the first frame
     starts. A later frame starts at the correction that the frames before it let expect, and is held there as firmly as
     they know it. After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what
-    came of it is visited again. In the end all estimates are assessed; where the sequence failed, frames that did so
-    too keep their measured values. Frames in `keyframes` stay exactly as given, and everything else follows them.
+    came of it is visited again. In the end all estimates are assessed. Frames that failed are solved alone, if nothing
+    but joints is free; where the sequence failed, frames that still do keep their measured values. Frames in
+    `keyframes` stay exactly as given, and everything else follows them.
 
     Args:
         scene: arms and cameras.
@@ -175,8 +176,8 @@ class SequenceOptimizer:
         if self._revisits:
             return self._visit_again(*self._revisits.pop())
         if self._judging is None:
-            found = self.estimates, self._smoother.smoothed()
-            self._judging = assessed_estimates(*found, self._scene, self._solver, self._open)
+            found, alone = (self.estimates, self._smoother.smoothed()), not self._keyframes and self._free.joints_only
+            self._judging = assessed_estimates(*found, self._scene, self._solver, self._open, alone=alone)
         if (judged := next(self._judging, None)) is not None:
             self._estimates = self.estimates | {judged.index: judged}
             return judged

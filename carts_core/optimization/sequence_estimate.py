@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
 from .error_model import Gaussian
-from .measurement import Measurement
+from .measurement import Measurement, SolvedAlone
 from .observability import Uncertainty
 from .variables import Variables
 from .verdict import Assessment
@@ -64,6 +64,30 @@ class FrameEstimate:
         known = assessment.of(self.uncertainty)
         return replace(self, assessment=assessment, uncertainty=known, joint_std=_joint_std(known, scene))
 
+    def solved_alone(self, scene: Scene, variables: Variables, found: SolvedAlone, seconds: float) -> "FrameEstimate":
+        """The same frame without the others, and with the verdict on that.
+
+        Args:
+            scene: of the sequence.
+            variables: the frame's unknowns.
+            found: their values and deviations, which must be known, and the verdict.
+            seconds: that it has taken, on top of those before [s].
+        """
+        assert found.uncertainty is not None
+        state, joints = _positions(scene, variables, found.correction)
+        return replace(
+            self,
+            state=state,
+            joint_positions=joints,
+            joint_std=_joint_std(found.uncertainty, scene),
+            uncertainty=found.uncertainty,
+            loss=found.loss,
+            start=Origin.COLD,
+            iterations=self.iterations + found.iterations,
+            seconds=self.seconds + seconds,
+            assessment=found.assessment,
+        )
+
 
 @dataclass(frozen=True)
 class Visit:
@@ -85,17 +109,15 @@ class Visit:
             prior: what was expected of it before any image [rad].
         """
         variables = self.variables
-        offsets = torch.from_numpy(correction.mean).to(variables.lower)
-        state = variables.state(variables.clamp(offsets)).detached()
+        state, joint_positions = _positions(scene, variables, correction.mean)
         scales = variables.scales.cpu().double().numpy()
         std, expected = (np.sqrt(known.covariance.diagonal().clip(min=0.0)) * scales for known in (correction, prior))
         uncertainty = Uncertainty(tuple(variables.names), tuple(std.tolist()), tuple(expected.tolist()))
-        joints = [values.cpu().double().numpy().copy() for values in state.joint_positions]
         return FrameEstimate(
             index=index,
             frame_id=self.frame_id,
             state=state,
-            joint_positions={arm.name: values for arm, values in zip(scene.arms, joints, strict=True)},
+            joint_positions=joint_positions,
             joint_std=_joint_std(uncertainty, scene),
             uncertainty=uncertainty,
             loss=self.measurement.loss,
@@ -107,3 +129,12 @@ class Visit:
 
 def _joint_std(known: Uncertainty, scene: Scene) -> dict[str, Float[np.ndarray, " dofs"]]:
     return {arm.name: known.joint_std(arm.name, arm.robot.joint_names) for arm in scene.arms}
+
+
+def _positions(
+    scene: Scene, variables: Variables, correction: Float[np.ndarray, " n"]
+) -> tuple[SceneState, dict[str, Float[np.ndarray, " dofs"]]]:
+    offsets = torch.from_numpy(correction).to(variables.lower)
+    state = variables.state(variables.clamp(offsets)).detached()
+    joints = [values.cpu().double().numpy().copy() for values in state.joint_positions]
+    return state, {arm.name: values for arm, values in zip(scene.arms, joints, strict=True)}

@@ -18,6 +18,8 @@ from .verdict_of_many import SequenceAssessment, assess_sequence
 
 _LOOKED_AT = 3
 """Frames that tell whether base frames are off."""
+_IN_VAIN = 5
+"""Frames in a row that fail alone as well, after which no more are tried."""
 
 
 def sequence_base_frame_gain(
@@ -47,8 +49,10 @@ def assessed_estimates(
     scene: Scene,
     solver: FrameSolver,
     opened: Callable[[int], tuple[Frame, Variables]],
+    *,
+    alone: bool,
 ) -> Iterator[FrameEstimate]:
-    """Estimates with their assessments.
+    """Estimates with their assessments, and again those of frames that failed and were then solved alone.
 
     Args:
         estimates: position -> final estimate.
@@ -56,13 +60,40 @@ def assessed_estimates(
         scene: of the sequence.
         solver: that knows the images.
         opened: gives the frame at a position, and its unknowns.
+        alone: whether frames that failed are solved alone, too.
     """
+    failed = []
     for index, estimate in estimates.items():
         began = time.perf_counter()
         frame, variables = opened(index)
         found = assess(solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
         seconds = estimate.seconds + time.perf_counter() - began
-        yield replace(estimate.judged(found, scene), seconds=seconds)
+        judged = replace(estimate.judged(found, scene), seconds=seconds)
+        yield judged
+        if found.verdict is Verdict.FAILED and not found.nothing_there:
+            failed.append(judged)
+    in_vain = 0
+    for estimate in failed if alone else ():
+        better = _solved_alone(estimate, scene, solver, opened)
+        in_vain = 0 if better else in_vain + 1
+        if better is not None:
+            yield better
+        elif in_vain == _IN_VAIN:
+            return
+
+
+def _solved_alone(
+    estimate: FrameEstimate, scene: Scene, solver: FrameSolver, opened: Callable[[int], tuple[Frame, Variables]]
+) -> FrameEstimate | None:
+    """The estimate of a frame that is solved without the others; None where that fails, too."""
+    began = time.perf_counter()
+    frame, variables = opened(estimate.index)
+    found = solver.alone(frame, variables)
+    if found is None or found.uncertainty is None or found.assessment is None:
+        return None
+    if found.assessment.verdict is Verdict.FAILED:
+        return None
+    return estimate.solved_alone(scene, variables, found, time.perf_counter() - began)
 
 
 def assessed_sequence(

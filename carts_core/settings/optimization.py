@@ -46,6 +46,11 @@ class FreeParameters:
     locked_cameras: tuple[str, ...] = ()
     """Cameras whose extrinsics stay where they are."""
 
+    @property
+    def joints_only(self) -> bool:
+        """Whether no calibration is unknown, which frames share."""
+        return not (self.base_frames or self.extrinsics or self.intrinsics)
+
 
 @dataclass(frozen=True)
 class SurfaceSolver:
