@@ -220,3 +220,25 @@ def test_jobs_take_the_range_that_is_chosen_until_it_is_dropped_or_something_els
     tab.place_in_viewer.put(intents.SetRange((4, 7)))
     expect(tab.page.locator(".carts-range")).to_have_text("005 – 008")
     expect(frames).to_have_value("All")
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)])
+def test_a_note_covers_neither_the_names_of_the_pictures_nor_what_is_pressed(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], size: tuple[int, int]
+) -> None:
+    app = open_viewer(cameras=("left", "right"), width=320, height=240)
+    tab = open_tab(app, size)
+    tab.place_in_viewer.put(intents.Download(1))
+    note = tab.page.locator(".mantine-Notification-root", has_text="Nothing has been exported yet")
+    expect(note).to_be_visible()
+    tab.page.wait_for_function(
+        "one => one.getAnimations({subtree: true}).length === 0", arg=note.element_handle(), timeout=10_000
+    )
+    box = note.bounding_box()
+    others = tab.page.locator(".carts-cell-label, .carts-review-bar button, .carts-strip canvas").all()
+    assert box is not None and len(others) >= 3
+    for other in others:
+        where = other.bounding_box()
+        assert where is None or (where["y"] + where["height"] <= box["y"] or where["y"] >= box["y"] + box["height"]), (
+            other.text_content()
+        )
