@@ -74,26 +74,25 @@ def assessed_estimates(
             failed.append(judged)
     in_vain = 0
     for estimate in failed if alone else ():
-        better = _solved_alone(estimate, scene, solver, opened)
-        in_vain = 0 if better else in_vain + 1
-        if better is not None:
-            yield better
-        elif in_vain == _IN_VAIN:
+        found = _solved_alone(estimate, scene, solver, opened)
+        in_vain = 0 if found.assessment is not estimate.assessment else in_vain + 1
+        yield found
+        if in_vain == _IN_VAIN:
             return
 
 
 def _solved_alone(
     estimate: FrameEstimate, scene: Scene, solver: FrameSolver, opened: Callable[[int], tuple[Frame, Variables]]
-) -> FrameEstimate | None:
-    """The estimate of a frame that is solved without the others; None where that fails, too."""
+) -> FrameEstimate:
+    """The estimate of a frame that is solved without the others; as it was, where that fails, too."""
     began = time.perf_counter()
     frame, variables = opened(estimate.index)
     found = solver.alone(frame, variables)
-    if found is None or found.uncertainty is None or found.assessment is None:
-        return None
-    if found.assessment.verdict is Verdict.FAILED:
-        return None
-    return estimate.solved_alone(scene, variables, found, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    verdict = found and found.assessment and found.assessment.verdict
+    if found is None or found.uncertainty is None or verdict in (None, Verdict.FAILED):
+        return replace(estimate, seconds=estimate.seconds + seconds)
+    return estimate.solved_alone(scene, variables, found, seconds)
 
 
 def assessed_sequence(
