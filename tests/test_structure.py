@@ -114,3 +114,14 @@ def test_every_test_module_has_a_name_of_its_own() -> None:
     paths = [path for path in (ROOT / "tests").rglob("*.py") if not (path.parent / "__init__.py").exists()]
     names = [path.name for path in paths if path.name != "conftest.py"]
     assert [name for name in set(names) if names.count(name) > 1] == []  # pytest would stop at the second one
+
+
+def test_onnx_runtime_is_imported_only_where_it_is_told_to_send_nothing() -> None:
+    found = []
+    for name, path in _sources().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            if any(one.split(".")[0] == "onnxruntime" for one in names):
+                found.append(name)
+    assert found == ["carts_core.onnx_runtime"]

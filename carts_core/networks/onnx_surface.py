@@ -6,7 +6,6 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -15,6 +14,7 @@ from ..errors import OutputError
 from ..files import output_path, write_bytes
 from ..files.reading import WEIGHTS, read_bytes
 from ..model.mesh_cache import cache_dir
+from ..onnx_runtime import onnxruntime
 from ..process import inference_threads
 from .surface_network import SurfaceNetwork
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import onnxruntime
 from jaxtyping import Bool, Float, UInt8
 
 from ..errors import WeightsError
 from ..files.reading import WEIGHTS, read_bytes
+from ..onnx_runtime import onnxruntime
 from ..wording import shortened
 from .prompt import Prompt
 

@@ -1,6 +1,9 @@
 """ONNX Runtime runs the surface network as torch does, or not at all."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -128,3 +131,19 @@ def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(
 def test_a_cache_that_cannot_be_written_is_no_error(weights: Path, cache: Path) -> None:
     cache.write_text("a file where the folder should be")
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_onnx_runtime_collects_nothing_about_whoever_uses_it(weights: Path, tmp_path: Path, ours: bool) -> None:
+    """What it would send it keeps in a database in the user's cache first; without our import it does."""
+    FeatureExtractor.load(weights, inference="onnx")
+    (graph,) = (tmp_path / "cache").glob("surface-*.onnx")
+    imported = "from carts_core.onnx_runtime import onnxruntime" if ours else "import onnxruntime"
+    session = f"onnxruntime.InferenceSession({str(graph)!r}, providers=['CPUExecutionProvider'])"
+    # It collects nothing where it finds that it runs in a test.
+    environment = {name: value for name, value in os.environ.items() if name in ("PATH", "PYTHONPATH", "LANG")}
+    home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home" / "cache")}
+    (tmp_path / "home").mkdir()
+    subprocess.run([sys.executable, "-c", f"{imported}\n{session}"], env=environment | home, check=True, timeout=120)
+    kept = [path.name for path in (tmp_path / "home").rglob("onnxruntime.db")]
+    assert kept == ([] if ours else ["onnxruntime.db"])

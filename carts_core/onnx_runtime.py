@@ -1,0 +1,14 @@
+"""ONNX Runtime, told to send nothing: from 1.29 on it reports machine and models to Microsoft unless it is told not to.
+
+Whoever needs `onnxruntime` imports it from here, since the library looks at the environment when it is loaded.
+"""
+
+import os
+
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
+import onnxruntime
+
+onnxruntime.disable_telemetry_events()
+
+__all__ = ["onnxruntime"]
