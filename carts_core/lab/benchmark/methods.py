@@ -31,6 +31,8 @@ class Method:
     """The given masks are what is fitted, and no network is used."""
     baseline: bool = False
     """It is a network of others, whose weights have to be given."""
+    image_alone: bool = False
+    """It sees the image, and neither kinematics nor a rendering."""
 
 
 def _ours(_: int) -> SolverSettings:
@@ -42,7 +44,7 @@ def _start(_: int) -> SolverSettings:
 
 
 METHODS = {
-    "unet": Method("U-Net alone", None),
+    "unet": Method("U-Net alone", None, image_alone=True),
     "surface": Method("surface network alone, given the rendering", None),
     "start": Method("CaRTS without optimization", _start),
     "l1": Method("CaRTS L1 (paper's setting)", lambda _: DescentSolver.paper(50, Loss.L1)),
@@ -65,6 +67,8 @@ _NETWORKS: dict[BaselineName, str] = {
     "swin": "Swin",
     "colleoni": "Colleoni's",
 }
+_GIVEN_RENDERING: tuple[BaselineName, ...] = ("colleoni",)
+"""Networks that get a rendering at the measured joint positions beside the image."""
 _AUGMENTATIONS: dict[Augmentation, str] = {
     "none": "no augmentation",
     "smoke": "simulated smoke",
@@ -74,7 +78,7 @@ _AUGMENTATIONS: dict[Augmentation, str] = {
 }
 assert set(_NETWORKS) == set(get_args(BaselineName)) and set(_AUGMENTATIONS) == set(get_args(Augmentation))
 BASELINES = {
-    f"{network}_{change}": Method(f"{label}, {what}", None, baseline=True)
+    f"{network}_{change}": Method(f"{label}, {what}", None, baseline=True, image_alone=network not in _GIVEN_RENDERING)
     for network, label in _NETWORKS.items()
     for change, what in _AUGMENTATIONS.items()
 }

@@ -16,6 +16,7 @@ from .figures import write_figures
 from .frame import TOLERANCE
 from .further_tables import calibration_table, camera_table, occlusion_table, room_table, sequence_table
 from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
+from .image_alone import image_alone_table
 from .measurement import Measurement
 from .page import PAGE
 from .speed_tables import pair_table, speed_table, stage_table, worse_table
@@ -107,7 +108,7 @@ def _sections(
     """Title -> tables."""
     compared = data.compared()
     return [
-        ("Main table", main_tables(data)),
+        ("Main table", [*main_tables(data), *_known(image_alone_table(compared))]),
         ("Iterations", iteration_tables(data)),
         ("Error at the start", error_tables(compared)),
         ("Occlusion", _known(occlusion_table(data))),
