@@ -1,4 +1,4 @@
-"""ONNX Runtime, told to send nothing: from 1.29 on it reports machine and models to Microsoft unless it is told not to.
+"""ONNX Runtime without its telemetry: from 1.29 on it reports machine and models to Microsoft by default.
 
 Whoever needs `onnxruntime` imports it from here, since the library looks at the environment when it is loaded.
 """

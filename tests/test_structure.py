@@ -116,7 +116,7 @@ def test_every_test_module_has_a_name_of_its_own() -> None:
     assert [name for name in set(names) if names.count(name) > 1] == []  # pytest would stop at the second one
 
 
-def test_onnx_runtime_is_imported_only_where_it_is_told_to_send_nothing() -> None:
+def test_onnx_runtime_is_imported_only_where_its_telemetry_is_switched_off() -> None:
     found = []
     for name, path in _sources().items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -51,5 +51,6 @@ class Evaluation:
         if self.hessian is None or self.common is None or self.uncertainty is None:
             return None
         moved = offsets - prior.mean
-        later = uncertainty_after(variables, prior, self.hessian, self.common, moved, start_share)
-        return later and self.uncertainty.scaled(later)
+        return self.uncertainty.scaled(
+            uncertainty_after(variables, prior, self.hessian, self.common, moved, start_share)
+        )

@@ -91,7 +91,7 @@ def uncertainty_after(
     common: Float[Tensor, " n"],
     moved: Float[Tensor, " n"],
     start_share: float,
-) -> Uncertainty | None:
+) -> Uncertainty:
     """For errors of the start as large as what a fit has corrected makes likely.
 
     The fit is the optimum under a prior of the expected size, so more is left of larger errors than its curvature says:
@@ -100,17 +100,12 @@ def uncertainty_after(
 
     Args:
         variables: the unknowns.
-        prior: of their offsets, before the image was used.
+        prior: of their offsets, before the image was used; it informs all of them.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
         common: as in `uncertainty`.
         moved: offsets at the optimum, less the prior's mean.
         start_share: share of an error of the start that is left in what the image seems to show [1].
-
-    Returns:
-        None where the prior leaves an unknown open.
     """
-    if not prior.informs_all:
-        return None
     precision, curvature = prior.precision.double(), curvature.double()
     information, inverse = curvature - precision, torch.linalg.inv(curvature)
     scale = expected_scale(moved, information, precision, start_share)
@@ -156,8 +151,9 @@ def expected_scale(
     shown, corrected = shown[shown > _SHOWN], corrected[shown > _SHOWN, 0]
     if not len(shown):
         return 1.0
-    variance = _SQUARES[:, None] * ((1.0 - start_share) * shown / (1.0 + shown)).square()
+    squares = _SQUARES.to(shown.device)
+    variance = squares[:, None] * ((1.0 - start_share) * shown / (1.0 + shown)).square()
     variance += shown / (1.0 + shown).square()
     likelihood = -0.5 * (variance.log() + corrected.square() / variance).sum(1)
-    probability = (likelihood - 0.5 * (_SQUARES.log() + 0.5).square()).softmax(0)
-    return float(probability @ _SQUARES) ** 0.5
+    probability = (likelihood - 0.5 * (squares.log() + 0.5).square()).softmax(0)
+    return float(probability @ squares) ** 0.5

@@ -74,9 +74,9 @@ def assessed_estimates(
             failed.append(judged)
     in_vain = 0
     for estimate in failed if alone else ():
-        found = _solved_alone(estimate, scene, solver, opened)
-        in_vain = 0 if found.assessment is not estimate.assessment else in_vain + 1
-        yield found
+        solved = _solved_alone(estimate, scene, solver, opened)
+        in_vain = in_vain + 1 if solved.assessment is estimate.assessment else 0
+        yield solved
         if in_vain == _IN_VAIN:
             return
 

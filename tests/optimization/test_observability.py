@@ -58,7 +58,6 @@ def test_errors_lie_within_the_deviations_however_far_off_the_start_was(variable
         moved = torch.linalg.solve(information + precision, (1 - start_share) * information @ -away + noise)
         curvature = (information + precision).float()
         known = uncertainty_after(variables, prior, curvature, torch.zeros(joints), moved.float(), start_share)
-        assert known is not None
         sizes.append(size)
         errors.append((moved + away).abs() * variables.scales)
         deviations.append(torch.tensor(known.std))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from ...settings import DescentSolver, Loss, SolverName, SolverSettings, SurfaceSolver, solver
-from ...settings.baseline import Augmentation, BaselineName
+from ...settings.baseline import Augmentation, BaselineName, BaselineNetwork
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,6 @@ _NETWORKS: dict[BaselineName, str] = {
     "swin": "Swin",
     "colleoni": "Colleoni's",
 }
-_GIVEN_RENDERING: tuple[BaselineName, ...] = ("colleoni",)
-"""Networks that get a rendering at the measured joint positions beside the image."""
 _AUGMENTATIONS: dict[Augmentation, str] = {
     "none": "no augmentation",
     "smoke": "simulated smoke",
@@ -78,7 +76,9 @@ _AUGMENTATIONS: dict[Augmentation, str] = {
 }
 assert set(_NETWORKS) == set(get_args(BaselineName)) and set(_AUGMENTATIONS) == set(get_args(Augmentation))
 BASELINES = {
-    f"{network}_{change}": Method(f"{label}, {what}", None, baseline=True, image_alone=network not in _GIVEN_RENDERING)
+    f"{network}_{change}": Method(
+        f"{label}, {what}", None, baseline=True, image_alone=not BaselineNetwork(network).looks_at_kinematics
+    )
     for network, label in _NETWORKS.items()
     for change, what in _AUGMENTATIONS.items()
 }
