@@ -36,8 +36,12 @@ class Job:
     """Step -> further options of its command."""
 
 
-def read_manifest(path: Path) -> list[Job]:
+def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
     """The jobs of a manifest, in its order.
+
+    Args:
+        path: of the manifest.
+        output: folder of the batch, if there is one. What lies there was made by it, and patterns leave it out.
 
     Raises:
         SettingsError: it cannot be read, has a key, step or value that is not allowed, or a pattern matches no file.
@@ -56,7 +60,9 @@ def read_manifest(path: Path) -> list[Job]:
     strangers = set(content) - {"format", "jobs"}
     if strangers:
         raise SettingsError(f"manifest {path} has {listed(sorted(strangers))}; allowed are format and [[jobs]].")
-    found = [job for number, table in enumerate(tables, 1) for job in _jobs(path, f"{path}, jobs {number}", table)]
+    found = [
+        job for number, table in enumerate(tables, 1) for job in _jobs(path, output, f"{path}, jobs {number}", table)
+    ]
     names = unique_file_names([job.name for job in found])
     return [Job(name, *_fields(job)) for name, job in zip(names, found, strict=True)]
 
@@ -65,12 +71,12 @@ def _fields(job: Job) -> tuple[Any, ...]:
     return job.recording, job.camera, job.domain, job.steps, job.options
 
 
-def _jobs(manifest: Path, where: str, table: dict[str, Any]) -> Iterator[Job]:
+def _jobs(manifest: Path, output: Path | None, where: str, table: dict[str, Any]) -> Iterator[Job]:
     if strangers := set(table) - _KEYS:
         raise SettingsError(f"{where} has {listed(sorted(strangers))}; allowed are {listed(sorted(_KEYS))}.")
     steps = _steps(where, _texts(where, table, "steps", None))
     options = _options(where, table.get("options", {}), steps)
-    recordings = _recordings(manifest, where, _texts(where, table, "recordings", None))
+    recordings = _recordings(manifest, output, where, _texts(where, table, "recordings", None))
     cameras, domains = _texts(where, table, "cameras", ("all",)), _texts(where, table, "domains", ("",))
     for recording, domain, camera in product(recordings, domains, cameras):
         yield Job(_name(recording, domain, camera), recording, camera, domain, steps, options)
@@ -102,11 +108,13 @@ def _options(where: str, given: Any, steps: tuple[Step, ...]) -> dict[str, tuple
     return {step: _texts(f"{where}, options", given, step, None) for step in given}
 
 
-def _recordings(manifest: Path, where: str, patterns: tuple[str, ...]) -> list[Path]:
+def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple[str, ...]) -> list[Path]:
     """Files and folders that patterns match, those of each pattern in the order of their names."""
     folder, found = manifest.absolute().parent, []
     for pattern in patterns:
         matched = sorted(glob.glob(str(folder / pattern), recursive=True))
+        if output is not None and glob.has_magic(pattern):
+            matched = [path for path in matched if not Path(path).resolve().is_relative_to(output.resolve())]
         if not matched:
             raise SettingsError(f"{where}: recording {pattern!r} matches nothing in {folder}. Correct or remove it.")
         found += map(Path, matched)

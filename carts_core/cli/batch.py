@@ -61,10 +61,10 @@ class Batch:
         from .batch_job import check_options
 
         console = Terminal()
-        jobs = read_manifest(self.manifest)
+        folder = output_folder(self.output, "batch", self.manifest.stem)
+        jobs = read_manifest(self.manifest, folder.path)
         chosen = shard(jobs, self.shard)
         check_options(jobs)
-        folder = output_folder(self.output, "batch", self.manifest.stem)
         write_jobs(folder, jobs)
         failed: dict[str, str] = {}
         if not self.report_only:

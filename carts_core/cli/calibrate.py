@@ -62,7 +62,7 @@ class Calibrate:
         indices = frame_indices(self.frames, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
-        observer.check(sequence, indices, cameras)
+        observer.check(sequence, indices, cameras, [self.domain])
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
             known = observer.warnings(sequence, indices[0], self.domain, tuple(cameras), background=False)

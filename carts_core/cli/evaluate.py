@@ -63,7 +63,7 @@ class Evaluate:
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
         observer = self.network.observer(self.solving.chosen, sequence)
-        observer.check(sequence, frames, cameras)
+        observer.check(sequence, frames, cameras, domains)
         run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
         found = run(
             sequence,
@@ -92,7 +92,7 @@ class Evaluate:
                 verdict_counts(where, [score.verdict for score in seen]),
             )
         required = self.solving.chosen.needs_background
-        for group in camera_groups(cameras, self.together):
+        for group in [] if observer.masked else camera_groups(cameras, self.together):
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:

@@ -82,7 +82,7 @@ class Live:
             held.callback(tracker.close)
             if stream.server is not None:
                 console.print(f"listening on 127.0.0.1:{stream.server.port}")
-            lines = self._lines(held)
+            lines = self._lines()
             recorder = None
             if self.record is not None:
                 made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
@@ -96,32 +96,39 @@ class Live:
             sinks = [show, *([recorder] if recorder is not None else [])]
             statistics = LiveStatistics()
             try:
-                # A stream may have no end but this.
-                with suppress(KeyboardInterrupt):
+                # A stream may have no end but this, and who reads its lines may go away.
+                with suppress(KeyboardInterrupt, BrokenPipeError):
                     follow(stream.source, tracker, sinks, statistics)
             finally:
                 console.print(str(statistics))
+                if not statistics.tracked:
+                    console.print("No frame was complete: it takes joints of every arm and an image of every camera.")
                 if recorder is not None and (path := recorder.close()) is not None:
                     console.print(f"wrote {path}. Look at it: carts view {path}")
 
-    def _lines(self, held: ExitStack) -> "list[Callable]":
+    def _lines(self) -> "list[Callable]":
         """Where results go as lines of JSON."""
+        import os
         import sys
 
         import msgspec
 
-        from ..files import output_stream
+        from ..files import append_line, write_bytes
 
-        encoder = msgspec.json.Encoder()
-        if self.output is not None:
-            stream = held.enter_context(output_stream(self.output))
-        elif not self.quiet:
-            stream = sys.stdout.buffer
-        else:
+        encoder, output = msgspec.json.Encoder(), self.output
+        if output is not None:
+            write_bytes(output, b"")
+            return [lambda message: append_line(output, encoder.encode(message), sync=False)]
+        if self.quiet:
             return []
 
         def write(message: object) -> None:
-            stream.write(encoder.encode(message) + b"\n")
-            stream.flush()
+            try:
+                sys.stdout.buffer.write(encoder.encode(message) + b"\n")
+                sys.stdout.buffer.flush()
+            except BrokenPipeError:
+                # Or Python would try again, and complain, at its end.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise
 
         return [write]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -52,35 +53,55 @@ class Observer:
             return tuple(sorted((frame.masks or {}).items()))
         return tuple(sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored))
 
-    def check(self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str]) -> None:
+    def check(
+        self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
+    ) -> None:
         """See that all frames have what is to be fitted, before any of them is solved.
 
         Raises:
             SettingsError: they have not.
         """
-        if self.given is None:
+        if not self.masked:
             return
-        frames, cameras = list(frames), list(cameras)
-        for camera in cameras:
-            without = [index for index in frames if not self.given.there(index, camera)]
-            if without and (self.every or len(without) == len(frames)):
+        frames = list(frames)
+        for camera, domain in product(cameras, domains):
+            without = [index for index in frames if not self._has_mask(sequence, index, camera, domain)]
+            # With the network beside them, masks of others have to be of this recording, and its own may be missing.
+            if without and (self.every or (self.given is not None and len(without) == len(frames))):
                 raise SettingsError(
-                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self.given.origin} of camera "
+                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
                     f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}, position {without[0]}. Choose "
-                    "others with --frames and --camera, or give both with --observe both."
+                    "others with --frames and --camera, or leave them to the network with --observe both."
                 )
+
+    @property
+    def _origin(self) -> str:
+        return "mask" if self.given is None else self.given.origin
+
+    def _has_mask(self, sequence: "Sequence", index: int, camera: str, domain: str | None) -> bool:
+        if self.given is None:
+            return sequence.has_masks(camera, domain, index)
+        return self.given.there(index, camera)
 
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
     ) -> list[str]:
-        """What speaks against the network for these arms and images, from one frame; nothing where masks are fitted.
+        """What speaks against the network for these arms and images, from one frame; where masks are fitted, whether
+        some of the cameras that look together have none.
 
         Args:
             sequence, index, domain, cameras: which frame.
             background: whether the solver knows the empty background.
         """
         if self.masked:
-            return []
+            without = [camera for camera in cameras if not self._has_mask(sequence, index, camera, domain)]
+            if not without or len(without) == len(cameras):
+                return []
+            return [
+                f"Frame {sequence.frame_ids[index]} has no {self._origin} of camera {', '.join(without)}, so all "
+                f"cameras that look together ({', '.join(cameras)}) are left to the network there, masks or not. "
+                "Leave that camera out with --camera, or give it masks."
+            ]
         from ..optimization import familiarity
 
         frame = sequence.frame(index, domain, cameras)

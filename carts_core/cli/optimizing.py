@@ -60,7 +60,9 @@ class Optimizing:
         self._keyframes = self._read_keyframes()
         self._looking: SequenceOptimizer | None = None
         self._observer = asked.network.observer(self._solver, self._sequence)
-        self._observer.check(self._sequence, self._frames, asked.select.camera_names(self._sequence.scene))
+        select = asked.select
+        cameras, domains = select.camera_names(self._sequence.scene), select.domain_names(self._sequence)
+        self._observer.check(self._sequence, self._frames, cameras, domains)
 
     def run(self) -> None:
         """Optimize what is not there yet.
@@ -201,7 +203,7 @@ class Optimizing:
             self._console,
             kept_start_hint(part.name, stopped),
             base_frame_hint(part.name, gains),
-            *backgrounds.problems,
+            *(() if self._observer.masked else backgrounds.problems),
             *verdict_hints(part.name, assessed),
         )
 

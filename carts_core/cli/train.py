@@ -50,18 +50,17 @@ class Train:
 
         with locked_folder(self.output):
             config = adapted_to(recording, self.output, self.training)
-        first: dict[str, float] | None = None
         said: dict[str, float] | None = None
 
         def report(progress: TrainingProgress) -> None:
-            nonlocal first, said
-            if progress.validation is None or progress.validation is said:
+            nonlocal said
+            if progress.validation is None or progress.first is None or progress.validation is said:
                 return
-            first, said = first or progress.validation, progress.validation
-            console.print(f"step {progress.step}: {gain(first, said)}", soft_wrap=True)
+            said = progress.validation
+            console.print(f"step {progress.step}: {gain(progress.first, said)}", soft_wrap=True)
 
         result = train(config, self.output, report)
         console.print(f"weights: {result.weights}\nreport:  {result.report}")
-        if first is not None:
-            console.print(f"kept, the best: {gain(first, result.validation)}", soft_wrap=True)
+        if result.first is not None:
+            console.print(f"kept, the best: {gain(result.first, result.validation)}", soft_wrap=True)
         console.print(f"Use: carts optimize {recording} --weights {result.weights}", soft_wrap=True)

@@ -96,8 +96,8 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
         os.fsync(folder)
 
 
-def append_line(path: OutputPath | Path, line: bytes) -> None:
-    """Add a line to a file, made if it is missing, and see it on disk.
+def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
+    """Add a line to a file, made if it is missing, and see it on disk; without `sync`, leave that to the system.
 
     A last line that was not finished, since the process was killed, is ended first.
 
@@ -113,8 +113,9 @@ def append_line(path: OutputPath | Path, line: bytes) -> None:
             torn = length > 0 and os.pread(stream.fileno(), 1, length - 1) != b"\n"
             stream.write(b"\n" * torn + line + b"\n")
             stream.flush()
-            os.fsync(stream.fileno())
-        if length == 0:
+            if sync:
+                os.fsync(stream.fileno())
+        if length == 0 and sync:
             os.fsync(folder)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..model.scene import Scene
 from ..recording import Frame, Sequence
+from ..recording.joints import PLAUSIBLE
 from .messages import FrameMessage, StreamError, decoded
 
 
@@ -106,11 +107,14 @@ class Assembler:
         for name, joints in message.joints.items():
             if name not in self._joints:
                 raise StreamError(f"there is no arm {name!r}; the arms are {', '.join(self._joints)}.")
-            names = self._sequence.scene.arm(name).robot.joint_names
+            robot = self._sequence.scene.arm(name).robot
+            names = robot.joint_names
             for joint, value in joints.items():
-                if joint not in names or not np.isfinite(value):
+                largest = PLAUSIBLE[robot.joint_types[names.index(joint)]] if joint in names else -1.0
+                if not abs(value) <= largest:
                     raise StreamError(
-                        f"{name}: joint {joint!r} at {value}; its joints are {', '.join(names)}, in rad or m."
+                        f"{name}: joint {joint!r} at {value}; its joints are {', '.join(names)}, in rad or m, at most "
+                        f"{PLAUSIBLE['revolute']:.3g} rad and {PLAUSIBLE['prismatic']:.3g} m."
                     )
                 self._joints[name][names.index(joint)] = value
             self._known.add(name)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
-from ..files import append_line, file_name, output_path, write_bytes, write_text
+from ..files import append_line, file_name, output_path, remove_file, write_bytes, write_text
 from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.scene import Scene
 from ..project import Edits, JointCorrection, Key, Project, Provenance
@@ -79,6 +79,9 @@ class Recorder:
         if self._error is not None:
             raise self._error
         if not self._edits:
+            # Nothing came: the same command is to work again.
+            remove_file(self._output / "sequence.toml")
+            self._folder.rmdir()
             return None
         path = (self._output / "sequence.toml").path
         project = Project.open(Sequence.open(path), path.with_suffix(".carts"))

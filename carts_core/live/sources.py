@@ -1,5 +1,6 @@
 """Replays, cameras, and folders that fill, as sources of a live stream."""
 
+import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -17,6 +18,10 @@ from ..recording.images import read_image
 from .messages import FrameMessage, ImageMessage, StreamError
 from .moments import Assembler, Moment
 
+_log = logging.getLogger(__name__)
+
+_NAMED = 20
+"""How many frames that are left out are named."""
 _POLL = 0.01
 """How often a folder is looked at [s]."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -120,7 +125,7 @@ class Folder:
     """A folder that fills with `NAME.json` and an image `NAME.png`, or `NAME.CAMERA.png` of each of several cameras.
 
     The JSON file is a frame message without images. It is written last, so that a name counts once it is there; of
-    several new names only the last counts.
+    several new names only the last counts. What cannot be used is left out, and a warning is logged.
 
     Args:
         assembler: makes frames of it.
@@ -135,6 +140,7 @@ class Folder:
         if not folder.is_dir():
             raise SettingsError(f"{folder} is no folder. Name the one that images are written to.")
         self._assembler, self._cameras, self._folder = assembler, cameras, folder
+        self._left_out = 0
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Moment]:
@@ -145,13 +151,23 @@ class Folder:
             if newest <= seen:
                 continue
             seen = newest
-            moment = self._assembler.moment(self._message(newest))
+            try:
+                moment = self._assembler.moment(self._message(newest))
+            except StreamError as error:
+                self._leave_out(error)
+                continue
             if moment is not None:
                 yield moment
 
     def close(self) -> None:
         """See `Source`."""
         self._closed.set()
+
+    def _leave_out(self, error: StreamError) -> None:
+        self._left_out += 1
+        if self._left_out <= _NAMED:
+            further = " Further ones are not named." if self._left_out == _NAMED else ""
+            _log.warning("A frame is left out: %s%s", error, further)
 
     def _message(self, name: str) -> FrameMessage:
         path = self._folder / f"{name}.json"
@@ -166,7 +182,8 @@ class Folder:
         stems = [f"{name}.{camera}", *([name] if len(self._cameras) == 1 else [])]
         found = [path for stem in stems for suffix in _SUFFIXES if (path := self._folder / f"{stem}{suffix}").exists()]
         if not found:
-            raise StreamError(f"{self._folder} has {name}.json and no image {stems[0]}.png. Write the JSON file last.")
+            images = " or ".join(f"{stem}.png" for stem in stems)
+            raise StreamError(f"{self._folder} has {name}.json and no image {images}. Write the JSON file last.")
         try:
             image = read_image(found[0])
         except SequenceError as error:

@@ -20,6 +20,7 @@ from ..optimization.measurement import FrameSolver, Measurement
 from ..optimization.predictor import SurfacePredictor, predictor_of
 from ..optimization.sequence_estimate import Origin, Visit
 from ..optimization.variables import Variables
+from ..optimization.verdict import arm_is_elsewhere
 from ..recording import Frame
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.live import LiveSettings
@@ -32,6 +33,8 @@ _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""
 _CONTRADICTS = 9.0
 """A correction three deviations off what was expected, on average, contradicts it."""
+_LOOKED = 1.0
+"""How often it is seen whether an arm that is out of view is elsewhere in the image [s]."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,9 @@ class LiveTracker:
         """Of the parts of the error, after the last good frame."""
         self._seen = -math.inf
         """When the last good frame was taken [s]."""
-        self._searched = -math.inf
+        self._searched = self._looked = -math.inf
+        self._elsewhere = False
+        """Whether an arm was out of view, and something that looks like one elsewhere, when it was last looked for."""
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
         self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
         self._recovery: _Recovery | None = None
@@ -140,6 +145,8 @@ class LiveTracker:
             self._take(errors, attempt, measurement)
             self.verdict = LiveVerdict.GOOD
             correction = combined(errors.correction(attempt.state), measurement.information)
+            if self._arm_is_elsewhere(frame, variables, correction.mean, measurement.loss, now):
+                self.verdict = LiveVerdict.DOUBTFUL
         else:
             self.verdict = self._missed(now)
             correction, measurement = self._known(errors, now).expected, measurement.left_out()
@@ -157,6 +164,17 @@ class LiveTracker:
             found.joint_std,
             time.perf_counter() - began,
         )
+
+    def _arm_is_elsewhere(
+        self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float, now: float
+    ) -> bool:
+        """Whether an arm is out of view where it was found, and something that looks like one is in the image."""
+        if now - self._looked >= _LOOKED:
+            solver = self._solvers[Effort.SMALL, self._moving]
+            missing = solver.arms_out_of_view(variables, correction)
+            self._looked = now
+            self._elsewhere = missing and arm_is_elsewhere(solver.evidence(frame, variables, correction, loss))
+        return self._elsewhere
 
     def _known(self, errors: ErrorModel, now: float, effort: Effort = Effort.SMALL) -> _Attempt:
         """What is known of a frame before it is looked at; a search assumes nothing."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..model.scene import Scene
 from ..recording import Frame
+from ..rendering import Renderer
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.presets import COMPARE, reduced
 from ..settings.stages import FINEST, Observe, Stage, first_observe
@@ -22,6 +23,7 @@ from .evidence import Evidence
 from .factors import Linearization, Prior
 from .fit import Fit
 from .frame_problem import FrameProblem
+from .inputs import working_size
 from .observability import Uncertainty
 from .predictor import SurfacePredictor
 from .stages import run_stages
@@ -155,6 +157,13 @@ class FrameSolver:
         """What the images say for and against a correction [n] whose loss is known."""
         offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
         return self._problem(frame, variables, None).evidence(offsets, loss)
+
+    def arms_out_of_view(self, variables: Variables, correction: np.ndarray) -> bool:
+        """Whether no pixel of some arm is in view at a correction [n]."""
+        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        width, height = working_size(self._scene, self._settings.working_width, 1)
+        labels = Renderer(self._scene, width=width, height=height).segment(variables.state(offsets).to("cpu"))
+        return any(not (labels == arm).any() for arm in range(len(self._scene.arms)))
 
     def base_frame_gain(
         self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters

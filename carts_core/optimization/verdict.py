@@ -49,18 +49,22 @@ def assess(found: Evidence) -> Assessment:
     for applies, reason, remedy in _NOTHING_THERE:
         if applies(found):
             return Assessment(Verdict.FAILED, reason, remedy, max(probability, _LIKELY), found, True)
+    what = "given mask" if found.masked else "image"
     if probability >= _LIKELY:
-        return Assessment(
-            Verdict.FAILED, "The image contradicts the fit: " + _weakest(found), _REMEDY_FAILED, probability, found
-        )
-    if found.elsewhere >= _LOOKS_LIKE_ONE:
+        reason = f"The {what} contradicts the fit: " + _weakest(found)
+        return Assessment(Verdict.FAILED, reason, _REMEDY_FAILED, probability, found)
+    if arm_is_elsewhere(found):
         reason = "An arm is out of view where it was fitted, and something that looks like an arm is elsewhere."
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
     if probability >= _POSSIBLE:
-        return Assessment(
-            Verdict.DOUBTFUL, "The image supports the fit only in part: " + _weakest(found), _REMEDY, probability, found
-        )
-    return Assessment(Verdict.GOOD, "The image supports the fit.", "", probability, found)
+        reason = f"The {what} supports the fit only in part: " + _weakest(found)
+        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, probability, found)
+    return Assessment(Verdict.GOOD, f"The {what} supports the fit.", "", probability, found)
+
+
+def arm_is_elsewhere(found: Evidence) -> bool:
+    """Whether an arm is out of view where it was fitted, and something that looks like an arm is in the image."""
+    return found.elsewhere >= _LOOKS_LIKE_ONE
 
 
 _POSSIBLE, _LIKELY = 0.1, 0.5
@@ -76,11 +80,24 @@ _LOOKS_LIKE_ONE = 5e-3
 _LEFT = 0.3
 """Share of its area at the start below which an arm has left the image [1]."""
 
+_MOST, _MORE = 0.5, 2.0
+"""Share of the images, and multiple of what arms cover as measured, from which a fit follows no mask of arms [1]."""
+
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
         lambda found: found.start_area < OUT_OF_VIEW,
         "No arm is in view: as measured, the arms lie outside of the image or behind the camera.",
         "Check T_camera_world, T_world_base and the units of the joints, or leave the frame out.",
+    ),
+    (
+        lambda found: found.masked and found.area > max(_MOST, _MORE * found.start_area),
+        "The given mask covers most of the image, which the arms as measured do not.",
+        "Check that the mask is white on the arms and black elsewhere, not the other way round, without transparency.",
+    ),
+    (
+        lambda found: found.masked and found.predicted < _UNSEEN and found.agreement < _AT_RANDOM,
+        "The given mask shows nothing where the arms should be.",
+        "Check that it belongs to this frame and is white on the arms and black elsewhere, or leave the frame out.",
     ),
     (
         lambda found: (
@@ -94,7 +111,8 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
         lambda found: found.still_in_view < _LEFT,
         "An arm that was in view at the start has left the image.",
-        "Set it roughly by hand and run again, or check T_camera_world and T_world_base.",
+        "See that the image, or the mask that is fitted, shows all arms; set the arm roughly by hand and run again, or "
+        "check T_camera_world and T_world_base.",
     ),
     (
         lambda found: found.changed is not None and found.changed < _UNSEEN,
@@ -104,8 +122,8 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
 )
 
 _REMEDY = (
-    "Look at the overlay. Run the optimizer, set the arm by hand, or fit the frame together with its neighbours "
-    "(sequence mode; Solve in the page)."
+    "Look at the overlay. Run the optimizer if it has not run, set the arm by hand, or fit the frame together with its "
+    "neighbours (sequence mode; Solve in the page) if that is not done."
 )
 _REMEDY_FAILED = (
     "Run the optimizer, or if it has run, set the arm roughly by hand and run again, check the calibration, or name an "

@@ -60,18 +60,19 @@ def read_image(path: Path) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """A mask file; 128 and more is instrument.
+    """A mask file; half of what its pixels can hold (128 of 255) and more is instrument.
 
     Raises:
-        SequenceError: the file is missing, truncated, not an image, or has labels instead of 0 and 255.
+        SequenceError: the file is missing, truncated, not an image, or has labels instead of black and white.
     """
-    image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if 0 < (brightest := int(image.max())) < 128:
+    image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    white = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1
+    if 0 < (brightest := image.max()) < 0.5 * white:
         raise SequenceError(
-            f"mask {path} has no value above {brightest}. Masks are 0 (background) and 255 (instrument): "
-            "multiply a mask of 0 and 1 by 255, choose the instrument's label in a label image."
+            f"mask {path} has no value above {brightest}. Masks are 0 (background) and {white} (instrument): "
+            f"multiply a mask of 0 and 1 by {white}, choose the instrument's label in a label image."
         )
-    return image >= 128
+    return image >= 0.5 * white
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:

@@ -198,13 +198,14 @@ class Sequence:
         """Where a camera's images come from, as recorded; nothing is kept. Errors as `has_masks`."""
         return self._camera(camera).images[self._domain(domain)]
 
-    def has_masks(self, camera: str, domain: str | None = None) -> bool:
-        """Whether the sequence file gives masks for a camera (in a domain).
+    def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
+        """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position.
 
         Raises:
             SequenceError: there is no such domain or camera.
         """
-        return self._domain(domain) in self._camera(camera).masks
+        masks = self._camera(camera).masks.get(self._domain(domain))
+        return masks is not None and (index is None or masks[index] is not None)
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
         """The mean background BG_m: what the camera sees where no arm is, RGB, undistorted.

@@ -32,6 +32,18 @@ def test_every_recording_camera_and_domain_is_a_job(archive: Path) -> None:
     assert {job.recording for job in jobs} == {archive / name / "sequence.toml" for name in "abc"}
 
 
+def test_what_a_batch_has_made_is_no_new_recording(archive: Path) -> None:
+    made = archive / "runs" / "calibration"
+    made.mkdir(parents=True)
+    (made / "sequence.toml").write_text("")
+    everything = 'recordings = ["**/sequence.toml"]\nsteps = ["optimize"]\n'
+    path = manifest(archive, "[[jobs]]\n" + everything)
+    assert len(read_manifest(path)) == 4
+    assert [job.name for job in read_manifest(path, archive / "runs")] == ["a", "b", "c"]
+    with pytest.raises(SettingsError, match="matches nothing"):
+        read_manifest(manifest(archive, "[[jobs]]\n" + everything.replace("**", "runs/*")), archive / "runs")
+
+
 def test_jobs_of_the_same_name_get_folders_of_their_own(archive: Path) -> None:
     names = [job.name for job in read_manifest(manifest(archive, JOBS + JOBS))]
     assert len(set(names)) == 6

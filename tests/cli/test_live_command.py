@@ -4,11 +4,14 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from carts_core.cli import main
+from carts_core.errors import CartsError
+from carts_core.live import LiveEstimate, LiveTracker
 from carts_core.project import Key, Project
 from carts_core.recording import Sequence
 
@@ -80,3 +83,24 @@ def test_a_folder_that_holds_something_is_not_recorded_into(
         main(["live", str(sequence), "--quiet", "--record", str(tmp_path / "full")])
     assert "is there already. Name a new folder" in re.sub(r"\s+", " ", capsys.readouterr().err)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["note.txt"]
+
+
+def test_results_are_on_disk_as_they_come_and_stay_after_an_error(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results, track, lines = tmp_path / "results.jsonl", LiveTracker.track, []
+    results.write_text("of an earlier run")
+
+    def tracked(self: LiveTracker, *arguments: Any) -> LiveEstimate:
+        lines.append(results.read_text().count("\n"))
+        if len(lines) == 3:
+            raise CartsError("It ends.")
+        return track(self, *arguments)
+
+    monkeypatch.setattr(LiveTracker, "track", tracked)
+    with pytest.raises(SystemExit):
+        main(["live", str(sequence), "--rate", "0.5", "--output", str(results)])
+    assert lines == [0, 1, 2] and [json.loads(line)["id"] for line in results.read_text().splitlines()] == [
+        "001",
+        "002",
+    ]

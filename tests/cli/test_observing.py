@@ -1,6 +1,7 @@
 """`--observe`: what the network sees, given masks, or both."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,32 @@ def test_frames_whose_mask_has_changed_are_optimized_again(
     cv2.imwrite(str(file), mask)
     main(command)
     assert "redone: the masks changed" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.usefixtures("no_network")
+@pytest.mark.parametrize("command", ["optimize", "evaluate", "calibrate"])
+def test_a_frame_without_a_mask_is_refused_before_any_is_solved(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    (sequence.parent / "masks" / "left" / "002.png").unlink()
+    sequence.write_text(re.sub(r"(?m)^(masks = .*)$", r"\1\nsparse_masks = true", sequence.read_text()))
+    output = ["--json", str(tmp_path / "out")] if command == "evaluate" else ["--output", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as stop:
+        main([command, str(sequence), "--observe", "masks", "--frames", "0-1", *output])
+    said = " ".join(capsys.readouterr().err.split())
+    assert stop.value.code == BAD_INPUT and "1 of 2 frames have no mask of camera 'left'" in said and "002" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_masks_of_some_cameras_are_said_to_be_unused_where_all_look_together(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_sequence(frames=1, width=160, height=128, cameras=("left", "right"))
+    text = path.read_text()
+    path.write_text(text[: text.rindex("masks = ")] + text[text.index("\n", text.rindex("masks = ")) + 1 :])
+    main(["optimize", str(path), "--observe", "both", "--together", "--output", str(tmp_path / "out"),
+          "--settings", "iterations=1"])  # fmt: skip
+    assert "has no mask of camera right, so all cameras that look together" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,13 @@ def test_a_camera_that_begins_to_move_is_recorded_with_where_it_was(
         assert np.allclose(found.mounts(index)["left"], mounts[index], atol=1e-7)
 
 
+def test_where_no_frame_came_nothing_is_left(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1))
+    for _ in range(2):
+        assert Recorder(sequence, ("left",), tmp_path / "recorded", Provenance(Source.HAND)).close() is None
+        assert not (tmp_path / "recorded").exists()
+
+
 def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     found = record(Sequence.open(tiny_sequence(frames=2)), tmp_path / "recorded", [{}, {}])
     assert not found.moving_cameras and len(found) == 2

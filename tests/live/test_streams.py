@@ -178,6 +178,8 @@ def test_an_image_and_joints_make_a_frame_and_joints_stay(
         ({"joints": {"PSM9": {}}}, "there is no arm 'PSM9'; the arms are PSM1"),
         ({"joints": {"PSM1": {"elbow": 0.0}}}, "joint 'elbow' at 0.0; its joints are"),
         ({"joints": {"PSM1": {"yaw": float("nan")}}}, "joint 'yaw' at nan"),
+        ({"joints": {"PSM1": {"yaw": 1e300}}}, "joint 'yaw' at 1e\\+300; .* at most 12.6 rad"),
+        ({"joints": {"PSM1": {"insertion": 141.0}}}, "joint 'insertion' at 141.0; .* and 2 m"),
         ({"camera_poses": {"left": [[1.0]]}}, "give a rigid 4 x 4 matrix"),
         ({"camera_poses": {"left": (2 * np.eye(4)).tolist()}}, "give a rigid 4 x 4 matrix"),
         ({"camera_poses": {"up": np.eye(4).tolist()}}, "for one of left"),
@@ -297,11 +299,33 @@ def test_a_folder_that_fills_is_followed_from_name_to_name(
     thread.join()
     assert [frame.frame_id for frame in found][-1] == "002" and len(found) >= 2
     np.testing.assert_array_equal(found[-1].images["left"], sequence.frame(2).images["left"])
-    (folder / "003.json").write_text('{"type": "frame", "time": 1}')
-    with pytest.raises(StreamError, match=r"no image 003\.left\.png"):
-        list(Folder(assembler, ("left",), folder))
     with pytest.raises(SettingsError, match="is no folder"):
         Folder(assembler, ("left",), folder / "003.json")
+
+
+def test_what_cannot_be_used_in_a_folder_is_left_out(
+    sequence: Sequence, assembler: Assembler, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    source, image = Folder(assembler, ("left",), tmp_path), sequence.frame(0).images["left"][..., ::-1]
+    usable = json.dumps({"type": "frame", "time": 0.0, "joints": JOINTS})
+
+    def fill() -> None:
+        (tmp_path / "000.json").write_text(usable)
+        for number, content in enumerate(["{", usable.replace("PSM1", "PSM9"), usable], 1):
+            time.sleep(0.2)
+            cv2.imwrite(str(tmp_path / f"{number:03d}.png"), image)
+            (tmp_path / f"{number:03d}.json").write_text(content)
+        time.sleep(0.2)
+        source.close()
+
+    thread = threading.Thread(target=fill)
+    thread.start()
+    found = [moment.frame.frame_id for moment in source]
+    thread.join()
+    assert found == ["003"]
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 3 and all(text.startswith("A frame is left out: ") for text in said)
+    assert "no image 000.left.png or 000.png" in said[0] and "PSM9" in said[2]
 
 
 def test_a_video_is_shown_at_its_own_rate_with_joints_from_elsewhere(

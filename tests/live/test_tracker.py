@@ -19,6 +19,7 @@ from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
 from carts_core.live import Effort, LiveTracker, LiveVerdict
 from carts_core.model.scene import SceneState
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import ImagePredictor
 from carts_core.optimization.measurement import FrameSolver, Measurement
 from carts_core.recording import Frame, Sequence
@@ -273,3 +274,14 @@ def test_what_goes_wrong_in_a_search_beside_the_stream_is_raised(
     with pytest.raises(SettingsError, match="no such weights"):
         for _ in range(200):
             concurrent.next()
+
+
+def test_an_arm_that_is_out_of_view_and_yet_in_the_image_is_not_called_good(sample_sequence_path: Path) -> None:
+    sequence, verdicts = Sequence.open(sample_sequence_path), []
+    tracker = LiveTracker(sequence.scene, FeatureExtractor.load(), cameras=["left"])
+    for number in range(8):
+        frame = sequence.frame(number, cameras=["left"])
+        measured = {name: values.copy() for name, values in frame.measured.items()}
+        measured["psm1"][0] += 2.5
+        verdicts.append(tracker.track(replace(frame, measured=measured, timestamp=number / 5)).verdict)
+    assert LiveVerdict.GOOD not in verdicts and verdicts[-1] is LiveVerdict.DOUBTFUL

@@ -60,6 +60,17 @@ def test_an_image_like_the_empty_background_shows_no_arm() -> None:
     assert found.verdict is Verdict.FAILED and found.nothing_there and "empty background" in found.reason
 
 
+def test_a_mask_that_is_black_on_the_arms_or_shows_none_has_failed() -> None:
+    masked = replace(CONVINCING, masked=True, agreement=1.0, changed=None, overlap_with_change=None)
+    assert assess(masked).verdict is Verdict.GOOD and "mask" in assess(masked).reason
+    assert assess(replace(masked, area=0.45, start_area=0.01)).verdict is Verdict.GOOD
+    assert assess(replace(masked, area=0.7, start_area=0.6)).verdict is Verdict.GOOD
+    inverted = assess(replace(masked, area=0.9, start_area=0.15))
+    assert inverted.verdict is Verdict.FAILED and inverted.nothing_there and "other way round" in inverted.remedy
+    empty = assess(replace(masked, agreement=0.0, predicted=0.0))
+    assert empty.verdict is Verdict.FAILED and empty.reason.startswith("The given mask shows nothing")
+
+
 def test_a_verdict_grows_worse_with_the_evidence() -> None:
     order = [Verdict.GOOD, Verdict.DOUBTFUL, Verdict.FAILED]
     names = ("loss", "residual", "agreement", "unconditioned", "predicted", "changed", "overlap_with_change")

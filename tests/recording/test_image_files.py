@@ -80,6 +80,16 @@ def test_an_empty_mask_is_a_mask(tmp_path):
     assert not read_mask(tmp_path / "mask.png").any()
 
 
+@pytest.mark.parametrize("brightest", [1, 255])
+def test_a_deep_mask_is_as_white_as_its_pixels_can_be(tmp_path, brightest: int):
+    values = np.array([[0, 32767, 32768, 65535]], np.uint16)
+    cv2.imwrite(str(tmp_path / "mask.png"), values)
+    assert read_mask(tmp_path / "mask.png").tolist() == [[False, False, True, True]]
+    cv2.imwrite(str(tmp_path / "mask.png"), np.eye(4, dtype=np.uint16) * brightest)
+    with pytest.raises(SequenceError, match=rf"no value above {brightest}\. .* and 65535"):
+        read_mask(tmp_path / "mask.png")
+
+
 def test_a_mask_of_zeros_and_ones_is_noticed(tmp_path):
     cv2.imwrite(str(tmp_path / "mask.png"), np.eye(4, dtype=np.uint8))
     with pytest.raises(SequenceError, match=r"mask .*mask.png has no value above 1. .*multiply"):

@@ -27,6 +27,11 @@ class History:
     seconds: float = 0.0
     """Wall time spent in training steps [s]."""
 
+    @property
+    def first(self) -> dict[str, float] | None:
+        """The first validation; None before it."""
+        return next(iter(self.validations), None)
+
 
 def save_checkpoint(
     folder: Path,

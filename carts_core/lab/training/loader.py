@@ -1,6 +1,7 @@
 """Training batches, made in worker processes while the network trains."""
 
 import os
+import signal
 from collections.abc import Iterator
 from itertools import count
 from typing import Any
@@ -71,6 +72,13 @@ class _Samples(Dataset):
         self._alone = True
 
 
+def _leave_signals_to_parent(worker: int) -> None:
+    """Signals to the whole process group stop the parent, which ends its workers once it has kept its work."""
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
 def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Batch]:
     """Endless batches of the task's tensors.
 
@@ -84,6 +92,7 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Batch]
         prefetch_factor=2 if config.workers else None,
         # A forked child hangs in OpenMP as soon as the parent has used threads.
         multiprocessing_context="spawn" if config.workers else None,
+        worker_init_fn=_leave_signals_to_parent if config.workers else None,
     )
     return map(tuple, loader)
 

@@ -53,6 +53,8 @@ class TrainingProgress:
     """Wall time per step [s]."""
     validation: dict[str, float] | None
     """The newest validation."""
+    first: dict[str, float] | None
+    """The first one of the run, wherever that was interrupted since."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class TrainingResult:
     """The training report."""
     validation: dict[str, float]
     """Figures of the saved weights."""
+    first: dict[str, float] | None
+    """Figures of the run's first validation; None of a run that had none."""
     seconds: float
     """Wall time spent in training steps, over all resumed parts [s]."""
 
@@ -132,7 +136,7 @@ class _Run:
         if self.config.patience is not None and not self.history.validations:
             # What the start reaches is what has to be beaten.
             validation = self._validate(samples)
-            progress(TrainingProgress(self.step, self._planned(), math.nan, math.nan, validation))
+            progress(TrainingProgress(self.step, self._planned(), math.nan, math.nan, validation, validation))
         if self.step < self._planned() and not self._has_ended_gaining():
             batches = training_batches(self.config, self.step)
             sums: dict[str, float] = {}
@@ -154,7 +158,8 @@ class _Run:
                     self.history.losses.append({"step": self.step, **means})
                     elapsed = time.perf_counter() - self._clock
                     self.history.seconds += elapsed
-                    progress(TrainingProgress(self.step, self._planned(), means["loss"], elapsed / count, validation))
+                    reached = means["loss"], elapsed / count, validation, self.history.first
+                    progress(TrainingProgress(self.step, self._planned(), *reached))
                     sums, count, self._clock = {}, 0, time.perf_counter()
                 if last or self.step % self.config.checkpoint_every == 0:
                     self._checkpoint()
@@ -166,7 +171,8 @@ class _Run:
         examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
         folder = output_path(self.output, "report")
         report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
-        return TrainingResult(weights_file(self.config, self.output), report, validation, self.history.seconds)
+        weights = weights_file(self.config, self.output)
+        return TrainingResult(weights, report, validation, self.history.first, self.history.seconds)
 
     def save(self) -> None:
         """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""
@@ -177,9 +183,8 @@ class _Run:
     def kept(self) -> str:
         """What there is of a run that is stopped, for people."""
         if self.step == 0:
-            return "no step was made, nothing was kept"
-        steps = counted(self.step, "step")
-        return f"{self.output} holds {steps}; the same command goes on from there"
+            return f"no step was made; weights in {self.output}, if there are any, are those of the start"
+        return f"{self.output} holds {counted(self.step, 'step')}; the same command goes on from there"
 
     def _planned(self) -> int:
         """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
@@ -233,8 +238,7 @@ class _Run:
         training = {"step": self.step, "validation": validation, "config": json.loads(config_json(self.config))}
         field = self.config.images.field_width
         # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
-        working_size = (field, field * 3 // 4)
-        save_weights(self._averaged(), weights_file(self.config, self.output), training, working_size)
+        save_weights(self._averaged(), weights_file(self.config, self.output), training, (field, field * 3 // 4))
 
     def _checkpoint(self) -> None:
         save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)

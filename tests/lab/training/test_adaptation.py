@@ -117,6 +117,7 @@ def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(tmp_path
     assert read_weights(result.weights).training["step"] == result.validation["step"]
     again = train(config, tmp_path)
     assert again.validation == result.validation
+    assert again.first == result.first == checkpoint.history.validations[0]
 
 
 def test_what_is_left_of_the_error_is_said():
