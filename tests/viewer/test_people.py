@@ -84,7 +84,7 @@ def test_steps_from_before_the_viewer_started_can_be_taken_back(people: People) 
 def test_beside_others_steps_from_before_are_left_to_the_history_and_that_is_said(people: People) -> None:
     people.project.apply("Accept", {Key.review(0): ACCEPTED})
     ann, bob = people.join(), people.join()
-    with pytest.raises(CartsError, match="No step of this tab is left to undo.*History"):
+    with pytest.raises(CartsError, match=r"No step of this tab is left to undo.*History"):
         people.undo(ann)
     people.go_to(bob, 0)
     assert _reviews(people)[0] == "untouched"
