@@ -94,15 +94,17 @@ class People:
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
-        """Take back somebody's last step; None if there is none at all.
+        """Take back somebody's last step; None if there is none, nor any of nobody's.
 
         Raises:
-            CartsError: others are at work, and none of the steps is this person's.
+            CartsError: others are at work, and there are only steps from before.
             ProjectError: it could not be saved, or somebody has changed the same since.
         """
         position, own = self.project.state.position, self._own(person)
         if not self.several and (own is None or own == position):
             return self.project.go_to(max(position - 1, 0))
+        if own is None and all(number in self._makers for number in range(1, position + 1)):
+            return None
         if own is None:
             raise CartsError(
                 "No step of this tab is left to undo. While several tabs are open each takes back its own; steps from "

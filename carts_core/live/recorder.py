@@ -81,7 +81,6 @@ class Recorder:
         if not self._edits:
             # Nothing came: the same command is to work again.
             remove_file(self._output / "sequence.toml")
-            self._folder.rmdir()
             return None
         path = (self._output / "sequence.toml").path
         project = Project.open(Sequence.open(path), path.with_suffix(".carts"))
