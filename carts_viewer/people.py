@@ -103,9 +103,9 @@ class People:
         position, own = self.project.state.position, self._own(person)
         if not self.several and (own is None or own == position):
             return self.project.go_to(max(position - 1, 0))
-        if own is None and all(number in self._makers for number in range(1, position + 1)):
-            return None
         if own is None:
+            if all(number in self._makers for number in range(1, position + 1)):
+                return None
             raise CartsError(
                 "No step of this tab is left to undo. While several tabs are open each takes back its own; steps from "
                 "before are under History."

@@ -19,7 +19,7 @@ from .predictor import FramePredictor
 _MARGIN, _NEAR = 16, 8
 """What the network is shown beyond the arms, and how far from them predictions count [px of the working image]."""
 
-_SHOWN, _TOLD = 2e-3, 0.3
+_SHOWN, _TELLING = 2e-3, 0.3
 """Share of the images from which an arm is judged by itself, and share of an arm where change has to tell something
 for its change to count [1]."""
 
@@ -87,7 +87,7 @@ def evidence(
         start_area=total(was) / was.numel(),
         loss=loss,
         predicted=_share(alone, rendered),
-        changed=_share_of_told(rendered, change),
+        changed=_share_of_telling(rendered, change),
         still_in_view=_still_in_view(images.renderer.segment(start), labels, len(end.joint_positions)),
         elsewhere=_elsewhere(images, labels, len(end.joint_positions), predictor),
         masked=predictor.masked,
@@ -145,7 +145,7 @@ def _of_arm(
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
-    if change is not None and _share(change[0], rendered) > _TOLD:
+    if change is not None and _share(change[0], rendered) > _TELLING:
         overlap = _overlap(rendered * change[0], change[1] * change[0] * here)
     return ArmEvidence(
         residual=2.0 * total((rendered - conditioned).square()) / max(total(rendered + conditioned), 1.0),
@@ -155,9 +155,9 @@ def _of_arm(
     )
 
 
-def _share_of_told(rendered: Tensor, change: tuple[Tensor, Tensor] | None) -> float | None:
+def _share_of_telling(rendered: Tensor, change: tuple[Tensor, Tensor] | None) -> float | None:
     """See `Evidence.changed`."""
-    if change is None or _share(change[0], rendered) <= _TOLD:
+    if change is None or _share(change[0], rendered) <= _TELLING:
         return None
     return _share(change[1], rendered * change[0])
 
