@@ -128,8 +128,11 @@ class LiveHandler:
         state = self._context.state.live
         assert state is not None
         text = f"{why} {run.statistics}."
-        self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
-        self._show(again=True)
+        try:
+            self._show(again=True)
+        finally:
+            # After the frame: nobody may see a frame of the stream as one of the recording.
+            self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
         if run.recorder is not None:
             self._context.change(live=replace(state, on=False, text=f"{text} {_written(run.recorder.close())}"))
 
