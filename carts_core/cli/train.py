@@ -25,7 +25,8 @@ class Train:
 
     def run(self) -> None:
         """Train to the end."""
-        from ..lab.training.training import TrainingProgress, train
+        from ..lab.training.progress import TrainingProgress
+        from ..lab.training.training import train
 
         check_device(self.training.device)
         console = Terminal()
@@ -44,12 +45,11 @@ class Train:
 
     def _adapt(self, recording: Path, console: Terminal) -> None:
         """Adapt the shipped network to a recording, saying each minute what is reached."""
-        from ..files import locked_folder
         from ..lab.training.adaptation import adapted_to, gain
-        from ..lab.training.training import TrainingProgress, train
+        from ..lab.training.progress import TrainingProgress
+        from ..lab.training.training import train
 
-        with locked_folder(self.output):
-            config = adapted_to(recording, self.output, self.training)
+        config = adapted_to(recording, self.output, self.training)
         said: dict[str, float] | None = None
 
         def report(progress: TrainingProgress) -> None:

@@ -5,6 +5,7 @@ import queue
 import threading
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, po
 from ..files import append_line, file_name, output_path, remove_file, write_bytes, write_text
 from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.scene import Scene
-from ..project import Edits, JointCorrection, Key, Project, Provenance
+from ..project import Edits, FitVerdict, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
 from ..recording.camera_motion import ORIENTATION, POSITION
 from .estimate import LiveVerdict
@@ -24,6 +25,20 @@ from .moments import mounts_of
 
 _WAITING = 32
 """Frames that wait for the disk; further ones are not recorded."""
+_AGAIN = "Fit the frame again, which takes longer than was left live."
+_VERDICTS = {
+    LiveVerdict.GOOD: FitVerdict("good", "Fitted live."),
+    LiveVerdict.DOUBTFUL: FitVerdict(
+        "doubtful",
+        "The image did not fit when it was followed live: this is what the frames before let expect.",
+        _AGAIN,
+        0.5,
+    ),
+    LiveVerdict.LOST: FitVerdict(
+        "failed", "The arms were lost when it was followed live, so joints are as measured.", _AGAIN, 1.0
+    ),
+}
+"""What is kept of each; the probabilities are not measured, they put the worst frames first."""
 
 
 class Recorder:
@@ -31,7 +46,8 @@ class Recorder:
 
     The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
     corrected ones, `camera_CAMERA.csv` with where each camera's mount was, `sequence.toml`, and at the end the project
-    `sequence.carts`. Each frame is on disk with its row.
+    `sequence.carts`. Each frame is on disk with its row. Where the arms were lost, joints are as measured and the
+    verdict is *failed*.
 
     Args:
         sequence: whose arms and cameras these are.
@@ -55,7 +71,7 @@ class Recorder:
         self._moving: set[str] = set()
         self._describe()
         self._waiting: queue.Queue[Tracked | None] = queue.Queue(_WAITING)
-        self._edits: list[dict[Key, JointCorrection]] = []
+        self._edits: list[Edits] = []
         self._error: Exception | None = None
         self.missed = 0
         self._thread = threading.Thread(target=self._write, name="carts-live-recorder", daemon=True)
@@ -123,19 +139,21 @@ class Recorder:
         for camera, image in frame.images.items():
             content = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
             write_bytes(self._output / "images" / file_name(camera) / f"{name}.png", content)
-        row = KinematicsRow(name, "optimized", estimate.joint_positions, estimate.joint_std, estimate.verdict.value)
-        lines = kinematics_csv(self._scene, [row]).splitlines()
-        measured = position_values(self._scene, KinematicsRow(name, "measured", frame.measured))
+        lost, verdict = estimate.verdict is LiveVerdict.LOST, _VERDICTS[estimate.verdict]
+        measured = KinematicsRow(name, "measured", frame.measured, {}, verdict.verdict)
+        corrected = KinematicsRow(name, "optimized", estimate.joint_positions, estimate.joint_std, verdict.verdict)
+        lines = kinematics_csv(self._scene, [measured if lost else corrected]).splitlines()
         if number == 0:
             columns = ",".join(["frame", "time", *joint_columns(self._scene)])
             append_line(self._output / "kinematics.csv", columns.encode())
             append_line(self._output / "corrected.csv", lines[0].encode())
         self._write_mounts(number, name, tracked)
-        values = ",".join([name, f"{estimate.time:.6f}", *(f"{value:.9f}" for value in measured)])
+        positions = (f"{value:.9f}" for value in position_values(self._scene, measured))
+        values = ",".join([name, f"{estimate.time:.6f}", *positions])
         append_line(self._output / "kinematics.csv", values.encode())
         append_line(self._output / "corrected.csv", lines[1].encode())
-        edits = {}
-        if estimate.verdict is not LiveVerdict.LOST:
+        edits: dict[Key[Any], Any] = {Key.verdict(number): verdict}
+        if not lost:
             for arm in self._scene.arms:
                 std = tuple(float(value) for value in estimate.joint_std[arm.name])
                 joints = tuple(float(value) for value in estimate.joint_positions[arm.name])

@@ -7,26 +7,32 @@ from pathlib import Path
 import numpy as np
 from moving import swing
 
+from carts_core.export.kinematics import read_kinematics_csv
 from carts_core.live.estimate import Effort, LiveEstimate, LiveVerdict
 from carts_core.live.loop import Tracked
 from carts_core.live.moments import Moment
 from carts_core.live.recorder import Recorder
-from carts_core.project import Provenance, Source
+from carts_core.project import Project, Provenance, Source
 from carts_core.recording import Sequence
 
 FRAMES = 4
 
 
-def record(sequence: Sequence, folder: Path, poses: list[dict[str, np.ndarray]]) -> Sequence:
-    """Record frames whose cameras are at poses, as they were sent, and open what was recorded."""
+def record(
+    sequence: Sequence, folder: Path, poses: list[dict[str, np.ndarray]], verdicts: tuple[LiveVerdict, ...] = ()
+) -> Sequence:
+    """Record frames whose cameras are at poses, as they were sent, and open what was recorded.
+
+    Joints are said to be .01 (rad, m) from what was measured.
+    """
     recorder = Recorder(sequence, ("left",), folder, Provenance(Source.HAND))
     for number, sent in enumerate(poses):
         frame = replace(sequence.frame(number), timestamp=0.1 * number)
-        joints = {arm: values.copy() for arm, values in frame.measured.items()}
+        joints = {arm: values + 0.01 for arm, values in frame.measured.items()}
         estimate = LiveEstimate(
             frame.frame_id,
             0.1 * number,
-            LiveVerdict.GOOD,
+            verdicts[number] if verdicts else LiveVerdict.GOOD,
             Effort.SMALL,
             0.01,
             sequence.scene.state(joints),
@@ -63,3 +69,22 @@ def test_where_no_frame_came_nothing_is_left(tiny_sequence: Callable[..., Path],
 def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     found = record(Sequence.open(tiny_sequence(frames=2)), tmp_path / "recorded", [{}, {}])
     assert not found.moving_cameras and len(found) == 2
+
+
+def test_verdicts_are_recorded_and_what_was_lost_is_as_measured(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=3))
+    said = (LiveVerdict.GOOD, LiveVerdict.DOUBTFUL, LiveVerdict.LOST)
+    found = record(sequence, tmp_path / "recorded", [{}, {}, {}], said)
+    project = Project.open(found, tmp_path / "recorded" / "sequence.carts", read_only=True)
+    verdicts = [project.state.verdict(index) for index in range(3)]
+    assert [verdict and verdict.verdict for verdict in verdicts] == ["good", "doubtful", "failed"]
+    assert [len(project.state.joints(index)) for index in range(3)] == [1, 1, 0]
+    project.close()
+    rows = read_kinematics_csv(tmp_path / "recorded" / "corrected.csv", found.scene)
+    assert [row.source for row in rows] == ["optimized", "optimized", "measured"]
+    assert [row.verdict for row in rows] == ["good", "doubtful", "failed"]
+    for index, off in enumerate((0.01, 0.01, 0.0)):
+        (values,) = rows[index].joint_positions.values()
+        np.testing.assert_allclose(values, found.frame(index).measured["PSM1"] + off, atol=1e-8)

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...files import output_path, write_bytes
+from ...files import locked_folder, output_path, write_bytes
 from ...recording import Sequence
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
@@ -31,21 +31,17 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
 
     Args:
         recording: sequence file; no image of it but the empty background is learnt from.
-        output: folder of the run.
+        output: folder of the run, which is made once the recording could be read.
         given: settings for everything else.
 
     Raises:
         SequenceError: the recording cannot be read.
         OutputError: `output` cannot be written to.
+        BusyError: another run writes there.
     """
     sequence = Sequence.open(recording)
-    found = 0
-    for camera in sequence.scene.cameras:
-        background = sequence.mean_background(camera.name)
-        if background.problem is None:
-            _, content = cv2.imencode(".png", background.image[..., ::-1])
-            write_bytes(output_path(output, BACKGROUNDS, f"{found}.png"), content.tobytes())
-            found += 1
+    with locked_folder(output):
+        found = _write_backgrounds(sequence, output)
     default, samples = TrainingConfig(), given.validation_samples
     robots = tuple(dict.fromkeys(arm.robot.urdf for arm in sequence.scene.arms))
     images = replace(
@@ -70,6 +66,18 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
         patience=_PATIENCE,
         images=images,
     )
+
+
+def _write_backgrounds(sequence: Sequence, output: Path) -> int:
+    """Write the empty backgrounds of a sequence's cameras; gives how many can be estimated."""
+    found = 0
+    for camera in sequence.scene.cameras:
+        background = sequence.mean_background(camera.name)
+        if background.problem is None:
+            _, content = cv2.imencode(".png", background.image[..., ::-1])
+            write_bytes(output_path(output, BACKGROUNDS, f"{found}.png"), content.tobytes())
+            found += 1
+    return found
 
 
 def gain(before: dict[str, float], now: dict[str, float]) -> str:

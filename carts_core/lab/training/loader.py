@@ -1,9 +1,13 @@
 """Training batches, made in worker processes while the network trains."""
 
+import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from itertools import count
+from multiprocessing.synchronize import Event
 from typing import Any
 
 import cv2
@@ -72,29 +76,46 @@ class _Samples(Dataset):
         self._alone = True
 
 
-def _leave_signals_to_parent(worker: int) -> None:
+def _outlive_signals(closing: Event, worker: int) -> None:
     """Signals to the whole process group stop the parent, which ends its workers once it has kept its work."""
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+    def end_if_closing(*_: object) -> None:
+        if closing.is_set():
+            # Not by an exception: what waits for the parent would be waited for.
+            os._exit(0)
+
+    signal.signal(signal.SIGTERM, end_if_closing)
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
 
-def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Batch]:
-    """Endless batches of the task's tensors.
+@contextmanager
+def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterator[Batch]]:
+    """Endless batches of the task's tensors, for as long as the context lasts; then the workers end.
 
     A batch depends on the seed, the number of workers and its own number, wherever the stream starts.
     """
+    # A forked child hangs in OpenMP as soon as the parent has used threads.
+    spawning = multiprocessing.get_context("spawn")
+    closing = spawning.Event()
     loader = DataLoader(
         _Samples(config),
         batch_size=config.batch_size,
         sampler=count(first_step * config.batch_size),
         num_workers=config.workers,
         prefetch_factor=2 if config.workers else None,
-        # A forked child hangs in OpenMP as soon as the parent has used threads.
-        multiprocessing_context="spawn" if config.workers else None,
-        worker_init_fn=_leave_signals_to_parent if config.workers else None,
+        multiprocessing_context=spawning if config.workers else None,
+        worker_init_fn=partial(_outlive_signals, closing) if config.workers else None,
     )
-    return map(tuple, loader)
+    others = multiprocessing.active_children()
+    batches = map(tuple, loader)
+    workers = [child for child in multiprocessing.active_children() if child not in others]
+    try:
+        yield batches
+    finally:
+        closing.set()
+        for worker in workers:
+            worker.terminate()
 
 
 def validation_set(config: TrainingConfig) -> Batch:

@@ -3,8 +3,8 @@
 import json
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from ...wording import counted
 from .checkpoint import History, load_checkpoint, save_checkpoint
 from .growth import grow
 from .loader import training_batches, validation_set
+from .progress import TrainingProgress, TrainingResult
 from .report import write_report
 from .task import Batch
 from .tasks import task_of
@@ -37,40 +38,6 @@ _MAY_CHANGE = (
     "validation_minutes",
     "patience",
 )
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """Where a run stands; one per logged step."""
-
-    step: int
-    """Steps done."""
-    steps: int
-    """Steps in all; an estimate in a run of limited time."""
-    loss: float
-    """Loss, averaged over the last steps."""
-    seconds_per_step: float
-    """Wall time per step [s]."""
-    validation: dict[str, float] | None
-    """The newest validation."""
-    first: dict[str, float] | None
-    """The first one of the run, wherever that was interrupted since."""
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """What a finished run leaves behind."""
-
-    weights: Path
-    """Weights file, ready for `FeatureExtractor.load`."""
-    report: Path
-    """The training report."""
-    validation: dict[str, float]
-    """Figures of the saved weights."""
-    first: dict[str, float] | None
-    """Figures of the run's first validation; None of a run that had none."""
-    seconds: float
-    """Wall time spent in training steps, over all resumed parts [s]."""
 
 
 def train(
@@ -138,31 +105,8 @@ class _Run:
             validation = self._validate(samples)
             progress(TrainingProgress(self.step, self._planned(), math.nan, math.nan, validation, validation))
         if self.step < self._planned() and not self._has_ended_gaining():
-            batches = training_batches(self.config, self.step)
-            sums: dict[str, float] = {}
-            count, self._clock = 0, time.perf_counter()
-            last = False
-            while not last:
-                batch = next(batches)
-                with finished_first():
-                    terms = self._train_step(batch)
-                for name, value in terms.items():
-                    sums[name] = sums.get(name, 0.0) + value
-                count += 1
-                last = self.step == self._planned()
-                if last or self._validation_due():
-                    validation = self._validate(samples)
-                    last = last or self._has_ended_gaining()
-                if last or count == _LOG_EVERY:
-                    means = {name: value / count for name, value in sums.items()}
-                    self.history.losses.append({"step": self.step, **means})
-                    elapsed = time.perf_counter() - self._clock
-                    self.history.seconds += elapsed
-                    reached = means["loss"], elapsed / count, validation, self.history.first
-                    progress(TrainingProgress(self.step, self._planned(), *reached))
-                    sums, count, self._clock = {}, 0, time.perf_counter()
-                if last or self.step % self.config.checkpoint_every == 0:
-                    self._checkpoint()
+            with training_batches(self.config, self.step) as batches:
+                validation = self._train_on(batches, samples, validation, progress)
         if self.config.patience is not None:
             validation = max(self.history.validations, key=lambda entry: entry[self.task.score])
         elif validation is None:
@@ -173,6 +117,40 @@ class _Run:
         report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
         weights = weights_file(self.config, self.output)
         return TrainingResult(weights, report, validation, self.history.first, self.history.seconds)
+
+    def _train_on(
+        self,
+        batches: Iterator[Batch],
+        samples: Batch,
+        validation: dict[str, float] | None,
+        progress: Callable[[TrainingProgress], None],
+    ) -> dict[str, float] | None:
+        """Train to the end; gives the newest validation, which is the given one where there was no other."""
+        sums: dict[str, float] = {}
+        count, self._clock = 0, time.perf_counter()
+        last = False
+        while not last:
+            batch = next(batches)
+            with finished_first():
+                terms = self._train_step(batch)
+            for name, value in terms.items():
+                sums[name] = sums.get(name, 0.0) + value
+            count += 1
+            last = self.step == self._planned()
+            if last or self._validation_due():
+                validation = self._validate(samples)
+                last = last or self._has_ended_gaining()
+            if last or count == _LOG_EVERY:
+                means = {name: value / count for name, value in sums.items()}
+                self.history.losses.append({"step": self.step, **means})
+                elapsed = time.perf_counter() - self._clock
+                self.history.seconds += elapsed
+                reached = means["loss"], elapsed / count, validation, self.history.first
+                progress(TrainingProgress(self.step, self._planned(), *reached))
+                sums, count, self._clock = {}, 0, time.perf_counter()
+            if last or self.step % self.config.checkpoint_every == 0:
+                self._checkpoint()
+        return validation
 
     def save(self) -> None:
         """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""

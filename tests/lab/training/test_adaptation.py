@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.errors import SettingsError
+from carts_core.errors import SequenceError, SettingsError
 from carts_core.lab.randomization.geometry import RobotGeometry
 from carts_core.lab.randomization.recorded import RecordedPlacements
 from carts_core.lab.training.adaptation import BACKGROUNDS, adapted_to, gain
@@ -94,6 +94,12 @@ def test_settings_come_from_the_recording_and_the_shipped_weights(tmp_path: Path
     assert config.images.photographs == tmp_path / BACKGROUNDS
     cameras = len(Sequence.open(sample_sequence()).scene.cameras)
     assert len(list((tmp_path / BACKGROUNDS).glob("*.png"))) == cameras
+
+
+def test_a_recording_that_is_not_there_leaves_no_folder(tmp_path: Path):
+    with pytest.raises(SequenceError, match="nowhere"):
+        adapted_to(tmp_path / "nowhere.toml", tmp_path / "run", TrainingConfig())
+    assert not (tmp_path / "run").exists()
 
 
 def test_options_that_are_given_are_kept(tmp_path: Path):

@@ -1,4 +1,5 @@
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -15,7 +16,8 @@ from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import ImageSettings
 from carts_core.lab.training.checkpoint import CHECKPOINT_FILE, load_checkpoint
 from carts_core.lab.training.loader import training_batches, validation_set
-from carts_core.lab.training.training import TrainingProgress, schedule, train
+from carts_core.lab.training.progress import TrainingProgress
+from carts_core.lab.training.training import schedule, train
 from carts_core.networks import FeatureExtractor
 from carts_core.networks.weights import read_weights
 from carts_core.settings import Architecture, TrainingConfig
@@ -180,8 +182,13 @@ def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
 def test_the_stream_of_batches_goes_on_where_a_run_was_stopped(workers_before: int, workers: int, reuse: int):
     # One worker process makes what none makes.
     before, after = (small_config(workers=count, reuse=reuse) for count in (workers_before, workers))
-    whole = list(islice(training_batches(before, first_step=0), 7))
-    later = list(islice(training_batches(after, first_step=4), 3))
+    with training_batches(before, first_step=0) as batches:
+        whole = list(islice(batches, 7))
+    with training_batches(after, first_step=4) as batches:
+        later = list(islice(batches, 3))
+    for worker in multiprocessing.active_children():
+        worker.join(20.0)
+    assert not multiprocessing.active_children()
     for left, right in zip(whole[4:], later, strict=True):
         images, classes = right
         assert images.shape == (2, 2, 3, 48, 64) and images.dtype == torch.uint8
@@ -209,7 +216,8 @@ def test_the_validation_set_is_always_the_same_and_not_the_training_stream():
     images, _ = validation_set(config)
     again, _ = validation_set(config)
     assert torch.equal(images, again)
-    first, _ = next(training_batches(config, first_step=0))
+    with training_batches(config, first_step=0) as batches:
+        first, _ = next(batches)
     assert not torch.equal(first[0], images[0])
 
 
