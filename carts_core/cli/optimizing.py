@@ -22,6 +22,7 @@ from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
+from .constant_corrections import constant_correction_hint
 from .frame_folder import FrameFolder, FrameResult
 from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints
 from .observing import RECORDING
@@ -115,6 +116,7 @@ class Optimizing:
             # A kill between the last result and the end leaves it.
             remove_file(output.checkpoint)
         if todo:
+            print_hints(self._console, constant_correction_hint(part.name, sequence, output.rows))
             self._console.print(
                 f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
             )
