@@ -25,7 +25,7 @@ from carts_viewer.networks import STARTED, Networks
 from carts_viewer.running import OptimizerFactory
 
 SMALL = (
-    "--steps 2 --batch-size 1 --workers 0 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
+    "--steps 2 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
     "--images.field-width 64"
 ).split()
 OVER = 120.0

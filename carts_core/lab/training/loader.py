@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import count
@@ -107,15 +107,18 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterat
         multiprocessing_context=spawning if config.workers else None,
         worker_init_fn=partial(_outlive_signals, closing) if config.workers else None,
     )
-    others = multiprocessing.active_children()
-    batches = map(tuple, loader)
-    workers = [child for child in multiprocessing.active_children() if child not in others]
+    batches = _stream(loader)
     try:
         yield batches
     finally:
         closing.set()
-        for worker in workers:
-            worker.terminate()
+        batches.close()
+
+
+def _stream(loader: DataLoader) -> Generator[Batch]:
+    """The loader's batches; closing it drops the loader's iterator, which ends its workers."""
+    for batch in loader:
+        yield tuple(batch)
 
 
 def validation_set(config: TrainingConfig) -> Batch:
