@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from ...optimization.observability import Uncertainty
 from ...recording import Frame
 from ...rendering import Renderer
 from .machine import machine
-from .measurement import Measurement, Score
+from .measurement import BEST_OF, Measurement, Score
 from .methods import METHODS
 from .scope import Run
 
@@ -99,6 +99,12 @@ class Truth:
             seconds=seconds,
             nsd_wide=self._wide(mask) if whole else None,
         )
+
+    def with_wide(self, score: Score, state: SceneState, renderer: Renderer) -> Score:
+        """The score of an estimate, with the second surface distance where that was left out."""
+        if score.nsd_wide is not None:
+            return score
+        return replace(score, nsd_wide=self._wide(renderer.segment(state.to("cpu"))[0] >= 0))
 
     def within(
         self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
@@ -241,16 +247,24 @@ def _followed(
     """The scores of all iterates, for each the place of the best one then, and the seconds with those until then."""
     trace: list[Score] = []
     best: list[int] = []
+
+    def complete() -> None:
+        if optimizer.best is not None:
+            trace[best[-1]] = truth.with_wide(trace[best[-1]], optimizer.best.state, renderer)
+
     while True:
         began = time.perf_counter()
         iterate = optimizer.step()
         seconds += time.perf_counter() - began
         if iterate is None:
+            complete()
             return trace, best, seconds
         best.append(len(trace) if optimizer.best is iterate else best[-1])
-        known, first = iterate.uncertainty, not trace
+        known, steps = iterate.uncertainty, len(trace)
         loss = None if isinstance(optimizer.settings, SurfaceSolver) else iterate.loss
-        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, whole=first))
+        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, whole=not steps))
+        if steps in BEST_OF:
+            complete()
 
 
 def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:

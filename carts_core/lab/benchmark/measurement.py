@@ -6,6 +6,9 @@ from typing import Any
 
 from .scope import Run
 
+BEST_OF = (30, 50)
+"""Steps after which the best iterate has a row of its own in the tables."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -26,7 +29,8 @@ class Score:
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
     nsd_wide: float | None = None
-    """The same as `nsd` within `frame.WIDE_TOLERANCE`; None on the way from start to end."""
+    """The same as `nsd` within `frame.WIDE_TOLERANCE`; None on the way from start to end, but for what the optimizer
+    held for the best at the end, or after so many steps as `BEST_OF` says."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from .frame import TOLERANCE
 from .further_tables import calibration_table, camera_table, occlusion_table, room_table, sequence_table
 from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
 from .image_alone import image_alone_table
-from .measurement import Measurement
+from .measurement import BEST_OF, Measurement
 from .page import PAGE
 from .speed_tables import pair_table, speed_table, stage_table, worse_table
 from .statistics import Measurements
@@ -131,7 +131,7 @@ def _known(*tables: Table | None) -> list[Table]:
 def _row(measurement: Measurement) -> dict[str, object]:
     """One run, flat."""
     start, final = measurement.start, measurement.final
-    bests = {steps: measurement.best_of(steps) for steps in (30, 50)}
+    bests = {steps: measurement.best_of(steps) for steps in BEST_OF}
     return {
         **asdict(measurement.run),
         "dice_start": start and start.dice,

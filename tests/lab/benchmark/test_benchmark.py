@@ -62,6 +62,8 @@ def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothin
     by_method = {measurement.run.method: measurement for measurement in measurements}
     assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
     assert 1 <= by_method["ours"].iterations <= 2
+    best = by_method["paper"].best_of(2)
+    assert best is not None and best.nsd_wide is not None and 0.0 <= best.nsd <= best.nsd_wide <= 1.0
     held, posed = by_method["stereo"], by_method["stereo_posed"]
     assert replace(posed.run, method="stereo") == held.run and posed.final.dice != held.final.dice
     for measurement in measurements:
