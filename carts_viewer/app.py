@@ -61,7 +61,7 @@ class ViewerApp:
         self.scene = sequence.scene
         self.project = storage.project
         self._storage = storage
-        renderer = OverlayRenderer(sequence, device)
+        renderer = OverlayRenderer(sequence)
         queue: IntentQueue[Tab] = IntentQueue()
         self._optimizers = OptimizerFactory(
             weights=weights, device=device, inference=inference, segmenter=segmenter, report=self._say
@@ -103,7 +103,7 @@ class ViewerApp:
             project: The project file, begun if it is not there; None for the default place.
             host: The address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
-            device: Where to render and optimize, say `cpu` or `cuda`.
+            device: Where the networks run, say `cpu` or `cuda`.
             inference: Who runs the surface network.
             weights: Weights files; a network that none is given of is the shipped one.
             segmenter: Segments what people point at; None for the one that ships.

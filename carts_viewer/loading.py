@@ -32,7 +32,7 @@ class NetworkLoader:
         """
         Args:
             weights: Weights files; a network that none is given of is the shipped one.
-            device: Where to compute.
+            device: Where the networks run.
             inference: Who runs the surface network.
             segmenter: Segments what people point at; None for the one that ships.
             report: Called with a line for people about what takes long.

@@ -20,10 +20,9 @@ from carts_viewer.state import Maps, Scores
 class OverlayRenderer:
     """Renders poses into the scene's cameras; keeps one renderer per camera."""
 
-    def __init__(self, sequence: Sequence, device: str | torch.device = "cpu") -> None:
+    def __init__(self, sequence: Sequence) -> None:
         self._scene = sequence.scene
         self._measured_joints = sequence.measured_joints
-        self._device = device
         self._renderers: dict[str, Renderer] = {}
         self._last: dict[str, tuple[SceneState, layers.ArmIds]] = {}
 
@@ -31,7 +30,7 @@ class OverlayRenderer:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
         # Overlay and scores of one pose are asked for one after the other.
         if camera not in self._last or self._last[camera][0] is not state:
-            self._last[camera] = (state, self._renderer(camera).segment(state.to(self._device))[0])
+            self._last[camera] = (state, self._renderer(camera).segment(state.to("cpu"))[0])
         return self._last[camera][1]
 
     def classes(
@@ -41,7 +40,7 @@ class OverlayRenderer:
 
         What was added to the mask where nothing is rendered at all has no class.
         """
-        rendered = self._renderer(camera).segment_links(state.to(self._device))[0]
+        rendered = self._renderer(camera).segment_links(state.to("cpu"))[0]
         classes = np.append(link_classes(self._scene.arms), 0)
         links = rendered
         if correction is not None and (rendered >= 0).any():
@@ -99,7 +98,7 @@ class OverlayRenderer:
 
     def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
         """The point of the arm that is seen at a pixel, or the nearest within `radius` [px]; None without one."""
-        return pick_point(self._scene, self._renderer(camera), state.to(self._device), pixel, radius)
+        return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
         """How close the pose and its corrected mask are to the frame's truth, as far as there is one."""
@@ -115,7 +114,7 @@ class OverlayRenderer:
 
     @torch.no_grad()
     def _shaded(self, state: SceneState, camera: str, opacity: float) -> layers.Rgba:
-        rendering = self._renderer(camera)(state.to(self._device))
+        rendering = self._renderer(camera)(state.to("cpu"))
         arm_ids = rendering.arm_ids[0].cpu().numpy()
         self._last[camera] = (state, arm_ids)
         return layers.shaded(rendering.image[0].cpu().numpy(), arm_ids, opacity)
@@ -123,7 +122,5 @@ class OverlayRenderer:
     def _renderer(self, camera: str) -> Renderer:
         if camera not in self._renderers:
             own = self._scene.camera(camera)
-            self._renderers[camera] = Renderer(
-                self._scene, width=own.width, height=own.height, cameras=[camera], device=self._device
-            )
+            self._renderers[camera] = Renderer(self._scene, width=own.width, height=own.height, cameras=[camera])
         return self._renderers[camera]

@@ -47,7 +47,7 @@ class OptimizerFactory(NetworkLoader):
             return self.prepare()
         network = None if target.observed.what == "masks" else NetworkPredictor(self.prepare())
         masks, name = (None, "mask") if target.given is None else (target.given.masks, target.given.origin)
-        return MaskPredictor(network, masks, self._device, name)
+        return MaskPredictor(network, masks, name)
 
     def provenance(
         self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters, target: Target = NETWORK

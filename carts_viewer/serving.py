@@ -44,7 +44,7 @@ def serve(
         folders: From where masks may be imported, besides the sequence's own folder.
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
-        device: Where to render and optimize, say `cpu` or `cuda`.
+        device: Where the networks run, say `cpu` or `cuda`.
         inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
         segmenter: Segments what people point at; None for the one that ships.
@@ -92,7 +92,7 @@ def serve_site(
         folders: What the page may look into, and nothing outside.
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
-        device: Where to render and optimize, say `cpu` or `cuda`.
+        device: Where the networks run, say `cpu` or `cuda`.
         inference: Who runs the surface network.
         weights: Weights files; a network that none is given of is the shipped one.
         segmenter: Segments what people point at; None for the one that ships.

@@ -154,7 +154,7 @@ class Observing(Network):
         given = self._given(sequence)
         masks, origin = (None, "mask") if given is None else (given.masks, given.origin)
         if self.observe == "masks":
-            only = MaskPredictor(None, masks, self.processor, origin)
+            only = MaskPredictor(None, masks, origin=origin)
             return Observer(only, "", masked=True, given=given, every=True)
         extractor = self.load()
         if self.observe == "both":

@@ -124,8 +124,9 @@ class Network:
     weights: tuple[Path, ...] = ()
     """Weights files; a network that none is given of is the shipped one."""
     device: str = "cpu"
-    """`cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU the surface network is run by torch or ONNX Runtime
-    (the same to 1e-4), whichever was faster when it was measured here, once; `cpu:torch` and `cpu:onnx` name one."""
+    """`cpu`, or a CUDA device such as `cuda` or `cuda:1` for the networks. On a CPU the surface network is run by torch
+    or ONNX Runtime (the same to 1e-4), whichever was faster when it was measured here, once; `cpu:torch` and `cpu:onnx`
+    name one."""
 
     def __post_init__(self) -> None:
         if self.device not in _ENGINES:
@@ -133,7 +134,7 @@ class Network:
 
     @property
     def processor(self) -> str:
-        """Device that pixels are on, as torch names it."""
+        """Device of the networks, as torch names it."""
         return "cpu" if self.device in _ENGINES else self.device
 
     @property

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..errors import WeightsError
 from ..resources import shipped_weights
 from ..settings.inference import Inference
-from .inference import surface_engine
+from .inference import full_precision, surface_engine
 from .network import FeatureNetwork, UNet
 from .surface_network import SurfaceNetwork
 from .weights import Weights, read_weights
@@ -105,9 +105,11 @@ class FeatureExtractor:
     ) -> Float[Tensor, "batch 6 h w"]:
         """Surface maps of what images show, given those of where the arms are expected.
 
-        Arguments and errors as `SurfaceNetwork.forward`.
+        They are where the images are, wherever the network runs. Arguments and errors as `SurfaceNetwork.forward`.
         """
         if self._faster is not None:
             self._surface.check_input(images, 3)
             return self._faster(images, given)
-        return self._surface(images.contiguous(memory_format=torch.channels_last), given).map()
+        there = images.to(self.device, memory_format=torch.channels_last)
+        with full_precision(self.device):
+            return self._surface(there, given.to(self.device)).map().to(images.device)

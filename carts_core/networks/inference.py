@@ -4,6 +4,7 @@ import json
 import platform
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -68,6 +69,13 @@ def surface_engine(
     if wanted == "auto" and _remembered(network, sha256, found) == "torch":
         return "torch", None
     return "onnx", found
+
+
+def full_precision(device: torch.device) -> AbstractContextManager[None]:
+    """Within it convolutions on a GPU are as exact as on a CPU; PyTorch's default has cuDNN round to 10 bits (TF32)."""
+    if device.type != "cuda":
+        return nullcontext()
+    return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
 
 
 def _missing(device: torch.device) -> str | None:

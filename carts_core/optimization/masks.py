@@ -48,7 +48,6 @@ class MaskPredictor:
     Args:
         network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
         masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
-        device: where it computes, without a network.
         origin: what errors call a mask.
     """
 
@@ -56,11 +55,10 @@ class MaskPredictor:
         self,
         network: SurfacePredictor | None = None,
         masks: Callable[[int], Mapping[str, GivenMask]] | None = None,
-        device: torch.device | str = "cpu",
         origin: str = "mask",
     ) -> None:
         self._network, self._masks, self._origin = network, masks, origin
-        self.device = torch.device(device) if network is None else network.device
+        self.device = torch.device("cpu")
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
         """The predictor of one frame.

@@ -86,8 +86,9 @@ class NetworkPredictor(ImagePredictor):
 
     @property
     def device(self) -> torch.device:
-        """See `FramePredictor`."""
-        return self.extractor.device
+        """The CPU, wherever the network runs. The rest of a frame is thousands of small operations; a GPU would wait
+        between them."""
+        return torch.device("cpu")
 
     @property
     def stride(self) -> int:

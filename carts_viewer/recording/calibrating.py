@@ -57,7 +57,7 @@ class CalibrationJob:
             sequence: the recording.
             scene: its arms and cameras, with the calibration to begin with.
             weights: weights files.
-            device: where to compute.
+            device: where the networks run.
             inference: who runs the surface network.
             report: called on the job's thread with every progress, the last one `ended`.
         """

@@ -55,7 +55,7 @@ class HandEyeStep:
         panel = host.page.server.gui.main_panel
         panel.dock_left()
         panel.set_width(_WIDTH)
-        self._picture = FramePicture(host.page, self._sequence, host.device)
+        self._picture = FramePicture(host.page, self._sequence)
 
     def close(self) -> None:
         """Stop a calibration, and take the picture away."""

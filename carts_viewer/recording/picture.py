@@ -21,10 +21,10 @@ _OPACITY = 0.9
 class FramePicture:
     """What lies behind the document at its side."""
 
-    def __init__(self, page: Page, sequence: Sequence, device: str) -> None:
+    def __init__(self, page: Page, sequence: Sequence) -> None:
         self._page = page
         self._sequence = sequence
-        self._renderer = OverlayRenderer(sequence, device)
+        self._renderer = OverlayRenderer(sequence)
         self._shown: tuple[int, str] | None = None
         frame = sequence.frame(0)
         state = sequence.scene.state(frame.measured, mounts=frame.mounts)

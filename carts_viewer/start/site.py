@@ -60,7 +60,7 @@ class Site:
             batch: folder of the batch that is shown first.
             host: the address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
-            device: where to render and optimize.
+            device: where the networks run.
             inference: who runs the surface network.
             weights: weights files.
             segmenter: segments what people point at; None for the one that ships.

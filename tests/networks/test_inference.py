@@ -55,6 +55,13 @@ def test_onnx_predicts_what_torch_predicts(weights: Path, size: tuple[int, int],
     )
 
 
+@pytest.mark.gpu
+def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_are() -> None:
+    images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
+    here, there = (FeatureExtractor.load(device=device).surface(images, given) for device in ("cpu", "cuda"))
+    torch.testing.assert_close(there, here, atol=inference.TOLERANCE, rtol=0)
+
+
 def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
     images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
     before, found = torch.get_num_threads(), []

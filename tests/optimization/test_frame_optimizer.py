@@ -12,6 +12,7 @@ from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
+from carts_core.optimization.predictor import predictor_of
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import Loss, solver
@@ -131,6 +132,24 @@ def test_the_default_solver_raises_dice_on_every_device(sequence: Sequence, devi
             for iterate in (first, last)
         )
         assert after > before
+
+
+@pytest.mark.gpu
+def test_joints_are_the_same_wherever_the_network_runs(sequence: Sequence) -> None:
+    here, there = (
+        list(optimizer_of(sequence, FeatureExtractor.load(device=device), settings=SurfaceSolver()))[-1]
+        for device in ("cpu", "cuda")
+    )
+    assert np.allclose(here.joint_positions()["PSM1"], there.joint_positions()["PSM1"], atol=1e-3)
+
+
+def test_rendering_and_solving_stay_on_the_cpu_where_the_network_is_elsewhere(sequence: Sequence) -> None:
+    elsewhere = FeatureExtractor.load(device="meta")
+    assert elsewhere.device.type == "meta"
+    assert predictor_of(elsewhere).device.type == "cpu"
+    # A network on this device computes nothing: all goes well until what it says is to come back.
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        list(optimizer_of(sequence, elsewhere, settings=SurfaceSolver()))
 
 
 def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: FeatureExtractor) -> None:

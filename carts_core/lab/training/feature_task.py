@@ -61,7 +61,7 @@ class FeatureTask:
         """Example predictions of a folded network."""
         rows = []
         for pair, truth in zip(batch[0].float() / 255, batch[1].cpu().numpy() > 0, strict=True):
-            features = network.features(pair)
+            features = network.features(pair.to(next(network.parameters()).device))
             predicted = (network.head(features)[:, 0] > 0).cpu().numpy()
             similarity = functional.cosine_similarity(features[:1], features[1:], dim=1)[0].cpu().numpy()
             shown = pair.permute(0, 2, 3, 1).cpu().numpy()

@@ -20,6 +20,7 @@ from .task import Batch, byte_tensor, flips
 from .validation import pooled_dice
 
 _SMOOTH = 0.2
+_AT_ONCE = 8
 
 
 class SurfaceTask:
@@ -77,7 +78,7 @@ class SurfaceTask:
     def validate(self, network: SurfaceNetwork, batch: Batch) -> dict[str, float]:
         """Figures of a folded network."""
         images, given, surface = _floats(batch)
-        seen = torch.cat([network(images[i : i + 8], given[i : i + 8]).map() for i in range(0, len(images), 8)])
+        seen = _seen(network, images, given)
         true, guess = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (surface, seen))
         known = given[:, COVERAGE].sum(1) > 0.5
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
@@ -93,7 +94,7 @@ class SurfaceTask:
     def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
         """Example predictions of a folded network."""
         images, given, surface = _floats(batch)
-        seen = network(images, given).map()
+        seen = _seen(network, images, given)
         rows = []
         for image, wrong, found, true in zip(images, given, seen, surface, strict=True):
             rows.append(
@@ -113,6 +114,13 @@ def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     images, given, surface = batch
     images = (images.float() / 255).contiguous(memory_format=torch.channels_last)
     return images, given.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
+
+
+def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
+    """What the network sees in many images, where these are; it may be on another device."""
+    device = next(network.parameters()).device
+    parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)
+    return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])
 
 
 def _part_dice_loss(
