@@ -107,8 +107,10 @@ def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(
     events: list[TrainingProgress] = []
     config = small_config(steps=100_000, minutes=0.05, validation_every=1_000)
     result = train(config, tmp_path, events.append)
-    assert result.seconds >= 2.5
-    assert 1 < events[-1].step == events[-1].steps < 100_000
+    steps = events[-1].step
+    assert 1 < steps == events[-1].steps < 100_000
+    # At the pace that it had, one more step would have been too late.
+    assert result.seconds * (steps + 1) / steps >= 60 * 0.05
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None and checkpoint.step == events[-1].step
     assert checkpoint.history.losses[-1]["step"] == checkpoint.step
