@@ -10,6 +10,7 @@ from planted import contents, treasure
 from carts_core.cli.command_line import BAD_INPUT, main
 
 SMALL = ["--endoscope.width", "48", "--endoscope.height", "36", "--motion.frames", "1", "--domains", "regular"]
+SMALL += ["--render.samples", "1", "--render.tissue-resolution", "64", "--render.texture-resolution", "64"]
 OPTIONS = ("--name", "--robot", "--tip-link", "--domains")
 
 
