@@ -49,7 +49,7 @@ def write_annotations(
     """Write images, and the file of annotations that CVAT and Datumaro look for under this name.
 
     Args:
-        dataset, folder, monitor: what is written where, and who is told.
+        dataset, folder, monitor: what is written where, and who hears of progress.
         kind: `instances` or `person_keypoints`, as COCO names its files.
         categories: as COCO has them.
         annotate: the objects of a view, without their numbers.

@@ -121,9 +121,8 @@ class FrameOptimizer:
         self._scene = scene = scene.with_cameras(cameras)
         self._arm_names = tuple(arm.name for arm in scene.arms)
         self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
-        surface = isinstance(settings, SurfaceSolver)
-        device = predictor_of(networks).device if surface else networks.device
-        state = scene.state(frame.measured if start is None else start, device, frame.mounts)
+        source = predictor_of(networks) if isinstance(settings, SurfaceSolver) else networks
+        state = scene.state(frame.measured if start is None else start, source.device, frame.mounts)
         self._free = free or FreeParameters()
         self._variables = Variables(scene, state, self._free, settings.length_scale)
         known = backgrounds if isinstance(backgrounds, Backgrounds) else Backgrounds(backgrounds)

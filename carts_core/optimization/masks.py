@@ -58,7 +58,7 @@ class MaskPredictor:
         origin: str = "mask",
     ) -> None:
         self._network, self._masks, self._origin = network, masks, origin
-        self.device = torch.device("cpu")
+        self.device = torch.device("cpu") if network is None else network.device
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
         """The predictor of one frame.

@@ -33,7 +33,7 @@ def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
 
 
 def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Tensor, "3 h w"]:
-    """An image of five with a flat veil of smoke from the diamond-square algorithm, the others as they are."""
+    """An image of five with a flat layer of smoke from the diamond-square algorithm, the others as they are."""
     if rng.random() >= SMOKE_SHARE:
         return image
     height, width = image.shape[1:]
