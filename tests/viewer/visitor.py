@@ -1,15 +1,23 @@
 """Somebody at the start page and in New recording: chooses, clicks in the picture, and counts the clicks."""
 
 import csv
-from collections.abc import Iterable, Sequence
+import re
+import sys
+import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from playwright.sync_api import Locator, Page
+from playwright.sync_api import Error, Locator, Page
 
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_viewer.start.site import Site
 
+_DRAWS = """new Promise((done) => {
+  requestAnimationFrame(() => done(true));
+  setTimeout(() => done(false), 2000);
+})"""
 _YAML = """image_width: {width}
 image_height: {height}
 camera_name: {name}
@@ -49,6 +57,8 @@ class Visitor:
     def __init__(self, site: Site, page: Page) -> None:
         self.site, self.page = site, page
         self.clicks = 0
+        self._errors: list[str] = []
+        page.on("pageerror", lambda error: self._errors.append(f"{error}\n{error.stack}"))
         page.goto(site.url)
 
     def button(self, name: str) -> Locator:
@@ -57,7 +67,8 @@ class Visitor:
 
     def press(self, name: str, timeout: float = 60.0) -> None:
         """Press a button as soon as it is there; `timeout` in [s]."""
-        self.button(name).click(timeout=1e3 * timeout)
+        with self._explained():
+            self.button(name).click(timeout=1e3 * timeout)
         self.clicks += 1
 
     def press_entry(self, text: str) -> None:
@@ -65,9 +76,16 @@ class Visitor:
         self.page.locator("main .files button").filter(has_text=text).first.click()
         self.clicks += 1
 
+    def press_folder(self, name: str) -> None:
+        """Press a folder of the file browser, and wait until it is the one that is looked into."""
+        self.press_entry(f"{name}/")
+        with self._explained():
+            self.page.locator("main .bar code").filter(has_text=re.compile(rf"/{re.escape(name)}$")).wait_for()
+
     def reads(self, text: str, timeout: float = 60.0) -> None:
         """Wait until this is to be read; `timeout` in [s]."""
-        self.page.locator("main").get_by_text(text).first.wait_for(timeout=1e3 * timeout)
+        with self._explained():
+            self.page.locator("main").get_by_text(text).first.wait_for(timeout=1e3 * timeout)
 
     def dismiss_warning(self) -> None:
         """Take away viser's note that there is no graphics card, where it lies over the picture."""
@@ -86,3 +104,18 @@ class Visitor:
         assert 0 <= pixel[0] <= size[0] and 0 <= pixel[1] <= size[1], f"{pixel} is not in the picture"
         self.page.mouse.click(x, y)
         self.clicks += 1
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """What fails inside says what the page and the site were doing."""
+        try:
+            yield
+        except Error as error:
+            error.add_note("Errors of the page: " + ("\n".join(self._errors) or "none"))
+            working = sys._current_frames().get(self.site._thread.ident or 0)
+            error.add_note("The site's thread:\n" + "".join(traceback.format_stack(working)[-8:]))
+            error.add_note(f"The site shows {type(self.site.place).__name__}: {self.site.document.content[:300]}")
+            error.add_note(f"The page shows: {self.page.locator('main').inner_text(timeout=5e3)[:300]}")
+            connected = self.page.evaluate("Boolean(window.carts.connected())")
+            error.add_note(f"It is connected: {connected}; it draws: {self.page.evaluate(_DRAWS)}")
+            raise
