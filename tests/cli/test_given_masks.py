@@ -89,8 +89,8 @@ def test_a_calibration_fits_imported_masks(
     main(["import-masks", str(sequence), str(theirs)])
     output = tmp_path / "out"
     main(["calibrate", str(sequence), "--observe", "masks", "--masks", "imported", "--output", str(output)])
-    told = json.loads((output / "export.json").read_text())
-    assert (told["observed"], told["masks"], told["weights"]) == ("masks", "imported", "")
+    summary = json.loads((output / "export.json").read_text())
+    assert (summary["observed"], summary["masks"], summary["weights"]) == ("masks", "imported", "")
     before, after = (float(word) for word in said(capsys).split("mean Dice of these frames ")[1].split()[0:3:2])
     assert after > before and after > 0.95
 

@@ -52,8 +52,8 @@ def test_images_lie_beside_their_labels_and_can_be_left_out(dataset: Dataset, tm
 
 def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
     said = replace(dataset.frames[2], verdict="doubtful", review="accepted", dice=0.93)
-    told = replace(dataset, frames=(*dataset.frames[:2], said))
-    summary = json.loads((export(told, "coco", tmp_path / "out") / "export.json").read_text(encoding="utf-8"))
+    marked = replace(dataset, frames=(*dataset.frames[:2], said))
+    summary = json.loads((export(marked, "coco", tmp_path / "out") / "export.json").read_text(encoding="utf-8"))
     assert (summary["format"], summary["sequence"], summary["domain"]) == ("coco", "tiny", "regular")
     assert summary["views"][2] == {
         "name": dataset.steps[2][0],

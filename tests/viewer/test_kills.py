@@ -87,7 +87,7 @@ class Lives:
         self.tally.acknowledged_exports += len(client.exported)
 
     def _check_project(self, client: Client) -> None:
-        """Open the project as the next server would, and check what this life's client was told."""
+        """Open the project as the next server would, and check what this life's client has heard."""
         with Project.open(self._sequence, self._project_path) as project:
             assert project.writable
             steps = [step.name for step in project.state.steps]

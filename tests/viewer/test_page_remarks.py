@@ -48,14 +48,14 @@ def test_the_timeline_drops_an_old_verdict_while_a_run_moves_the_frame_and_bring
     eventually(lambda: app.state.verdict, lambda verdict: verdict is not None, timeout=90)
     # The button says why it cannot be pressed.
     expect(tab.page.get_by_role("button", name="The fit is checked", exact=True)).to_be_disabled()
-    told = eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit > 0)
+    shown = eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit > 0)
     tab.place_in_viewer.put(intents.Step())
     eventually(lambda: app.state.run.phase, lambda phase: phase is Phase.PAUSED, timeout=90)
     assert app.state.unsaved
     eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit == 0)
     expect(check).to_be_enabled()
     tab.place_in_viewer.put(intents.Reset())
-    eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit == told)
+    eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit == shown)
 
 
 def test_with_a_range_solving_and_exporting_say_what_they_are_about(

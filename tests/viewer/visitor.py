@@ -73,7 +73,8 @@ class Visitor:
 
     def press_entry(self, text: str) -> None:
         """Press a line of the file browser."""
-        self.page.locator("main .files button").filter(has_text=text).first.click()
+        with self._explained():
+            self.page.locator("main .files button").filter(has_text=text).first.click()
         self.clicks += 1
 
     def press_folder(self, name: str) -> None:

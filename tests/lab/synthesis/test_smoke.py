@@ -70,10 +70,10 @@ def test_smoke_moves() -> None:
 def test_the_overlay_is_blind_to_depth_but_smooth_and_never_dark() -> None:
     overlay = SmokeOverlay(0.5, np.random.default_rng(1))
     black = np.zeros((H, W, 3), np.uint8)
-    veil = overlay.over(black)
-    assert np.array_equal(veil, overlay.over(black))
-    assert 60 < veil.mean() < 150
-    assert veil.std() > 10
+    layer = overlay.over(black)
+    assert np.array_equal(layer, overlay.over(black))
+    assert 60 < layer.mean() < 150
+    assert layer.std() > 10
     white = np.full((H, W, 3), 205, np.uint8)
     assert np.array_equal(overlay.over(white), white)
-    assert not np.array_equal(overlay.over(black, time=1.0), veil)
+    assert not np.array_equal(overlay.over(black, time=1.0), layer)
