@@ -1,7 +1,7 @@
-"""How the two packages are built: no modules that import one another in a circle, none too long to be read at once."""
+"""Import structure of the two packages."""
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -9,10 +9,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("carts_core", "carts_viewer")
-LONGEST_MODULE = 300
-LONGEST_FUNCTION = 60
-SHORT = (*PACKAGES, "tools", "docs", ".ci", "examples")
-"""Folders in which modules and functions keep to these lengths."""
 
 
 def _sources() -> dict[str, Path]:
@@ -49,16 +45,6 @@ def cycle(graph: Mapping[str, set[str]]) -> list[str]:
     return []
 
 
-def too_long(name: str, source: str) -> Iterator[str]:
-    """What of a module is longer than it may be."""
-    if len(source.splitlines()) > LONGEST_MODULE:
-        yield name
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
-            if node.end_lineno - node.lineno + 1 > LONGEST_FUNCTION:
-                yield node.name
-
-
 def test_no_module_imports_itself_through_others() -> None:
     sources = _sources()
     modules = frozenset(sources)
@@ -90,24 +76,6 @@ def test_a_circle_of_two_modules_is_found(second: str) -> None:
 
 def test_modules_that_only_share_a_third_one_are_no_circle() -> None:
     assert cycle({"p.a": {"p.c"}, "p.b": {"p.c", "p.a"}, "p.c": set()}) == []
-
-
-def test_no_module_and_no_function_is_too_long() -> None:
-    paths = [path for folder in SHORT for path in (ROOT / folder).rglob("*.py") if "_build" not in path.parts]
-    assert len(paths) > 300
-    found = [
-        f"{name}: {what}"
-        for path in paths
-        for name in [path.relative_to(ROOT).as_posix()]
-        for what in too_long(name, path.read_text(encoding="utf-8"))
-    ]
-    assert found == []
-
-
-def test_a_long_module_and_a_long_function_are_found() -> None:
-    assert list(too_long("m.py", "x = 1\n" * 301)) == ["m.py"]
-    assert list(too_long("m.py", "def f():\n" + "    x = 1\n" * 60)) == ["f"]
-    assert not list(too_long("m.py", "def f():\n" + "    x = 1\n" * 59))
 
 
 def test_every_test_module_has_a_name_of_its_own() -> None:
