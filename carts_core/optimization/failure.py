@@ -22,7 +22,7 @@ class ArmEvidence:
 _WITHOUT_CHANGE = (0.13, 23.8, 1.5, -3.25, -0.44)
 _WITH_CHANGE = (0.99, 27.9, 0.81, -1.84, -0.42, -2.85)
 """Bias, and weights of loss, residual, agreement, unconditioned (and overlap with change) in the log odds of a failure:
-logistic regressions over 503 frames of known truth, see docs/experiments; none of them is held out."""
+logistic regressions over 503 frames of known truth, see docs/explanation/decisions.md; none of them is held out."""
 
 _LEAST_CHANGE, _CHANGE_SLOPE = 0.6, 40.0
 """Overlap with change that every right fit had, and how fast the log odds rise below it."""

@@ -90,7 +90,7 @@ class FrameImages:
             size=size,
             images=dehazed(stacked, through),
             weight=pixel_weights(scene, ignore, size).to(predictor.device),
-            # Smoke misleads the network by more than noise does: docs/experiments.
+            # Smoke misleads the network by more than noise does: docs/explanation/decisions.md.
             certainty=torch.ones_like(through) if predictor.masked else certainty(through).square(),
             explained=explained,
             change=change,

@@ -1,4 +1,4 @@
-"""Links of the documentation, and the header of every experiment page."""
+"""Links of the documentation."""
 
 import re
 from pathlib import Path
@@ -24,11 +24,3 @@ def test_relative_links_lead_to_files(page: Path) -> None:
     # Generated pages are there after `make docs`, which refuses links that lead nowhere.
     missing = [link for link in local if "_generated" not in link and not (page.parent / link).exists()]
     assert not missing
-
-
-@pytest.mark.parametrize("page", sorted((DOCS / "experiments").glob("20*.md")), ids=named)
-def test_an_experiment_names_its_date_commit_command_and_data(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    assert text.startswith(f"# {page.name[:10]}: ")
-    for row in ("commit", "command", "data"):
-        assert re.search(rf"^\| {row}s? \| .+ \|$", text, re.MULTILINE), row
