@@ -1,5 +1,6 @@
 """Ctrl-C, and the signals that end a program in its stead, between two steps and never within one."""
 
+import ctypes
 import os
 import signal
 import sys
@@ -40,6 +41,36 @@ _PATIENCE = 2.0
 """How long a stop waits for a moment when no library is at work, which could take it for an error of its own [s]."""
 _AGAIN = 0.02
 """After how long a signal that has to wait comes again [s]."""
+PARENT = "CARTS_PARENT"
+"""Environment variable that names the process with which a command ends."""
+_PR_SET_PDEATHSIG = 1
+"""From Linux's sys/prctl.h."""
+_POLL = 1.0
+"""Period of the check for the parent, where the system has no signal for its end [s]."""
+
+
+def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
+    """Send a signal to this process when its parent ends, by SIGKILL too; at once if it has ended already.
+
+    Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. Elsewhere, a
+    thread checks once a second.
+
+    Args:
+        parent: process id of the parent.
+        number: the signal.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+    else:
+        threading.Thread(target=_signal_at_end, args=(parent, number), name="carts-parent", daemon=True).start()
+    if os.getppid() != parent:
+        os.kill(os.getpid(), number)
+
+
+def _signal_at_end(parent: int, number: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_POLL)
+    os.kill(os.getpid(), number)
 
 
 class _Unfinished:

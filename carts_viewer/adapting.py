@@ -11,6 +11,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from carts_core.errors import CartsError
+from carts_core.stopping import PARENT
 from carts_viewer.job_work import Progress
 
 OPTIONS: tuple[str, ...] = ()
@@ -58,7 +59,8 @@ class _Training:
     def __init__(self, arguments: list[str]) -> None:
         self._began = time.monotonic()
         # Waiting threads that spin would take the processor from the page.
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        output = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        environment = {**os.environ, **output, PARENT: str(os.getpid())}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "carts_core.cli", "train", *arguments],
             stdin=subprocess.DEVNULL,

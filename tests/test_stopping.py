@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -151,3 +152,85 @@ print(module.x)
     command = [sys.executable, "-c", code]
     ran = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "1\n", "")
+
+
+TRAINING = (
+    "--steps 100000 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 "
+    "--images.height 48 --images.field-width 64"
+)
+PARENTS = {
+    "training": f"""
+import sys, time
+from carts_viewer.adapting import _Training
+training = _Training([sys.argv[1], *"{TRAINING}".split()])
+time.sleep(600)
+""",
+    "batch": """
+import time
+from collections.abc import Callable
+from pathlib import Path
+from carts_core.batch.pool import Pool
+def work(job):
+    time.sleep(600)
+if __name__ == "__main__":
+    list(Pool(work, 1, 1).run([Path("a job")]))
+""",
+    "cluster": """
+import time
+from pathlib import Path
+from carts_core.batch.cluster import LOCAL, Cluster
+def work(job):
+    time.sleep(600)
+if __name__ == "__main__":
+    list(Cluster(work, LOCAL, 1, 1).run([Path("a job")]))
+""",
+    "decimation": """
+import numpy as np
+from carts_core.model.decimation import decimated
+random = np.random.default_rng(0)
+decimated(random.random((300_000, 3)), random.integers(0, 300_000, (300_000, 3)), 1e-3)
+""",
+}
+"""Programs that start a child process."""
+SLOW_TO_START = 60.0
+"""Longest time for a child, or its own child, on a busy machine [s]."""
+
+
+def descendants(process: int) -> set[int]:
+    """Processes that a process has started, and that these have started."""
+    found: set[int] = set()
+    for task in Path(f"/proc/{process}/task").glob("*/children"):
+        for child in map(int, task.read_text().split()):
+            found |= {child, *descendants(child)}
+    return found
+
+
+def command(process: int) -> str:
+    """The command line of a process that runs; empty for one that has ended."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ").strip()
+    except OSError:
+        return ""
+
+
+def eventually(condition: Callable[[], bool], longest: float = SLOW_TO_START) -> bool:
+    """Whether something becomes true in time."""
+    end = time.monotonic() + longest
+    while time.monotonic() < end and not condition():
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(("parent", "children"), [("training", 3), ("batch", 2), ("cluster", 2), ("decimation", 1)])
+def test_child_processes_end_when_their_parent_is_killed(parent: str, children: int, tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENTS[parent])
+    program = subprocess.Popen([sys.executable, str(script), str(tmp_path / "run")])
+    assert eventually(lambda: len(descendants(program.pid)) >= children), "the children did not start"
+    started = descendants(program.pid)
+    program.kill()
+    program.wait()
+    ended = eventually(lambda: not any(map(command, started)), 30.0)
+    assert ended, [command(process) for process in started]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from ..stopping import Stopped, stopped_by_signals
+from ..stopping import Stopped, end_with_parent, stopped_by_signals
 from .engine import ATTEMPTS, Outcome, Work, lost
 from .manifest import Job
 
@@ -73,7 +73,9 @@ class Pool:
 
     def _started(self) -> _Worker:
         ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(theirs, self._work), name="carts-batch", daemon=True)
+        process = self._context.Process(
+            target=_serve, args=(theirs, self._work, os.getpid()), name="carts-batch", daemon=True
+        )
         with _threads_of_children(self._threads):
             process.start()
         theirs.close()
@@ -112,9 +114,10 @@ def _threads_of_children(threads: int) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(connection: Connection, work: Callable[[Job], Outcome]) -> None:
-    """What a process does: jobs, until there are no more or nobody asks any longer."""
+def _serve(connection: Connection, work: Callable[[Job], Outcome], parent: int) -> None:
+    """Does jobs until there are no more, or the parent has ended."""
     with stopped_by_signals(), suppress(Stopped):
+        end_with_parent(parent)
         while True:
             try:
                 job = connection.recv()

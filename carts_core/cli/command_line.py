@@ -12,7 +12,7 @@ import tyro
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..imports import uncollected
-from ..stopping import exit_status, message, stopped_by_signals
+from ..stopping import PARENT, end_with_parent, exit_status, message, stopped_by_signals
 from .baseline import Baseline
 from .batch import Batch
 from .bench import Bench
@@ -66,6 +66,8 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors that are meant for people end it with one message and status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if parent := os.environ.pop(PARENT, ""):
+        end_with_parent(int(parent))
     try:
         with _quiet_when_unread():
             if arguments == ["--version"]:

@@ -6,6 +6,7 @@ looks at signals nor ends in good time on every mesh. 300,000 triangles at rando
 
 import io
 import math
+import os
 import resource
 import signal
 import subprocess
@@ -55,8 +56,8 @@ def decimated(
     seconds = _SECONDS + _SECONDS_PER_FACE * len(faces)
     np.savez(given, vertices=vertices, faces=faces, tolerance=tolerance, seconds=seconds)
     patience = seconds * _PATIENCE
-    # The file alone: importing the package would take longer than most meshes.
-    command = [sys.executable, "-P", __file__]
+    # The file alone: importing its package would take longer than most meshes.
+    command = [sys.executable, "-P", __file__, str(os.getpid())]
     try:
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=patience, check=True)
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as result:
@@ -183,6 +184,9 @@ def _fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[
 
 
 def _main() -> None:
+    from carts_core.stopping import end_with_parent  # noqa: PLC0415 - relative imports need the package
+
+    end_with_parent(int(sys.argv[1]), signal.SIGKILL)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as given:
         seconds = math.ceil(float(given["seconds"]))

@@ -16,6 +16,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
+from ...stopping import end_with_parent
 from .task import Batch
 from .tasks import task_of
 
@@ -76,8 +77,9 @@ class _Samples(Dataset):
         self._alone = True
 
 
-def _outlive_signals(closing: Event, worker: int) -> None:
+def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
     """Signals to the whole process group stop the parent, which ends its workers once it has kept its work."""
+    end_with_parent(parent, signal.SIGKILL)
 
     def end_if_closing(*_: object) -> None:
         if closing.is_set():
@@ -105,7 +107,7 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterat
         num_workers=config.workers,
         prefetch_factor=2 if config.workers else None,
         multiprocessing_context=spawning if config.workers else None,
-        worker_init_fn=partial(_outlive_signals, closing) if config.workers else None,
+        worker_init_fn=partial(_outlive_signals, closing, os.getpid()) if config.workers else None,
     )
     batches = _stream(loader)
     try:
