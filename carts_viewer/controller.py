@@ -138,7 +138,9 @@ class Controller:
         if others != state.others:
             self._context.change(others=others)
         person.index = state.index
-        if self._editor.view is not state.project and not self._live.active:
+        possible = self._editor.can_undo, self._editor.can_redo
+        changed = self._editor.view is not state.project or possible != (state.can_undo, state.can_redo)
+        if changed and not self._live.active:
             self._context.refresh()
 
     def _share(self) -> None:

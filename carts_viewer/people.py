@@ -1,7 +1,7 @@
-"""Who works on the project at the same time, each in a tab of their own: whose step of the history is whose.
+"""Ownership of the history's steps while several tabs edit one project.
 
-Somebody alone goes back and forth in the history as it is. Where several work at once, undo takes back one's own last
-step, by a new step that leaves what the others have done as it is.
+A single tab goes back and forth in the history as it is. With several, undo takes back the tab's own last step, or one
+from before the viewer started that is not of another tab's person, by a new step that leaves the others' as they are.
 """
 
 from collections.abc import Mapping
@@ -87,35 +87,30 @@ class People:
 
     def can_undo(self, person: Person) -> bool:
         """Whether there may be something that this person can take back."""
-        return self.project.state.position > 0 and (not self.several or self._own(person) is not None)
+        return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
 
     def can_redo(self, person: Person) -> bool:
         """Whether there is something that this person can do again."""
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
-        """Take back somebody's last step; None if there is none, nor any of nobody's.
+        """Take back a person's last step, or one that has no owner; None if there is neither.
 
         Raises:
-            CartsError: others are at work, and there are only steps from before.
-            ProjectError: it could not be saved, or somebody has changed the same since.
+            CartsError: a later step has changed the same.
+            ProjectError: it could not be saved.
         """
-        position, own = self.project.state.position, self._own(person)
-        if not self.several and (own is None or own == position):
+        position, own = self.project.state.position, self._last(person, free=self.several)
+        if not self.several and own in (None, position):
             return self.project.go_to(max(position - 1, 0))
         if own is None:
-            if all(number in self._makers for number in range(1, position + 1)):
-                return None
-            raise CartsError(
-                "No step of this tab is left to undo. While several tabs are open each takes back its own; steps from "
-                "before are under History."
-            )
+            return None
         try:
-            edits = self.project.reverting(own)
+            edits, figures = self.project.reverting(own)
         except ProjectError as error:
             self._reverted.add(own)
             raise CartsError(f"{error} Undo again to go on with your step before it.") from error
-        change = self._revert(person, own, "Undo", edits)
+        change = self._revert(person, own, "Undo", edits, figures)
         person.undone.append(self.project.state.position)
         return change
 
@@ -124,7 +119,7 @@ class People:
         if person.undone:
             number = person.undone[-1]
             person.undone.pop()
-            change = self._revert(person, number, "Redo", self.project.reverting(number))
+            change = self._revert(person, number, "Redo", *self.project.reverting(number))
             # What was done again can be taken back again.
             self._reverted.discard(self.project.state.position)
             return change
@@ -152,11 +147,18 @@ class People:
         person.undone.clear()
         return project.go_to(position)
 
-    def _own(self, person: Person) -> int | None:
-        """The last step of somebody's that is done and was not taken back; None if there is none."""
-        position = self.project.state.position
-        own = (n for n, maker in self._makers.items() if maker is person and n <= position and n not in self._reverted)
-        return max(own, default=None)
+    def _last(self, person: Person, *, free: bool) -> int | None:
+        """The last step that is done, was not taken back and is this person's or, where `free`, of no known person."""
+        owners = (person, None) if free else (person,)
+        done = range(self.project.state.position, 0, -1)
+        return next((n for n in done if n not in self._reverted and self._maker(n) in owners), None)
+
+    def _maker(self, number: int) -> Person | None:
+        """Who made a step; for one from before the viewer started, the person whose name it begins with."""
+        if number in self._makers:
+            return self._makers[number]
+        name = self.project.state.steps[number - 1].name
+        return next((one for one in self.persons if one.chosen and name.startswith(f"{one.chosen}: ")), None)
 
     def _next_is_free(self, person: Person) -> bool:
         """Whether the step that was undone last is nobody else's at work."""
@@ -166,11 +168,13 @@ class People:
         maker = self._makers.get(state.position + 1)
         return maker is person or not self.several
 
-    def _revert(self, person: Person, number: int, verb: str, edits: Edits) -> Change | None:
+    def _revert(
+        self, person: Person, number: int, verb: str, edits: Edits, figures: Mapping[int, Figures]
+    ) -> Change | None:
         name = self.project.state.steps[number - 1].name
         for known in ("Undo: ", "Redo: ", f"{person.name}: "):
             name = name.replace(known, "")
-        change = self._apply(person, f"{verb}: {name}", edits, None)
+        change = self._apply(person, f"{verb}: {name}", edits, figures)
         self._reverted |= {number, self.project.state.position}
         return change
 

@@ -132,7 +132,10 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
 
 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
-    """What brings back what a step has changed, and a later step by which some of it is another one now, if any."""
+    """What brings back what a step has changed, and a later step by which some of it is another one now, if any.
+
+    Verdicts are left out: whether one holds again depends on everything else of its frame.
+    """
     edits: dict[Key[Any], Any] = {}
     later: list[int] = []
 
@@ -144,7 +147,8 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
         ).fetchone()
         return (0, None) if row is None else row
 
-    for kind, frame, name in memory.execute("SELECT kind, frame, name FROM changes WHERE step = ?", (step,)).fetchall():
+    changed = "SELECT kind, frame, name FROM changes WHERE step = ? AND kind != ?"
+    for kind, frame, name in memory.execute(changed, (step, Kind.VERDICT.value)).fetchall():
         about, key = (kind, frame, name), Key(Kind(kind), frame, name)
         edits[key] = decode(key.kind, newest(about, step - 1)[1])
         number, value = newest(about, position)

@@ -166,8 +166,10 @@ class Project:
             moved = replace(state.with_entries(entries), position=position)
             return self._saved(moved, "undo" if back else "redo", step, entries.keys())
 
-    def reverting(self, number: int) -> Edits:
-        """The edits that take back one step and leave every later one as it is; nothing is changed.
+    def reverting(self, number: int) -> tuple[Edits, Mapping[int, Figures]]:
+        """The edits that take back one step and leave every later one as it is, with figures as for `apply`.
+
+        Nothing is changed. A frame that becomes what it was before the step has the verdict and figures of then.
 
         Args:
             number: of a step that is done.
@@ -179,13 +181,16 @@ class Project:
             state = self.state
             if not 1 <= number <= state.position:
                 raise ProjectError(f"no step {number} is done; {counted(state.position, 'step')} are.")
-            edits, later = journal.before(self._writer().memory, number, state.position)
+            memory = self._writer().memory
+            edits, later = journal.before(memory, number, state.position)
             if later is not None:
                 raise ProjectError(
                     f"step {number} ({state.steps[number - 1].name}) cannot be taken back alone: step {later} "
                     f"({state.steps[later - 1].name}) has changed the same since. Take that back first."
                 )
-            return edits
+            _, entries = journal.move(memory, state.position, number - 1)
+            verdicts, figures = state.regained(state.with_entries(entries), edits)
+            return {**edits, **verdicts}, figures
 
     def history(self) -> tuple[Step, ...]:
         """All steps, oldest first; those with a number above `state.position` are undone."""

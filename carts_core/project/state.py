@@ -186,6 +186,26 @@ class ProjectState:
         own = max((entry.step for key, entry in entries if key.kind not in _MARKS), default=0)
         return max(own, self._calibration_revision)
 
+    def regained(
+        self, past: "ProjectState", edits: Edits
+    ) -> tuple[dict[Key[FitVerdict], FitVerdict], dict[int, Figures]]:
+        """Verdicts and figures of the frames that edits make again what they were in an earlier state."""
+        after = self.after(Step(self.position + 1, "", 0.0), edits)
+        changed = {key.frame for key in edits if key.kind not in _MARKS}
+        frames = set(past.records) - {WHOLE_PROJECT} if WHOLE_PROJECT in changed else changed
+        same = [frame for frame in sorted(frames) if after._fitted(frame) == past._fitted(frame)]
+        verdicts = {Key.verdict(frame): past.verdict(frame) for frame in same}
+        figures = {frame: past.figures(frame) for frame in same}
+        return (
+            {key: verdict for key, verdict in verdicts.items() if verdict is not None},
+            {frame: known for frame, known in figures.items() if known is not None},
+        )
+
+    def _fitted(self, frame: int) -> dict[Key[Any], Any]:
+        """All values that a frame's verdict and figures depend on."""
+        entries = (*self._record(frame).entries.items(), *self._record(WHOLE_PROJECT).entries.items())
+        return {key: e.value for key, e in entries if key.kind not in _MARKS and e.value is not None}
+
     @property
     def undoable(self) -> Step | None:
         """The step that `Project.undo` takes back."""

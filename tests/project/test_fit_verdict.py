@@ -2,14 +2,27 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from project_model import HAND, IDENTITY
 
 from carts_core.errors import ProjectError
-from carts_core.project import FitVerdict, JointCorrection, Key, Project, Review, ReviewState, worst_first
+from carts_core.project import (
+    Figures,
+    FitVerdict,
+    JointCorrection,
+    Key,
+    MaskCorrection,
+    Project,
+    Review,
+    ReviewState,
+    TimeOffset,
+    worst_first,
+)
 
 GOOD = FitVerdict("good", "The image supports the fit.", "", 0.01)
 FAILED = FitVerdict("failed", "The image contradicts the fit.", "Run again.", 0.9)
+PAINTED = np.eye(IDENTITY.cameras["left"][1], IDENTITY.cameras["left"][0], dtype=bool)
 
 
 def _joints(value: float) -> JointCorrection:
@@ -51,6 +64,37 @@ def test_a_check_is_no_step_and_its_verdict_comes_and_goes_with_the_pose(project
         assert again.state.verdict(0) == FAILED
     with Project(IDENTITY, project_path) as again:
         assert again.incident is None and again.state.verdict(0) == FAILED and len(again.history()) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        (Key.mask_correction(0, "left"), MaskCorrection.of(PAINTED, ~PAINTED)),
+        (Key.joints(0, "PSM1"), _joints(0.3)),
+        (Key.time_offset(), TimeOffset(0.5)),
+    ],
+)
+def test_a_step_that_is_taken_back_alone_brings_verdict_and_figures_back_and_doing_it_again_does_not(
+    project: Project, key: Key, value: object
+) -> None:
+    project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.1), Key.verdict(0): GOOD}, {0: Figures(0.4, 0.9)})
+    project.apply("Edit", {key: value})
+    project.apply("Accept", {Key.review(1): Review(ReviewState.ACCEPTED)})
+    project.apply("Undo", *project.reverting(2))
+    assert project.state.verdict(0) == GOOD and project.state.figures(0) == Figures(0.4, 0.9)
+    project.apply("Redo", *project.reverting(4))
+    assert project.state.verdict(0) is None and project.state.figures(0) is None
+
+
+def test_a_step_below_another_edit_of_its_frame_is_taken_back_without_its_verdict(project: Project) -> None:
+    project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.1), Key.verdict(0): GOOD})
+    project.apply("Paint", {Key.mask_correction(0, "left"): MaskCorrection.of(PAINTED, ~PAINTED)})
+    project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.2), Key.verdict(0): FAILED})
+    project.apply("Undo", *project.reverting(2))
+    assert project.state.get(Key.mask_correction(0, "left")) is None and project.state.verdict(0) is None
+    # The verdict of step 1 was void when step 3 began.
+    project.apply("Undo", *project.reverting(3))
+    assert project.state.verdict(0) is None
 
 
 def test_the_same_verdict_on_another_pose_holds_too(project: Project) -> None:

@@ -299,13 +299,13 @@ def test_edits_from_several_threads_are_all_kept_one_after_the_other(project: Pr
 def test_one_step_is_taken_back_and_later_ones_stay(project: Project) -> None:
     project.apply("Drag", {Key.joints(0, "PSM1"): JOINTS})
     project.apply("Accept", {Key.review(1): ACCEPTED})
-    project.apply("Undo: Drag", project.reverting(1))
+    project.apply("Undo: Drag", *project.reverting(1))
     assert not project.state.joints(0) and project.state.review(1) == ACCEPTED
     # What took it back is a step like any other, and what it set is what is taken back now.
-    project.apply("Redo: Drag", project.reverting(3))
+    project.apply("Redo: Drag", *project.reverting(3))
     assert project.state.joints(0) == {"PSM1": JOINTS}
     # Step 1 and step 4 have set the same, so nothing has changed it since.
-    assert project.reverting(1) == {Key.joints(0, "PSM1"): None}
+    assert project.reverting(1) == ({Key.joints(0, "PSM1"): None}, {})
 
 
 def test_a_step_whose_values_were_changed_since_is_not_taken_back(project: Project) -> None:

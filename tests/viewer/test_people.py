@@ -81,10 +81,21 @@ def test_steps_from_before_the_viewer_started_can_be_taken_back(people: People) 
     assert _reviews(people)[0] == "untouched"
 
 
-def test_beside_others_steps_from_before_are_left_to_the_history_and_that_is_said(people: People) -> None:
-    people.project.apply("Accept", {Key.review(0): ACCEPTED})
+def test_beside_others_ones_last_step_from_before_the_viewer_started_is_taken_back_and_theirs_are_not(
+    people: People,
+) -> None:
+    people.project.apply("Ann: Accept", {Key.review(0): ACCEPTED})
+    people.project.apply("Accept", {Key.review(1): ACCEPTED})
+    people.project.apply("Bob: Reject", {Key.review(2): REJECTED})
     ann, bob = people.join(), people.join()
-    with pytest.raises(CartsError, match=r"No step of this tab is left to undo.*History"):
+    ann.chosen, bob.chosen = "Ann", "Bob"
+    people.apply(bob, "Reject", {Key.review(3): REJECTED})
+    for expected in (["accepted", "untouched"], ["untouched", "untouched"]):
+        assert people.can_undo(ann)
         people.undo(ann)
-    people.go_to(bob, 0)
-    assert _reviews(people)[0] == "untouched"
+        assert _reviews(people) == [*expected, "rejected", "rejected"]
+    assert not people.can_undo(ann) and people.undo(ann) is None
+    people.redo(ann)
+    people.undo(bob)
+    people.undo(bob)
+    assert _reviews(people) == ["accepted", "untouched", "untouched", "untouched"] and not people.can_undo(bob)

@@ -100,6 +100,22 @@ def test_a_tab_that_is_closed_in_mid_drag_leaves_a_saved_edit_and_does_not_hold_
     _shows_its_own(second)
 
 
+def test_undo_and_redo_can_be_pressed_as_soon_as_the_other_tab_has_left(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer()
+    first, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
+    first.type_value(first.slider("PSM1", 0), round(first.slider("PSM1", 0).value - 3.0, 2))
+    eventually(lambda: second.state.undoable, lambda steps: steps == 1)
+    undo, redo = (second.page.get_by_role("button", name=name, exact=True) for name in ("Undo", "Redo"))
+    expect(undo).to_be_disabled()
+    first.page.close()
+    expect(undo).to_be_enabled()
+    undo.click()
+    eventually(lambda: app.project.state.joints(0), lambda joints: not joints)
+    expect(redo).to_be_enabled()
+
+
 def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
     open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
 ) -> None:
