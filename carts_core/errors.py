@@ -3,9 +3,17 @@
 Each message says what was given, what is allowed and what to do.
 """
 
+from .wording import shortened
+
+_LONGEST = 4000
+"""Longest message, which may quote a file [characters]."""
+
 
 class CartsError(Exception):
     """Root of every error that is meant to be read by a person."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__(), _LONGEST)
 
 
 class RobotError(CartsError):

@@ -4,6 +4,7 @@ A recording, a robot and weights come from anywhere. Every read of one goes thro
 since people link their data; devices, pipes and sockets are refused, and no file is read further than its kind's limit.
 """
 
+import configparser
 import json
 import math
 import os
@@ -11,15 +12,21 @@ import re
 import stat
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..errors import CartsError
+from ..extras import needs_extra
+from ..wording import shortened
 
 MIB = 2**20
 GIB = 2**30
 LARGEST_DEPTH = 32
-"""How deeply tables and lists may be nested in TOML and JSON."""
+"""How deeply tables and lists may be nested in TOML, JSON and YAML."""
+MOST_YAML_EVENTS = 500_000
+"""Values of a YAML file, and beginnings and ends of its lists and tables."""
+MOST_INI_LINES = 10_000
 LARGEST_NAME = 255
 """Longest name of a file or folder [bytes]."""
 LARGEST_PATH = 4096
@@ -156,6 +163,76 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     if finite and not all_finite(values):
         raise ValueError("a number in it is not finite")
     return values
+
+
+def parse_yaml(text: str) -> Any:
+    """YAML as dictionaries, lists, numbers and texts; dates and sexagesimal numbers stay texts.
+
+    Raises:
+        ValueError: it is not YAML, has aliases or merge keys, or is beyond the limits of this module.
+        CartsError: the package that reads it is not installed.
+    """
+    needs_extra("yaml", "import")
+    import yaml  # noqa: PLC0415
+
+    parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        depth = 0
+        for count, event in enumerate(yaml.parse(text, Loader=parser)):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"it has the alias *{event.anchor}, and aliases are not read; write the value out")
+            if depth > LARGEST_DEPTH:
+                raise ValueError(f"it is nested more than {LARGEST_DEPTH} levels deep")
+            if count > MOST_YAML_EVENTS:
+                raise ValueError(f"it has more than {MOST_YAML_EVENTS:,} values")
+        values = yaml.load(text, Loader=_plain_yaml(parser))
+    except ValueError:
+        raise
+    except Exception as error:  # constructors of values raise many kinds
+        raise ValueError(shortened(" ".join(str(error).split()))) from error
+    _check_values(values)
+    return values
+
+
+@cache
+def _plain_yaml(parser: Any) -> Any:
+    """A loader without merge keys, whose numbers cost no more than their digits."""
+
+    class PlainLoader(parser):
+        def flatten_mapping(self, node: Any) -> None:
+            """Leaves merge keys in place, for which there is no constructor."""
+
+    def whole(loader: Any, node: Any) -> int | str:
+        text = loader.construct_scalar(node).replace("_", "")
+        octal = re.fullmatch(r"([-+]?)0([0-7]+)", text)
+        return text if ":" in text else int("{}0o{}".format(*octal.groups()) if octal else text, 0)
+
+    def real(loader: Any, node: Any) -> float | str:
+        text = loader.construct_scalar(node).replace("_", "")
+        return text if ":" in text else float(re.sub(r"\.(?=inf|nan)", "", text.lower()))
+
+    PlainLoader.add_constructor("tag:yaml.org,2002:int", whole)
+    PlainLoader.add_constructor("tag:yaml.org,2002:float", real)
+    PlainLoader.add_constructor("tag:yaml.org,2002:timestamp", parser.construct_yaml_str)
+    return PlainLoader
+
+
+def parse_ini(text: str) -> configparser.ConfigParser:
+    """INI with its values as they are written, without interpolation.
+
+    Raises:
+        ValueError: it is not INI, or has more than `MOST_INI_LINES` lines.
+    """
+    if text.count("\n") > MOST_INI_LINES:
+        raise ValueError(f"it has more than {MOST_INI_LINES:,} lines")
+    parser = configparser.ConfigParser(inline_comment_prefixes=(";", "#"), interpolation=None)
+    try:
+        # The time of the parser grows with the square of a run of blanks.
+        parser.read_string(re.sub(r"[^\S\n]+", " ", text))
+    except configparser.Error as error:
+        raise ValueError(shortened(" ".join(error.message.split()))) from error
+    return parser
 
 
 def all_finite(root: Any) -> bool:

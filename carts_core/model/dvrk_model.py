@@ -13,8 +13,7 @@ from xml.etree import ElementTree
 
 from ..errors import RobotError
 from ..extras import needs_extra
-from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, read_text
-from ..recording.importing.yaml_files import parse_yaml
+from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, parse_yaml, read_text
 from ..wording import counted
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI

@@ -15,8 +15,7 @@ from typing import Any
 from unittest import mock
 
 from ..errors import RobotError
-from ..files.reading import CALIBRATION, ROBOT, read_text
-from ..recording.importing.yaml_files import parse_yaml
+from ..files.reading import CALIBRATION, ROBOT, parse_yaml, read_text
 
 _LONGEST = 100_000
 """Longest text or list that an expression may make."""

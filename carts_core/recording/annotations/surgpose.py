@@ -5,9 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ...errors import SequenceError
-from ...files.reading import VALUES, read_text
+from ...files.reading import VALUES, parse_yaml, read_text
 from ...model.camera import HALF_PIXEL
-from ..importing.yaml_files import parse_yaml
 from .found import MOST_IMAGES, MOST_KEYPOINTS, ForeignImage
 
 

@@ -1,20 +1,18 @@
 """Cameras of foreign recordings: which one a name means, and calibrations of ROS, OpenCV, Kalibr and MATLAB."""
 
 import re
-from configparser import ConfigParser
-from configparser import Error as IniError
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...decoders.tables import read_matlab
 from ...errors import SequenceError
-from ...files.reading import CALIBRATION, VALUES, is_regular, parse_json, read_text
+from ...files.decoding import decoded
+from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_yaml, read_text
 from ...settings.importing import ImportOptions
 from .found import FoundCamera, Note
-from .matlab_files import read_matlab
-from .yaml_files import parse_yaml
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _KINDS = (
@@ -141,7 +139,6 @@ def with_calibration_file(camera: FoundCamera, path: Path) -> FoundCamera:
         KeyError,
         TypeError,
         IndexError,
-        IniError,
         AttributeError,
     ) as error:
         raise SequenceError(
@@ -218,8 +215,7 @@ def _stereo(R: np.ndarray, T: np.ndarray) -> np.ndarray:
 
 def _from_ini(camera: FoundCamera, path: Path) -> FoundCamera:
     """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are millimetres."""
-    parser = ConfigParser(inline_comment_prefixes=(";", "#"))
-    parser.read_string(read_text(path, CALIBRATION))
+    parser = parse_ini(read_text(path, CALIBRATION))
     left, right = parser["StereoLeft"], parser["StereoRight"]
     section = right if side_of(camera.name) == "right" else left
 
@@ -241,7 +237,7 @@ def _from_ini(camera: FoundCamera, path: Path) -> FoundCamera:
 
 def _from_matlab(camera: FoundCamera, path: Path) -> FoundCamera:
     """Stereo parameters as a struct of MATLAB: K or IntrinsicMatrix (transposed), radial and tangential distortion."""
-    content: Any = read_matlab(path)
+    content: Any = decoded(read_matlab, path)
     while len(content) == 1 and isinstance(only := next(iter(content.values())), dict):
         content = only
     right = side_of(camera.name) == "right"

@@ -1,24 +1,18 @@
 """Tables of other programs: CSV, Parquet and NumPy files as named columns of numbers."""
 
 import csv
-import io
-import math
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from ...decoders import tables
 from ...errors import SequenceError
 from ...extras import needs_extra
-from ...files.reading import MIB, TABLE, read_bytes, read_text
+from ...files.decoding import decoded
+from ...files.reading import TABLE, read_text
 
-_MOST_CELLS = 10_000_000
-"""Most values of a table."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
@@ -66,7 +60,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
         columns = readers.get(path.suffix.lower(), _csv)(path)
     except FileNotFoundError as error:
         raise SequenceError(f"table {path} is missing. Correct the path.") from error
-    except (OSError, ValueError, csv.Error, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         kinds = ", ".join(TABLE_SUFFIXES)
         raise SequenceError(f"table {path} cannot be read ({error}). Known are {kinds}. Export it again.") from error
     table = ForeignTable(path, columns)
@@ -82,8 +76,8 @@ def read_array(path: Path) -> np.ndarray:
         SequenceError: it is missing, damaged, or holds objects.
     """
     try:
-        return _array(read_bytes(path, TABLE))
-    except (OSError, ValueError, EOFError) as error:
+        return decoded(tables.read_arrays, path)[""]
+    except (OSError, ValueError, KeyError) as error:
         raise SequenceError(f"array {path} cannot be read ({error}). Copy it again.") from error
 
 
@@ -98,7 +92,7 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
         return {}
     delimiter = max(",;\t", key=lines[0].count)
     spaced = not lines[0].count(delimiter)
-    _check_cells(len(lines) * (lines[0].count(delimiter) + 1))
+    tables.check_cells(len(lines) * (lines[0].count(delimiter) + 1))
     rows = [line.split() for line in lines] if spaced else list(csv.reader(lines, delimiter=delimiter))
     width = len(rows[0])
     for number, row in enumerate(rows, start=1):
@@ -130,84 +124,36 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def read_parquet(path: Path) -> Any:
-    """The table in a Parquet file, as pyarrow has it.
+def read_parquet(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a Parquet file by name [rows]; [rows, values] where each row holds as many numbers.
 
     Raises:
+        CartsError: the package that reads it is not installed.
         OSError, ValueError: it cannot be read, or is too large.
     """
     needs_extra("pyarrow", "import")
-    import pyarrow  # noqa: PLC0415
-    import pyarrow.parquet  # noqa: PLC0415
-
-    try:
-        file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
-        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        chunks = [group.column(number) for group in groups for number in range(group.num_columns)]
-        # A run of equal values takes some bytes, however long it is.
-        _check_cells(sum(chunk.num_values for chunk in chunks))
-        _check_bytes(sum(chunk.total_uncompressed_size for chunk in chunks))
-        return file.read()
-    except pyarrow.ArrowException as error:
-        raise ValueError(str(error)) from error
-
-
-def _parquet(path: Path) -> dict[str, np.ndarray]:
-    table = read_parquet(path)
-    import pyarrow  # noqa: PLC0415
-
-    columns: dict[str, np.ndarray] = {}
-    for name in table.column_names:
-        column = table.column(name)
-        if pyarrow.types.is_list(column.type) or pyarrow.types.is_fixed_size_list(column.type):
-            rows = column.to_pylist()
-            lengths = {len(row) for row in rows if row is not None}
-            if len(lengths) == 1 and (length := lengths.pop()):
-                values = np.array([[np.nan] * length if row is None else row for row in rows])
-                columns.update({f"{name}.{index}": values[:, index] for index in range(values.shape[1])})
-        else:
-            columns[name] = column.to_numpy()
+    columns = decoded(tables.read_parquet, path)
+    for name, values in columns.items():
+        if isinstance(values, list):
+            columns[name] = np.empty(len(values), object)
+            columns[name][:] = values
     return columns
 
 
-def _array(content: bytes) -> np.ndarray:
-    """The array in the content of a .npy file, which must be as long as its header says, before any of it is made."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    try:
-        shape, _, kind = header(stream)
-    except (SyntaxError, tokenize.TokenError) as error:  # NumPy reads headers as Python's literals.
-        raise ValueError(f"its header is damaged ({error})") from error
-    if kind.itemsize * math.prod(shape) > len(content):
-        raise ValueError(f"its header says {shape}, and it has {len(content)} bytes")
-    stream.seek(0)
-    return np.load(stream)
-
-
-def _arrays(content: bytes) -> dict[str, np.ndarray]:
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        return {"column": _array(content)}
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        _check_bytes(sum(member.file_size for member in members))
-        return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
-
-
-def _check_cells(count: int) -> None:
-    if count > _MOST_CELLS:
-        raise ValueError(f"it has {count:,} values; at most {_MOST_CELLS:,} are read")
-
-
-def _check_bytes(count: int) -> None:
-    if count > TABLE.limit:
-        raise ValueError(f"it expands to {count // MIB} MiB; a {TABLE.name} may have {TABLE.limit // MIB} MiB at most")
+def _parquet(path: Path) -> dict[str, np.ndarray]:
+    columns: dict[str, np.ndarray] = {}
+    for name, values in read_parquet(path).items():
+        if values.ndim == 2:
+            columns.update({f"{name}.{index}": values[:, index] for index in range(values.shape[1])})
+        elif not len(values) or not isinstance(values[0], list):
+            columns[name] = values
+    return columns
 
 
 def _numpy(path: Path) -> dict[str, np.ndarray]:
-    arrays = _arrays(read_bytes(path, TABLE))
+    arrays = decoded(tables.read_arrays, path)
     columns: dict[str, np.ndarray] = {}
-    for name, values in arrays.items():
+    for name, values in ((name or "column", values) for name, values in arrays.items()):
         if values.ndim == 1:
             columns[name] = values
         elif values.ndim >= 2:

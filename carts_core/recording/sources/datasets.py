@@ -13,13 +13,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
-from ...files.reading import TABLE, VALUES, read_text
+from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...settings.importing import ImportOptions
 from ..importing.assembling import by_rows, cameras_of
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.media import common_ids, find_images, image_files
-from ..importing.yaml_files import parse_yaml
 from .protocol import Source
 
 _JIGSAWS_COLUMNS = 76

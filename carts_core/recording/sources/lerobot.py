@@ -29,8 +29,8 @@ class _Episode:
     """One episode: its rows, and where its images are in the videos."""
 
     index: int
-    table: Any
-    """pyarrow.Table with the episode's rows."""
+    table: ForeignTable
+    """The episode's rows."""
     videos: dict[str, tuple[Path, int]]
     """Feature -> video, and the episode's first frame in it."""
 
@@ -61,7 +61,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
     episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, notes)
-    rows = episode.table.num_rows
+    rows = len(episode.table)
     if not rows:
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
     if (total := info.get("total_episodes", 1)) != 1:
@@ -93,21 +93,21 @@ def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, n
     # v3.0: many episodes in one file; meta/episodes says where each begins.
     listed = sorted((root / "meta/episodes").rglob("*.parquet"))
     for file in listed:
-        for row in _parquet(file).to_pylist():
-            if row.get("episode_index") == index:
-                return _v3(root, row, cameras, float(info["fps"]), index)
+        columns = _parquet(file).columns
+        for number in np.flatnonzero(columns.get("episode_index", np.empty(0)) == index)[:1]:
+            row = {name: values[number] for name, values in columns.items()}
+            return _v3(root, row, cameras, float(info["fps"]), index)
     raise SequenceError(
         f"{root} has no episode {index}: neither {old.relative_to(root)} nor a row of meta/episodes. Copy it again."
     )
 
 
 def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index: int) -> _Episode:
-    import pyarrow  # noqa: PLC0415
-
     try:
         chunk, file = int(row["data/chunk_index"]), int(row["data/file_index"])
         table = _parquet(root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet")
-        table = table.filter(pyarrow.array(np.asarray(table.column("episode_index")) == index))
+        own = table.columns["episode_index"] == index
+        table = ForeignTable(table.path, {name: values[own] for name, values in table.columns.items()})
         videos = {}
         for key in cameras:
             place = (
@@ -121,9 +121,9 @@ def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index:
     return _Episode(index, table, videos)
 
 
-def _parquet(path: Path) -> Any:
+def _parquet(path: Path) -> ForeignTable:
     try:
-        return read_parquet(path)
+        return ForeignTable(path, read_parquet(path))
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"table {path} cannot be read ({error}). Copy it again; Git LFS pointers need a pull."
@@ -142,11 +142,11 @@ def _names(value: Any) -> list[str]:
 def _arms(
     root: Path, features: dict[str, Any], episode: _Episode, options: ImportOptions, notes: list[Note]
 ) -> tuple[FoundArm, ...]:
-    if _STATE not in features or _STATE not in episode.table.column_names:
+    if _STATE not in features or _STATE not in episode.table.columns:
         raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
     names = _names(features[_STATE].get("names"))
     try:
-        values = np.array(episode.table.column(_STATE).to_pylist(), np.float64)
+        values = np.array(episode.table.columns[_STATE].tolist(), np.float64)
     except (TypeError, ValueError) as error:
         raise SequenceError(f"{root}: rows of {_STATE} differ in length ({error}). Copy the data set again.") from error
     if values.ndim != 2 or len(names) != values.shape[1]:

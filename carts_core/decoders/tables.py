@@ -1,0 +1,97 @@
+"""Tables and arrays of other programs: Parquet, NumPy and MATLAB files."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files.reading import CALIBRATION, TABLE, read_bytes
+
+MOST_CELLS = 10_000_000
+"""Most values of a table."""
+LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
+"""Imported before the memory of a decoder is counted."""
+
+
+def read_parquet(path: Path) -> dict[str, Any]:
+    """Columns of a Parquet file by name [rows]; [rows, values] where each row holds as many numbers.
+
+    Columns of texts and of rows of different lengths are lists.
+
+    Raises:
+        OSError, ValueError: it cannot be read, or has too many values.
+    """
+    import pyarrow  # noqa: PLC0415 - an extra
+    import pyarrow.parquet  # noqa: PLC0415
+
+    try:
+        file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
+        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        # A run of equal values takes some bytes, however long it is.
+        check_cells(sum(group.column(number).num_values for group in groups for number in range(group.num_columns)))
+        table = file.read()
+    except pyarrow.ArrowException as error:
+        raise ValueError(str(error)) from error
+    columns = {}
+    for name in table.column_names:
+        column = table.column(name)
+        kind = column.type
+        nested = pyarrow.types.is_list(kind) or pyarrow.types.is_fixed_size_list(kind)
+        columns[name] = _matrix(column.to_pylist()) if nested else column.to_numpy()
+    return columns
+
+
+def _matrix(rows: list[list[Any] | None]) -> Any:
+    """Rows of numbers as an array, missing ones as NaN; the list itself if they are no numbers or differ in length."""
+    lengths = {len(row) for row in rows if row is not None}
+    if len(lengths) != 1:
+        return rows
+    missing = [np.nan] * lengths.pop()
+    try:
+        return np.array([missing if row is None else row for row in rows], np.float64)
+    except (TypeError, ValueError):
+        return rows
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file by name, or the one of a .npy file under an empty name.
+
+    Raises:
+        OSError, ValueError: it cannot be read, or holds objects.
+    """
+    content = io.BytesIO(read_bytes(path, TABLE))
+    loaded = np.load(content, allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return {"": loaded}
+    with loaded:
+        return {name: loaded[name] for name in loaded.files}
+
+
+def read_matlab(path: Path) -> dict[str, Any]:
+    """Variables of a MATLAB file (version 5) by name; structs as dictionaries.
+
+    Raises:
+        OSError: it is missing, or no regular file of the size of a calibration.
+        ValueError: it is damaged, or of another version.
+    """
+    from scipy.io import loadmat  # noqa: PLC0415
+
+    content = read_bytes(path, CALIBRATION)
+    try:
+        variables = loadmat(io.BytesIO(content), simplify_cells=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # scipy raises whatever its readers meet
+        raise ValueError(f"it is no MATLAB file of version 5 ({error})") from error
+    return {name: value for name, value in variables.items() if not name.startswith("__")}
+
+
+def check_cells(count: int) -> None:
+    """Check the number of values of a table.
+
+    Raises:
+        ValueError: there are too many.
+    """
+    if count > MOST_CELLS:
+        raise ValueError(f"it has {count:,} values; at most {MOST_CELLS:,} are read")

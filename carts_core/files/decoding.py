@@ -1,0 +1,295 @@
+"""Decoding of untrusted files in a child process whose memory and processor time are bounded.
+
+Decoders of libraries may need any amount of either for a small file: references that repeat, false sizes, compression.
+A decoder is a module-level function of this package that imports neither torch nor the rest of the application; it runs
+in a fresh interpreter, started with `decoded`, and its arguments and result are plain values, paths and arrays.
+
+The child ends when its parent does, at the latest when its processor time is used up.
+"""
+
+import atexit
+import contextlib
+import errno
+import importlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from .. import errors
+from ..errors import CartsError
+from ..wording import shortened
+from .reading import GIB, MIB, RefusedFileError
+
+_SECONDS, _SECONDS_PER_MIB = 3.0, 1.0
+_MEMORY, _MEMORY_PER_BYTE = 400 * MIB, 8
+_PATIENCE = 20
+"""Waiting time allowed for each second of processor time, on a busy machine."""
+_IDLE = 10.0
+_MOST_IDLE = 4
+_LARGEST_FILE = GIB
+"""Of a temporary file that a library expands [bytes], beyond a hundred times the size of what is decoded."""
+_ARRAY, _PATH = 1, 2
+_ENVIRONMENT = {
+    # Thread pools and arenas reserve address space that would count as memory.
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_ARENA_MAX": "2",
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Resources of one call of a decoder, beyond those of the interpreter and the libraries that it imports."""
+
+    seconds: float = _SECONDS
+    """Of processor time [s]."""
+    memory: int = _MEMORY
+    """[bytes]"""
+    written: int = _LARGEST_FILE
+    """Size of a temporary file [bytes]."""
+
+    @staticmethod
+    def of(path: Path) -> "Limits":
+        """Limits for a file or folder, in proportion to its size."""
+        files = [path] if not path.is_dir() else path.iterdir()
+        size = sum(file.stat().st_size for file in files if file.is_file())
+        return Limits(
+            _SECONDS + _SECONDS_PER_MIB * size / MIB, _MEMORY + _MEMORY_PER_BYTE * size, _LARGEST_FILE + 100 * size
+        )
+
+
+class DecodingLimitError(CartsError, ValueError):
+    """Decoding needs more memory or time than a file of its size may."""
+
+
+def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
+    """The result of a decoder for a file, computed in a child process within `Limits.of` the file.
+
+    Args:
+        function: decoder, at module level in this package. The table `LIBRARIES` of its module names, by function,
+            what is imported before memory is counted.
+        path: first argument, a file or folder.
+        arguments: further ones.
+
+    Raises:
+        OSError, CartsError: as the decoder raises them.
+        DecodingLimitError: it needs more memory or time than the limits.
+        ValueError: any other error of the decoder.
+    """
+    return called(function, path, *arguments, limits=Limits.of(path))
+
+
+def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
+    """As `decoded`, within any limits."""
+    with _LOCK:
+        decoder = _IDLE_DECODERS.pop() if _IDLE_DECODERS else Decoder()
+    try:
+        return decoder.call(function, *arguments, limits=limits)
+    finally:
+        with _LOCK:
+            if len(_IDLE_DECODERS) < _MOST_IDLE:
+                _IDLE_DECODERS.append(decoder)
+            else:
+                decoder.close()
+
+
+class Decoder:
+    """A child process that runs one decoder after the other; it starts with the first call, and anew after a failure.
+
+    Its decoders may keep what they have opened from call to call. Not safe to use from several threads at once.
+    """
+
+    def __init__(self, *, idle: float = _IDLE) -> None:
+        """`idle` is the time after which a child without work ends [s]."""
+        self._idle = idle
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe: Connection | None = None
+        self._folder = ""
+
+    def call(self, function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
+        """The result of a function; errors as those of `decoded`."""
+        request = _packed([function.__module__, function.__qualname__, arguments, *vars(limits).values()])
+        try:
+            if (reply := self._reply(request, limits)) is None:
+                # The child had been idle for so long that it ended when it was asked.
+                reply = self._reply(request, limits)
+        except BaseException:
+            self.close()
+            raise
+        if reply is None:
+            raise ValueError("its decoder cannot be started")
+        kind, *values = reply
+        if kind == "result":
+            return values[0]
+        if kind == "system":
+            raise OSError(*values[:2], *map(str, values[2:]))  # With the class that belongs to the number.
+        if kind == "memory":
+            self.close()
+            raise _needs_memory(limits)
+        raise _ERRORS.get(kind, ValueError)(*values)
+
+    def close(self) -> None:
+        """End the child and remove its temporary files."""
+        process, pipe, folder = self._process, self._pipe, self._folder
+        self._process, self._pipe = None, None
+        if pipe is not None:
+            pipe.close()
+        if process is not None:
+            process.kill()
+            process.wait()
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _reply(self, request: bytes, limits: Limits) -> Any:
+        """The child's reply, None where it ended before it got the request.
+
+        Raises:
+            DecodingLimitError: it was ended by the limits.
+            ValueError: it has died, as of a fault in a library.
+        """
+        if self._process is None or self._pipe is None:
+            self._start()
+        assert self._process is not None and self._pipe is not None
+        patience = limits.seconds * _PATIENCE
+        try:
+            self._pipe.send_bytes(request)
+            if not self._pipe.poll(patience):
+                self.close()
+                raise DecodingLimitError(f"decoding it takes longer than {patience:.0f} s")
+            return _unpacked(self._pipe.recv_bytes())
+        except (EOFError, ConnectionError):
+            status = self._process.wait()
+            self.close()
+        if status == 0:
+            return None
+        if -status == signal.SIGXCPU:
+            raise DecodingLimitError(f"decoding it takes longer than {limits.seconds:.0f} s")
+        if -status in (signal.SIGKILL, signal.SIGABRT):
+            raise _needs_memory(limits)
+        raise ValueError(f"its decoder ended with status {status}: it is damaged, or made to do harm")
+
+    def _start(self) -> None:
+        here, there = Pipe()
+        self._folder = tempfile.mkdtemp(prefix="carts-decoding-")
+        paths = [os.path.abspath(path) for path in sys.path]
+        start = "import sys; sys.path[:] = sys.argv[3:]; from carts_core.files.decoding import serve; serve()"
+        with there:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", start, str(there.fileno()), str(self._idle), *paths],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[there.fileno()],
+                env={**os.environ, **_ENVIRONMENT, "TMPDIR": self._folder},
+            )
+        self._pipe = here
+
+
+_LOCK = threading.Lock()
+_IDLE_DECODERS: list[Decoder] = []
+_ERRORS: dict[str, type[Exception]] = {
+    **{name: value for name, value in vars(errors).items() if isinstance(value, type)},
+    "RefusedFileError": RefusedFileError,
+    "DecodingLimitError": DecodingLimitError,
+}
+
+
+@atexit.register
+def _end() -> None:
+    for decoder in _IDLE_DECODERS:
+        decoder.close()
+    _IDLE_DECODERS.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    # Two processes must not speak with one child.
+    os.register_at_fork(after_in_child=_IDLE_DECODERS.clear)
+
+
+def serve() -> None:
+    """Run decoders for the parent; the command line names the descriptor of a pipe and the longest idle time [s]."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with Connection(int(sys.argv[1])) as pipe, contextlib.suppress(EOFError, ConnectionError):
+        while pipe.poll(float(sys.argv[2])):
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _answer(request: bytes) -> bytes:
+    module, name, arguments, seconds, memory, written = _unpacked(request)
+    try:
+        home = importlib.import_module(module)
+        for library in getattr(home, "LIBRARIES", {}).get(name, ()):
+            importlib.import_module(library)
+        _limit(seconds, memory, written)
+        return _packed(["result", getattr(home, name)(*arguments)])
+    except Exception as error:
+        return _packed(_described(error))
+
+
+def _described(error: Exception) -> list[Any]:
+    """An error as the name of its kind and its arguments; those of libraries become a `ValueError`."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return ["memory"]
+    if isinstance(error, CartsError):
+        return [type(error).__name__, str(error)]
+    if isinstance(error, OSError):
+        named = [] if error.filename is None else [Path(str(error.filename))]
+        return ["system", error.errno or 0, error.strerror or str(error), *named]
+    text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return ["ValueError", shortened(text, 1000).encode(errors="backslashreplace").decode()]
+
+
+def _limit(seconds: float, memory: int, written: int) -> None:
+    used = int(time.process_time() + 1)
+    resource.setrlimit(resource.RLIMIT_CPU, (used + int(seconds), resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (written, resource.RLIM_INFINITY))
+    with contextlib.suppress(OSError, ValueError):  # Only Linux has this file, and bounds address space.
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, resource.RLIM_INFINITY))
+
+
+def _needs_memory(limits: Limits) -> DecodingLimitError:
+    return DecodingLimitError(f"decoding it needs more than {limits.memory // MIB} MiB of memory")
+
+
+def _packed(value: Any) -> bytes:
+    return msgspec.msgpack.encode(value, enc_hook=_pack)
+
+
+def _pack(value: Any) -> Any:
+    if isinstance(value, Path):
+        return msgspec.msgpack.Ext(_PATH, os.fsencode(value))
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        return value.tolist()
+    if isinstance(value, np.ndarray):
+        head = msgspec.msgpack.encode([value.dtype.str, value.shape])
+        return msgspec.msgpack.Ext(_ARRAY, len(head).to_bytes(4, "little") + head + value.tobytes())
+    raise TypeError(f"a {type(value).__name__} cannot be passed between processes")
+
+
+def _unpacked(data: bytes) -> Any:
+    return msgspec.msgpack.decode(data, ext_hook=_unpack)
+
+
+def _unpack(code: int, data: memoryview) -> Any:
+    if code == _PATH:
+        return Path(os.fsdecode(bytes(data)))
+    end = 4 + int.from_bytes(data[:4], "little")
+    kind, shape = msgspec.msgpack.decode(data[4:end])
+    return np.frombuffer(data[end:], kind).reshape(shape).copy()
