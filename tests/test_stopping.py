@@ -184,6 +184,11 @@ def work(job):
 if __name__ == "__main__":
     list(Cluster(work, LOCAL, 1, 1).run([Path("a job")]))
 """,
+    "decoding": """
+import time
+from carts_core.files.decoding import Decoder, Limits
+Decoder().call(time.sleep, 600, limits=Limits(seconds=60))
+""",
     "decimation": """
 import numpy as np
 from carts_core.model.decimation import decimated
@@ -223,7 +228,9 @@ def eventually(condition: Callable[[], bool], longest: float = SLOW_TO_START) ->
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("parent", "children"), [("training", 3), ("batch", 2), ("cluster", 2), ("decimation", 1)])
+@pytest.mark.parametrize(
+    ("parent", "children"), [("training", 3), ("batch", 2), ("cluster", 2), ("decoding", 1), ("decimation", 1)]
+)
 def test_child_processes_end_when_their_parent_is_killed(parent: str, children: int, tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENTS[parent])

@@ -4,7 +4,7 @@ Decoders of libraries may need any amount of either for a small file: references
 A decoder is a module-level function of this package that imports neither torch nor the rest of the application; it runs
 in a fresh interpreter, started with `decoded`, and its arguments and result are plain values, paths and arrays.
 
-The child ends when its parent does, at the latest when its processor time is used up.
+The child ends with its parent.
 """
 
 import atexit
@@ -21,7 +21,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ import numpy as np
 
 from .. import errors
 from ..errors import CartsError
+from ..stopping import end_with_parent
 from ..wording import shortened
 from .reading import GIB, MIB, RefusedFileError
 
@@ -185,15 +188,20 @@ class Decoder:
         here, there = Pipe()
         self._folder = tempfile.mkdtemp(prefix="carts-decoding-")
         paths = [os.path.abspath(path) for path in sys.path]
-        start = "import sys; sys.path[:] = sys.argv[3:]; from carts_core.files.decoding import serve; serve()"
+        start = "import sys; sys.path[:] = sys.argv[4:]; from carts_core.files.decoding import serve; serve()"
         with there:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", start, str(there.fileno()), str(self._idle), *paths],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                pass_fds=[there.fileno()],
-                env={**os.environ, **_ENVIRONMENT, "TMPDIR": self._folder},
+            self._process = (
+                _spawner()
+                .submit(
+                    subprocess.Popen,
+                    [sys.executable, "-P", "-c", start, str(os.getpid()), str(there.fileno()), str(self._idle), *paths],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    pass_fds=[there.fileno()],
+                    env={**os.environ, **_ENVIRONMENT, "TMPDIR": self._folder},
+                )
+                .result()
             )
         self._pipe = here
 
@@ -214,17 +222,30 @@ def _end() -> None:
     _IDLE_DECODERS.clear()
 
 
+@cache
+def _spawner() -> ThreadPoolExecutor:
+    """The thread that starts children: Linux ends a child with the thread that started it."""
+    return ThreadPoolExecutor(1, "carts-decoding")
+
+
+def _forget() -> None:
+    """In a forked process, neither the thread nor the children of its parent are used."""
+    _IDLE_DECODERS.clear()
+    _spawner.cache_clear()
+
+
 if hasattr(os, "register_at_fork"):
-    # Two processes must not speak with one child.
-    os.register_at_fork(after_in_child=_IDLE_DECODERS.clear)
+    os.register_at_fork(after_in_child=_forget)
 
 
 def serve() -> None:
-    """Run decoders for the parent; the command line names the descriptor of a pipe and the longest idle time [s]."""
+    """Run decoders for the parent; the command line names its process, a pipe and the longest idle time [s]."""
+    parent, descriptor, idle = sys.argv[1:4]
+    end_with_parent(int(parent), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's.
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with Connection(int(sys.argv[1])) as pipe, contextlib.suppress(EOFError, ConnectionError):
-        while pipe.poll(float(sys.argv[2])):
+    with Connection(int(descriptor)) as pipe, contextlib.suppress(EOFError, ConnectionError):
+        while pipe.poll(float(idle)):
             pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 

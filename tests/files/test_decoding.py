@@ -3,11 +3,10 @@
 import io
 import os
 import signal
-import subprocess
-import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 
 from carts_core.decoders import tables
 from carts_core.errors import SequenceError
-from carts_core.files.decoding import Decoder, Limits, decoded
+from carts_core.files.decoding import Decoder, Limits, called, decoded
 from carts_core.files.reading import parse_ini, parse_yaml
 from carts_core.recording.importing.foreign_tables import read_foreign_table
 
@@ -85,16 +84,10 @@ def test_a_child_that_has_ended_for_lack_of_work_is_replaced():
     decoder.close()
 
 
-def test_no_child_outlives_its_parent():
-    program = (
-        "import os, time\nfrom carts_core.files.decoding import Decoder, Limits\n"
-        "print(Decoder().call(os.getpid, limits=Limits()), flush=True)\ntime.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        child = int(parent.stdout.readline())
-        parent.kill()
-    wait_for_end(child)
+def test_a_child_is_used_from_thread_to_thread():
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
+        numbers = [threads.submit(called, os.getpid, limits=SMALL).result() for threads in (one, other)]
+    assert numbers == [called(os.getpid, limits=SMALL)] * 2
 
 
 @pytest.mark.parametrize(
