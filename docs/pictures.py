@@ -149,7 +149,7 @@ def main() -> None:
         sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_page(viewport=WINDOW)
+        page = browser.new_page(viewport=WINDOW, bypass_csp=True)  # for wait_for_function
         page.add_init_script("localStorage.setItem('carts-tour', 'seen')")
         take(Photographer(app, page))
         browser.close()

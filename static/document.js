@@ -40,6 +40,24 @@
     return button;
   }
 
+  // What documents are made of; anything else in their HTML is left out.
+  const TAGS = new Set(("b br button code details div figcaption figure h1 h2 h3 img input label li ol option p polyline progress " +
+    "section select small span summary svg table tbody td th thead tr").split(" "));
+  const ATTRIBUTES = /^(alt|checked|class|colspan|disabled|fill|max|open|placeholder|points|preserveAspectRatio|role|selected|spellcheck|src|stroke|stroke-width|style|title|type|value|viewBox|data-[a-z]+|aria-[a-z]+)$/;
+  const PICTURES = /^\/media\/[0-9a-f]+\.jpg$/;
+
+  /** The nodes of a document's HTML. */
+  function built(content) {
+    const { body } = new DOMParser().parseFromString(content, "text/html"); // runs and loads nothing
+    for (const one of [...body.querySelectorAll("*")]) {
+      if (!TAGS.has(one.localName)) one.remove();
+      for (const { name, value } of [...one.attributes]) {
+        if (!ATTRIBUTES.test(name) || (name === "src" && !PICTURES.test(value))) one.removeAttribute(name);
+      }
+    }
+    return body.childNodes;
+  }
+
   const say = (name, value) => window.carts.report("chosen", JSON.stringify([name, value]));
 
   function release() {
@@ -60,7 +78,7 @@
     target.className = content ? `carts-document carts-document-${place}` : "";
     target.hidden = !content;
     const top = target.scrollTop;
-    target.innerHTML = content;
+    target.replaceChildren(...built(content));
     target.scrollTop = top;
     for (const [name, position] of scrolled) {
       const part = [...target.querySelectorAll("[data-scroll]")].find((other) => other.dataset.scroll === name);

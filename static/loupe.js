@@ -36,9 +36,8 @@
   }
 
   function build() {
-    box = document.createElement("div");
-    box.className = "carts-loupe";
-    box.innerHTML = `<canvas width="${SIDE * SCALE}" height="${SIDE * SCALE}"></canvas><div></div><div></div>`;
+    const [make, side] = [window.cartsElement, SIDE * SCALE];
+    box = make("div", { class: "carts-loupe" }, make("canvas", { width: side, height: side }), make("div"), make("div"));
     document.body.append(box);
   }
 

@@ -3,6 +3,7 @@
 (() => {
   "use strict";
 
+  const make = window.cartsElement;
   const ask = (text) => window.carts.report("asked", text);
   const remembered = (key) => { try { return JSON.parse(sessionStorage.getItem(key)); } catch { return null; } };
   const wanted = () => localStorage.getItem("carts-theme") ?? "dark"; // pictures are judged best before a dark wall
@@ -145,12 +146,12 @@
       sheet.className = "carts-sheet";
       sheet.setAttribute("aria-label", "Keys");
       const groups = window.cartsConfiguration.keyGroups ?? [];
-      const row = ([key, text]) => `<tr><td><kbd>${key}</kbd></td><td>${text}</td></tr>`;
-      const table = ([name, rows]) => `<section><h3>${name}</h3><table>${rows.map(row).join("")}</table></section>`;
-      sheet.innerHTML =
-        `<header><b>Keys</b><span>Press ? again, or Escape, to go on.</span><button data-do="tour">Take the tour</button>` +
-        `<button aria-label="Close">×</button></header>` +
-        `<div class="carts-columns">${groups.map(table).join("")}</div>`;
+      const row = ([key, text]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, text));
+      const table = ([name, rows]) => make("section", {}, make("h3", {}, name), make("table", {}, ...rows.map(row)));
+      sheet.append(
+        make("header", {}, make("b", {}, "Keys"), make("span", {}, "Press ? again, or Escape, to go on."),
+          make("button", { "data-do": "tour" }, "Take the tour"), make("button", { "aria-label": "Close" }, "×")),
+        make("div", { class: "carts-columns" }, ...groups.map(table)));
       sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
       sheet.querySelector("[data-do=tour]").addEventListener("click", () => { showSheet(false); window.carts.startTour(); });
       sheet.addEventListener("click", (event) => { if (event.target === sheet) showSheet(false); });
@@ -207,11 +208,10 @@
     if (!small.matches || bar || !window.__viserMutable?.canvas) return;
     bar = document.createElement("div");
     bar.className = "carts-review-bar";
-    bar.innerHTML =
-      `<div class="carts-review-line"></div>` +
-      [["previous", "‹", "Previous frame"], ["accept", "Accept", ""], ["work", "Needs work", ""], ["reject", "Reject", ""],
-        ["next", "›", "Next frame"], ["controls", "⋯", "All controls"]]
-        .map(([name, text, label]) => `<button data-do="${name}"${label ? ` aria-label="${label}"` : ""}>${text}</button>`).join("");
+    bar.innerHTML = `<div class="carts-review-line"><span class="carts-dot unknown"></span><span></span></div>
+      <button data-do="previous" aria-label="Previous frame">‹</button><button data-do="accept">Accept</button>
+      <button data-do="work">Needs work</button><button data-do="reject">Reject</button>
+      <button data-do="next" aria-label="Next frame">›</button><button data-do="controls" aria-label="All controls">⋯</button>`;
     bar.addEventListener("click", (event) => {
       const name = event.target.closest?.("button")?.dataset.do;
       if (name === "controls") document.body.classList.toggle("carts-controls");
@@ -222,10 +222,10 @@
 
   function drawBar() {
     if (!bar || !latest) return;
-    const line = bar.querySelector(".carts-review-line");
-    const text = `<span class="carts-dot ${latest.fit ?? "unknown"}"></span>Frame ${latest.label} · ${latest.review}` +
-      `${latest.fit ? ` · ${latest.fit}` : ""}`;
-    if (line.innerHTML !== text) line.innerHTML = text;
+    const [dot, line] = bar.querySelectorAll(".carts-review-line span");
+    dot.className = `carts-dot ${latest.fit ?? "unknown"}`;
+    const text = `Frame ${latest.label} · ${latest.review}${latest.fit ? ` · ${latest.fit}` : ""}`;
+    if (line.textContent !== text) line.textContent = text;
   }
 
   setInterval(() => {
@@ -239,6 +239,13 @@
     setHints(message) { hints = message; explain(); },
     /** A server that was started since this page was loaded knows nothing of our widgets. */
     meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
+    /** Load the page anew, at no place of the recording that was shown. */
+    reload() {
+      const address = new URL(location.href);
+      for (const name of ["project", "frame", "camera", "domain"]) address.searchParams.delete(name);
+      history.replaceState(null, "", address);
+      location.reload();
+    },
     showSheet: () => showSheet(true),
     toggleTheme,
   });

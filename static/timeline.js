@@ -3,6 +3,7 @@
 (() => {
   "use strict";
 
+  const make = window.cartsElement;
   const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#e879f9"];
   const NAMES = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved together"];
   const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
@@ -90,18 +91,22 @@
     const card = document.createElement("dl");
     card.className = "carts-strip-legend";
     card.hidden = true;
+    const key = (colour, text) => {
+      const swatch = make("span", { class: "carts-swatch" });
+      swatch.style.background = colour;
+      return make("span", { class: "carts-key" }, swatch, text);
+    };
     const keys = (colours, names) => [...names.keys()].filter((number) => colours[number])
-      .map((number) => `<span class="carts-key"><span class="carts-swatch" style="background: ${colours[number]}"></span>${names[number]}</span>`)
-      .join(" ");
+      .flatMap((number) => [" ", key(colours[number], names[number])]);
     const rows = [
       ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving leaves it as it is"],
-      ["Bar", `the higher, the worse it fits; low and faint where the fit of the frame as it is is not known, none where nothing is known at all. Its colour is the review, or what made the joints: ${keys(REVIEW, NAMES)}`],
-      ["Stripe below", `the verdict on the fit: ${keys(FIT, VERDICTS)}`],
-      ["Stripe below that", `where the joints come from: ${keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])}`],
+      ["Bar", "the higher, the worse it fits; low and faint where the fit of the frame as it is is not known, none where nothing is known at all. Its colour is the review, or what made the joints:", ...keys(REVIEW, NAMES)],
+      ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
+      ["Stripe below that", "where the joints come from:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
       ["Line at the bottom", "the whole sequence, in the colours of the verdict, or of the review where there is none; the frame in it is what is shown above"],
       ["Bands", "teal: the shown frame; pink: being solved; amber ends: the range, with what is outside dimmed"],
     ];
-    card.innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");
+    card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
     return card;
   }
 

@@ -73,9 +73,11 @@
         height: `${Math.min(box.bottom + 4, innerHeight - 2) - top}px`,
       });
     }
-    card.innerHTML = `<b>${title}</b><p>${text}</p><footer><span>${place + 1} of ${steps.length}</span>
-      <button data-do="leave">Leave</button><button data-do="back"${place ? "" : " disabled"}>Back</button>
-      <button data-do="next" class="main">${place + 1 < steps.length ? "Next" : "Done"}</button></footer>`;
+    const make = window.cartsElement;
+    card.replaceChildren(make("b", {}, title), make("p", {}, text), make("footer", {},
+      make("span", {}, `${place + 1} of ${steps.length}`), make("button", { "data-do": "leave" }, "Leave"),
+      make("button", { "data-do": "back", ...(place ? {} : { disabled: "" }) }, "Back"),
+      make("button", { "data-do": "next", class: "main" }, place + 1 < steps.length ? "Next" : "Done")));
     const actions = { leave: end, back: () => go(place - 1), next: () => go(place + 1) };
     for (const button of card.querySelectorAll("button")) button.onclick = actions[button.dataset.do];
     const around = box ?? { left: innerWidth / 2, right: innerWidth / 2, top: innerHeight / 2, bottom: innerHeight / 2 };

@@ -3,6 +3,7 @@ and a few safety rules hold for every file."""
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 
 import carts_core
 import carts_viewer
+from carts_core.resources import static_dir
 
 ROOTS = [Path(package.__path__[0]) for package in (carts_core, carts_viewer)]
 SOURCES = sorted(path for root in ROOTS for path in root.rglob("*.py"))
@@ -155,6 +157,43 @@ def test_no_file_runs_code_from_data_or_listens_on_every_interface() -> None:
 )
 def test_the_safety_check_notices_what_it_is_there_for(line: str) -> None:
     assert list(_hazards(ast.parse(line)))
+
+
+_MARKUP = re.compile(
+    r"(?P<sink>\.(?:innerHTML|outerHTML|srcdoc)\s*\+?=(?!=)|insertAdjacentHTML|createContextualFragment|document\.write|"
+    r"\beval\(|\bnew Function|[sS]etAttribute\(\s*[\"'`]on)\s*(?P<constant>(?:`[^`$]*`|\"[^\"]*\"|'[^']*');)?"
+)
+"""Where JavaScript makes HTML or code of a text; in constants it is our own."""
+
+
+def _markup(source: str) -> list[str]:
+    """Lines of JavaScript that make HTML or code of something that is not a constant."""
+    found = [match for match in _MARKUP.finditer(source) if not match["constant"]]
+    return [f"{source.count(chr(10), 0, match.start()) + 1}: {match['sink']}" for match in found]
+
+
+def test_no_script_makes_html_or_code_of_a_text() -> None:
+    scripts = {path.name: path.read_text(encoding="utf-8") for path in static_dir().glob("*.js")}
+    for path in SOURCES:
+        strings = [node.value for node in ast.walk(_tree(path)) if isinstance(node, ast.Constant)]
+        scripts[_named(path)] = "\n".join(value for value in strings if isinstance(value, str))
+    assert {name: found for name, source in scripts.items() if (found := _markup(source))} == {}
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        *("a.innerHTML = text;", "a.innerHTML = `<b>${text}</b>`;", 'a.innerHTML = "<b>" + text;', "a.outerHTML=text"),
+        *("a.innerHTML += `<b>`;\na.innerHTML = x", "a.insertAdjacentHTML('beforeend', text)", "document.write(text)"),
+        *("new Function(text)()", "eval(text)", "a.setAttribute('onclick', text)", "frame.srcdoc = text"),
+    ],
+)
+def test_the_check_of_scripts_notices_what_it_is_there_for(script: str) -> None:
+    assert _markup(script)
+
+
+def test_the_check_of_scripts_leaves_constants_alone() -> None:
+    assert not _markup("a.innerHTML = `<b>\nour own</b>`; a.innerHTML = '<p>'; if (a.innerHTML === text) b();")
 
 
 def test_the_safety_check_leaves_evaluation_mode_alone() -> None:

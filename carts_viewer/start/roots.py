@@ -43,10 +43,10 @@ class Roots:
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
     def checked(self, text: str | Path) -> Path:
-        """An absolute path below one of the folders, on the way to which there is no link.
+        """An absolute path below one of the folders, on the way to which there is no link and nothing hidden.
 
         Raises:
-            SettingsError: it is outside, is not there, or has a link on its way.
+            SettingsError: it is outside, is not there, or has a link or a hidden folder on its way.
         """
         path = Path(text)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
@@ -56,6 +56,8 @@ class Roots:
         try:
             for part in path.relative_to(root).parts:
                 place = place / part
+                if part.startswith("."):
+                    raise SettingsError(f"{place} is hidden. Choose another, or start carts view with --root {place}.")
                 mode = os.lstat(place).st_mode
                 if stat.S_ISLNK(mode):
                     raise SettingsError(f"{place} is a link, and links are not followed. Choose the folder itself.")

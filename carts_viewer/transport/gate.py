@@ -78,6 +78,7 @@ def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Re
     headers["Cache-Control"] = "no-cache"
     headers["X-Content-Type-Options"] = "nosniff"
     headers["X-Frame-Options"] = "DENY"
+    headers["Cross-Origin-Resource-Policy"] = "same-origin"
     headers["Referrer-Policy"] = "no-referrer"
     for name, value in more.items():
         headers[name.replace("_", "-")] = value

@@ -1,10 +1,11 @@
 """Who may talk to the viewer: this computer alone, or others who have the token; never another site's page.
 
 The toolkit below us checks neither `Host` nor `Origin`, so any page the user visits could open a websocket to the
-viewer and drive it. Two rules close that: `Host` names this computer (no DNS rebinding), and an `Origin`, which every
-browser sends with a websocket, is the origin that the page itself was loaded from.
+viewer and drive it. Three rules close that: `Host` names this computer (no DNS rebinding); an `Origin`, which every
+browser sends with a websocket, is the origin that the page itself was loaded from; and `Sec-Fetch-Site`, which browsers
+send with every request to this computer, names no other site, except for the page itself when a link leads there.
 
-Where other computers can reach the viewer, a third rule holds: every request, the websocket's included, carries the
+Where other computers can reach the viewer, a fourth rule holds: every request, the websocket's included, carries the
 token that was printed when the viewer started, or the cookie that a browser got for it.
 """
 
@@ -18,7 +19,8 @@ from websockets.datastructures import Headers
 
 from carts_core.errors import SettingsError
 
-_LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+PAGES = ("/", "/index.html")
+"""Paths of the page."""
 _ELSEWHERE = "192.0.2.1"
 """An address that is reserved for documentation, to ask the system which way it would send."""
 
@@ -76,6 +78,8 @@ class Guard:
         for origin in headers.get_all("Origin"):
             if origin != f"http://{hosts[0]}":
                 return f"The viewer answers its own page only, and this request came from {origin!r}."
+        if _from_another_page(target, headers):
+            return "The viewer's files are for its own page only. Open the page itself."
         if self.token is not None and not (self._has_token(target) or self._has_cookie(headers)):
             return "Open the address that the viewer printed when it started, with the token at its end."
         return None
@@ -91,11 +95,11 @@ class Guard:
 
     def _is_ours(self, name: str | None) -> bool:
         """Whether a request may call this server so."""
-        if name in _LOOPBACK_NAMES:
+        if name is not None and _is_loopback(name):
             return True
         if self.token is None or name is None:
             return False
-        # An attacker can make a name of their own lead here, but neither an address nor this computer's name.
+        # DNS rebinding makes any other name lead here, but neither an address nor this computer's own name.
         own = socket.gethostname().lower().partition(".")[0]
         names = {self._host.lower(), socket.gethostname().lower(), own, f"{own}.local"}
         return _address(name) is not None or name in names
@@ -113,6 +117,17 @@ class Guard:
 def _any_equal(given: Iterable[str], secret: str) -> bool:
     """Whether one of these is the secret; takes as long for a nearly right one as for a wrong one."""
     return any([secrets.compare_digest(value.encode("utf-8", "replace"), secret.encode()) for value in given])
+
+
+def _from_another_page(target: str, headers: Headers) -> bool:
+    """Whether a browser asks for a page of another origin; such a page may only link to ours, for the user to go to.
+
+    A websocket is judged by its `Origin`, which every browser sends with it.
+    """
+    if headers.get("Upgrade") == "websocket" or set(headers.get_all("Sec-Fetch-Site")) <= {"same-origin", "none"}:
+        return False
+    to_a_tab = headers.get_all("Sec-Fetch-Mode") == ["navigate"] and headers.get_all("Sec-Fetch-Dest") == ["document"]
+    return not (to_a_tab and target.partition("?")[0] in PAGES)
 
 
 def _cookie_name(headers: Headers) -> str:

@@ -24,12 +24,12 @@ from carts_core.resources import static_dir
 from carts_viewer.transport import incoming
 from carts_viewer.transport.fields import on_numbers, on_text, said
 from carts_viewer.transport.gate import gated, response
-from carts_viewer.transport.guard import Guard, check_address
-from carts_viewer.transport.index import TITLE, index_of_viser
+from carts_viewer.transport.guard import PAGES, Guard, check_address
+from carts_viewer.transport.index import index_of_viser
 from carts_viewer.transport.media import MEDIA, Media
 from carts_viewer.transport.outgoing import queue_safely
 from carts_viewer.transport.tab_page import call
-from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, run_script, value_of
+from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, value_of
 
 OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -50,18 +50,16 @@ _FIELDS = {
 }
 """Invisible fields, and what a tab says in them."""
 
-# The token has done its work when the page is there; nobody should copy it out of the address bar by mistake.
-_FORGET_TOKEN = (
-    "const address = new URL(location.href); address.searchParams.delete('token');"
-    "history.replaceState(null, '', address);"
-)
+_SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
+"""Files of `static/`, in the order in which they run."""
 
-_RELOAD = """
-const address = new URL(location.href);
-for (const name of ["project", "frame", "camera", "domain"]) address.searchParams.delete(name);
-history.replaceState(null, "", address);
-location.reload();
-"""
+_POLICY = (
+    "default-src 'none'; script-src 'self' 'nonce-{nonce}' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src data:; worker-src blob:; connect-src 'self' ws://{host} data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""`Content-Security-Policy` of the page. viser's client is an inline script (hence the nonce) that unpacks itself with
+WebAssembly, writes style sheets, and makes its workers and textures from blobs."""
 
 
 class Page:
@@ -143,7 +141,7 @@ class Page:
         """
         self._name = secrets.token_hex(8)
         for client in self.server.get_clients().values():
-            run_script(client, _RELOAD)
+            call(client, "reload")
 
     def close(self) -> None:
         """Stop serving and disconnect every tab."""
@@ -223,20 +221,25 @@ class Page:
         reason = self._guard.refusal(request.path, request.headers)
         if reason is not None:
             return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
+        if request.headers.get("Upgrade") == "websocket":
+            return None
         path = request.path.partition("?")[0]
-        if path.startswith("/static/"):
-            return self._static(path.removeprefix("/static/"))
+        return self._page(request) if path in PAGES else self._file(path)
+
+    def _file(self, path: str) -> Response | Awaitable[Response]:
         if path.startswith(MEDIA):
             return self.media.answer(path.removeprefix(MEDIA))
         if path.startswith(_THUMBNAIL) and self.thumbnail is not None:
             return self.thumbnail(path.removeprefix(_THUMBNAIL))
-        if path in ("/", "/index.html") and request.headers.get("Upgrade") != "websocket":
-            # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
-            own = f"connect-src 'self' ws://{request.headers['Host']} data: blob:"
-            cookie = self._guard.cookie(request.path, request.headers)
-            more = {"Content_Security_Policy": own} | ({} if cookie is None else {"Set_Cookie": cookie})
-            return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(), **more)
-        return None
+        return self._static(path.removeprefix("/static/") if path.startswith("/static/") else "")
+
+    def _page(self, request: Request) -> Response:
+        nonce = secrets.token_urlsafe(16)
+        # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
+        policy = _POLICY.format(nonce=nonce, host=request.headers["Host"])
+        cookie = self._guard.cookie(request.path, request.headers)
+        more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
+        return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(nonce), **more)
 
     def _refuse(self, data: object) -> str | None:
         """Why a tab's message must not reach viser; None when it may."""
@@ -254,30 +257,16 @@ class Page:
         kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
         return response(http.HTTPStatus.OK, kind, file.read_bytes())
 
-    def _index(self) -> bytes:
+    def _index(self, nonce: str) -> bytes:
         ids = {name: element_id(field) for name, field in self._fields.items()}
         said = {"keys": OWN_KEYS, "keyGroups": self.key_groups, "project": self.project, "server": self._name}
-        configuration = json.dumps({**ids, **said})
-        return (
-            index_of_viser()
-            .replace(
-                TITLE,
-                f"<title>{html.escape(self._title)}</title>"
-                '<link rel="icon" href="/static/icon.svg" />'
-                '<link rel="stylesheet" href="/static/page.css" />'
-                f"<script>{_FORGET_TOKEN} window.cartsConfiguration = {configuration};</script>"
-                '<script src="/static/page.js" defer></script>'
-                '<script src="/static/paint.js" defer></script>'
-                '<script src="/static/marks.js" defer></script>'
-                '<script src="/static/loupe.js" defer></script>'
-                '<script src="/static/drag.js" defer></script>'
-                '<script src="/static/lanes.js" defer></script>'
-                '<script src="/static/timeline.js" defer></script>'
-                '<script src="/static/tour.js" defer></script>'
-                '<script src="/static/shell.js" defer></script>'
-                '<link rel="stylesheet" href="/static/document.css" />'
-                '<script src="/static/document.js" defer></script>',
-                1,
-            )
-            .encode()
+        configuration = html.escape(json.dumps({**ids, **said}), quote=True)
+        head = (
+            f"<title>{html.escape(self._title)}</title>"
+            '<link rel="icon" href="/static/icon.svg" />'
+            '<link rel="stylesheet" href="/static/page.css" />'
+            '<link rel="stylesheet" href="/static/document.css" />'
+            f'<script src="/static/boot.js" data-configuration="{configuration}"></script>'
         )
+        scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
+        return index_of_viser(head + scripts, nonce).encode()

@@ -102,6 +102,4 @@ class TabPage:
 
 def call(client: viser.ClientHandle, name: str, *arguments: Any) -> None:
     """Call `window.carts[name](*arguments)` in one tab; unknown names are ignored there."""
-    values = ", ".join(json.dumps(argument) for argument in arguments)
-    source = f"window.carts && window.carts[{json.dumps(name)}] && window.carts[{json.dumps(name)}]({values});"
-    run_script(client, source)
+    run_script(client, json.dumps({"name": name, "args": arguments}))

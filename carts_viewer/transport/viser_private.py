@@ -66,7 +66,10 @@ def image_file(handle: viser.ImageHandle) -> bytes:
 
 
 def run_script(client: viser.ClientHandle, source: str) -> None:
-    """Run JavaScript in one tab. Never broadcast: viser replays a broadcast script to every tab that joins later."""
+    """Send a script to one tab, where `static/boot.js` takes JSON only and runs no code.
+
+    Never broadcast: viser replays a broadcast script to every tab that joins later.
+    """
     client._websock_connection.queue_message(RunJavascriptMessage(source=source))
 
 

@@ -270,6 +270,61 @@ def test_a_client_that_never_reads_holds_nobody_up(assembler: Assembler) -> None
         server.close()
 
 
+def _accepted(server: StreamServer) -> bool:
+    """Whether one more client gets a result."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as client:
+        time.sleep(0.1)
+        server.send(ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}))
+        return isinstance(next(_answers(client), None), ResultMessage)
+
+
+def test_connections_that_were_closed_before_the_first_result_keep_no_places(assembler: Assembler) -> None:
+    server = StreamServer(assembler, 0)
+    try:
+        for _ in range(40):
+            socket.create_connection(("127.0.0.1", server.port), timeout=20).close()
+        time.sleep(0.3)
+        assert _accepted(server)
+    finally:
+        server.close()
+
+
+def test_silent_clients_make_room_when_all_places_are_taken(
+    assembler: Assembler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = StreamServer(assembler, 0)
+    silent = [socket.create_connection(("127.0.0.1", server.port), timeout=20) for _ in range(16)]
+    try:
+        time.sleep(0.2)
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as late:
+            (answer,) = _answers(late)
+            assert isinstance(answer, ErrorMessage) and "16 clients are connected" in answer.message
+        monkeypatch.setattr("carts_core.live.server._SILENCE", 0.2)
+        time.sleep(0.3)
+        silent[0].sendall(packed(FrameMessage(0.1, JOINTS)))
+        time.sleep(0.1)
+        assert _accepted(server)
+        assert isinstance(next(_answers(silent[0])), ResultMessage)
+        assert sum(next(_answers(each), None) is None for each in silent[1:]) == 1
+    finally:
+        server.close()
+        for each in silent:
+            each.close()
+
+
+def test_a_sender_that_has_ended_its_side_gets_the_result_of_its_last_frame(assembler: Assembler) -> None:
+    server = StreamServer(assembler, 0)
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as sender:
+            sender.sendall(packed(FrameMessage(0.0, JOINTS)))
+            sender.shutdown(socket.SHUT_WR)
+            time.sleep(0.2)
+            server.send(ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}))
+            assert [type(answer) for answer in _answers(sender)] == [ResultMessage]
+    finally:
+        server.close()
+
+
 def test_a_broken_connection_ends_without_an_error_for_others(assembler: Assembler) -> None:
     one, other = socket.socketpair()
     other.sendall(struct.pack(">I", 10) + b"abc")

@@ -8,6 +8,7 @@ import pytest
 from cut_off import hardly_legible
 from playwright.sync_api import Browser, expect
 from viewer_canvas import eventually
+from waiting import wait_in
 
 from carts_core.batch.folder import is_batch, known_jobs, read_jobs, write_jobs
 from carts_core.batch.manifest import read_manifest
@@ -57,7 +58,7 @@ def test_failures_come_first_and_a_frame_opens_with_what_was_found(batch: Path, 
         assert app.state.verdict is not None and app.state.pose.source.value == "optimizer"
         assert app.project.path.parent == batch / "jobs" / read_jobs(batch)[0].name
         # A page that is closed while it loads may keep the browser waiting.
-        page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+        wait_in(page, "window.__viserMutable?.nodeRefFromName['/overlay']")
         page.close()
 
 
@@ -141,6 +142,6 @@ def test_another_recording_in_the_same_tab_is_not_taken_for_a_wrong_link(
         for path, name in ((first, "tiny"), (second, "other")):
             site.post(lambda path=path: site.open_sequence(path))
             expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible(timeout=60_000)
-            page.wait_for_function(f"location.href.includes('project={name}')")
+            wait_in(page, f"location.href.includes('project={name}')")
         assert page.evaluate("localStorage.getItem('noted')") is None
         page.close()

@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import expect
 from viewer_canvas import decoded, eventually
 from viewer_tab import Tab
+from waiting import wait_in
 
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
@@ -219,7 +220,7 @@ def test_frames_between_keyframes_are_solved_while_the_page_stays_live(
     tab.button("Solve between")
     stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
     expect(stop).to_be_visible()
-    tab.page.wait_for_function("carts.timeline().solving?.[1] === 7")
+    wait_in(tab.page, "carts.timeline().solving?.[1] === 7")
     # Another tab goes on browsing meanwhile.
     other.page.keyboard.press("n")
     eventually(lambda: other.state.index, lambda index: index == 1)

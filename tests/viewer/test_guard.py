@@ -39,7 +39,9 @@ def _cookie(guard: Guard, host: str = "192.168.0.7:8080") -> str:
     return answer.partition(";")[0]
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.0.0.1:9000"])
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.0.0.1:9000", "127.0.0.2:8080"]
+)
 def test_this_computers_own_names_are_answered(local: Guard, host: str) -> None:
     assert _refusal(local, host) is None
     assert _refusal(local, host, Origin=f"http://{host}") is None
@@ -61,6 +63,37 @@ def test_a_foreign_host_name_is_refused_so_that_dns_rebinding_does_not_work(loca
 )
 def test_another_sites_page_is_refused_even_on_this_computer(local: Guard, origin: str) -> None:
     assert "own page only" in (_refusal(local, "localhost:8080", Origin=origin) or "")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "127.0.0.1", "::1", "localhost", EVERYWHERE])
+def test_the_printed_address_is_answered(host: str) -> None:
+    guard = Guard(host)
+    url = urlsplit(guard.url(8080))
+    assert guard.refusal(f"{url.path or '/'}?{url.query}", Headers(Host=url.netloc)) is None
+
+
+_NAVIGATION = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+
+
+@pytest.mark.parametrize(
+    ("site", "target", "more", "answered"),
+    [
+        ("same-origin", "/thumbnail/0/0/0.jpg", {}, True),
+        ("none", "/thumbnail/0/0/0.jpg", _NAVIGATION, True),
+        ("cross-site", "/thumbnail/0/0/0.jpg", {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"}, False),
+        ("same-site", "/thumbnail/0/0/0.jpg", {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"}, False),
+        ("cross-site", "/thumbnail/0/0/0.jpg", _NAVIGATION, False),
+        ("cross-site", "/static/page.js", {"Sec-Fetch-Dest": "script"}, False),
+        ("cross-site", "/?frame=3", _NAVIGATION, True),
+        ("cross-site", "/", {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "iframe"}, False),
+        ("cross-site", "/", {"Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}, False),
+    ],
+)
+def test_another_sites_page_may_link_to_the_page_and_load_nothing(
+    local: Guard, site: str, target: str, more: dict[str, str], answered: bool
+) -> None:
+    headers = Headers({"Host": "localhost:8080", "Sec-Fetch-Site": site} | more)
+    assert (local.refusal(target, headers) is None) == answered
 
 
 def test_a_request_with_two_hosts_or_none_is_refused(local: Guard) -> None:

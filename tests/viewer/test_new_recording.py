@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, expect
 from swaying import write_log, write_swaying
 from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
+from waiting import wait_in
 
 from carts_core.evaluation.metrics import dice
 from carts_core.model.camera import HALF_PIXEL
@@ -114,7 +115,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Stop")
     visitor.reads("Stopped; the calibration from your points is as it was.", 120)
     visitor.press("Save and open")
-    visitor.page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+    wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
     visitor.site.wait()
     assert visitor.site.app is not None
     saved = visitor.site.app.sequence
@@ -164,7 +165,7 @@ def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
         eventually(
             lambda joint=joint: place_of(visitor).draft.options.columns.get(joint), lambda found: found is not None
         )
-    visitor.page.wait_for_function("!document.querySelector('main').innerText.includes('not recognized')")
+    wait_in(visitor.page, "!document.querySelector('main').innerText.includes('not recognized')")
     place = place_of(visitor)
     assert place.draft.options.columns == names
     assert visitor.button("Continue to hand-eye").is_enabled()
@@ -230,7 +231,7 @@ def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks
     print(f"{visitor.clicks} clicks, Dice {scores}")
     assert scores["left"] >= 0.94 and scores["right"] >= 0.95, scores
     visitor.press("Save and open")
-    visitor.page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000)
+    wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
     visitor.site.wait()
     assert visitor.site.app is not None
     saved = visitor.site.app.sequence.scene

@@ -11,6 +11,7 @@ from cut_off import hardly_legible
 from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
+from waiting import wait_in
 
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
@@ -24,7 +25,7 @@ def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(
 ) -> None:
     app = open_viewer(cameras=("left", "right"), width=160, height=120)
     tab = open_tab(app)
-    tab.page.wait_for_function("carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
+    wait_in(tab.page, "carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
     left, right = (tab.page.evaluate(f"carts.imageOnScreen({index})") for index in (0, 1))
     apart = abs(left["left"] - right["left"]) >= left["width"] or abs(left["top"] - right["top"]) >= left["height"]
     assert apart and left["width"] == pytest.approx(right["width"], abs=1.0)
@@ -50,7 +51,7 @@ def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(
     # Rings have names, and do not grow with the zoom.
     expect(tab.page.locator(".carts-point text").first).not_to_be_empty()
     # The image changes places with the other one; the page may be between the two.
-    tab.page.wait_for_function("carts.imageOnScreen(1)")
+    wait_in(tab.page, "carts.imageOnScreen(1)")
     width = "document.querySelector('.carts-point circle').getBoundingClientRect().width"
     before, shown = tab.page.evaluate(width), tab.page.evaluate("carts.imageOnScreen(1).width")
     tab.page.evaluate("carts.zoomAt(4, 0.5, 0.5)")
@@ -119,7 +120,7 @@ def test_nothing_gets_in_the_way(open_viewer: Callable[..., ViewerApp], open_tab
     # Keys go on working after a list was used.
     tab.choose("Domain", "Smoke")
     eventually(lambda: app.state.domain, lambda domain: domain == "smoke")
-    tab.page.wait_for_function("document.activeElement === document.body")
+    wait_in(tab.page, "document.activeElement === document.body")
     tab.page.wait_for_timeout(150)
     tab.page.keyboard.press("b")
     eventually(lambda: app.state.index, lambda index: index == 10)
@@ -220,11 +221,11 @@ def test_jobs_go_on_while_the_page_is_used_and_a_server_that_comes_back_finds_ev
     tab.choose("Slider range", "± 20")
     tab.choose("Layer", "Contour")
     eventually(lambda: (app.state.reach, app.state.layer), lambda now: now == ("± 20", "Contour"))
-    tab.page.wait_for_function("JSON.parse(localStorage.getItem('carts-settings')).layer == 'Contour'")
+    wait_in(tab.page, "JSON.parse(localStorage.getItem('carts-settings')).layer == 'Contour'")
     # The same address answers again, by another server: frame and tab are those from before.
     app.queue.put(intents.ShowFrame(4))
     app.wait_until_shown()
-    tab.page.wait_for_function("carts.shown().frame == 4")
+    wait_in(tab.page, "carts.shown().frame == 4")
     port = int(app.url.split(":")[2].strip("/").split("/")[0].split("?")[0])
     app.close()
     expect(tab.page.locator("body.carts-offline")).to_be_attached(timeout=10_000)
@@ -334,7 +335,7 @@ def test_the_3d_view_shows_the_arms_whole_with_grid_axes_and_the_measured_arms(
     axes = "Object.keys(window.__viserMutable.nodeRefFromName).filter(name => name.endsWith('/axes')).length"
     assert tab.page.evaluate(axes) == 2
     tab.page.keyboard.press("v")
-    tab.page.wait_for_function("carts.imageOnScreen() !== null")
+    wait_in(tab.page, "carts.imageOnScreen() !== null")
 
 
 def test_every_text_can_be_read_in_the_light_and_in_the_dark(

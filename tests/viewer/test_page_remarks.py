@@ -7,6 +7,7 @@ import pytest
 from playwright.sync_api import expect
 from viewer_canvas import eventually
 from viewer_tab import Tab
+from waiting import wait_for, wait_in
 
 from carts_core.optimization import SequenceOptimizer
 from carts_core.project import ReviewState
@@ -33,7 +34,7 @@ def test_a_field_that_was_left_with_a_key_gives_the_letters_back_to_the_page(
     field.press_sequentially("5", delay=60)
     eventually(lambda: app.state.index, lambda index: index == 4)
     field.press(key)
-    tab.page.wait_for_function("document.activeElement === document.body")
+    wait_in(tab.page, "document.activeElement === document.body")
     tab.page.keyboard.press("g")
     eventually(lambda: app.state.project.review(4).state, lambda state: state is ReviewState.ACCEPTED)
 
@@ -136,7 +137,7 @@ def test_nothing_in_the_window_covers_or_cuts_off_what_stands_beside_it(
     redo = tab.page.get_by_role("button", name="Redo", exact=True).bounding_box()
     assert bar is not None and redo is not None and bar["x"] > redo["x"] + redo["width"]
     # A picture that is zoomed keeps its name and fit in view, below the tool bar.
-    tab.page.wait_for_function("carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
+    wait_in(tab.page, "carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
     tab.page.evaluate("carts.zoomAt(4, 0.5, 0.25)")
     canvas, tools = (tab.page.locator(name).first.bounding_box() for name in ("canvas", ".carts-bar"))
     assert canvas is not None and tools is not None
@@ -231,9 +232,7 @@ def test_a_note_covers_neither_the_names_of_the_pictures_nor_what_is_pressed(
     tab.place_in_viewer.put(intents.Download(1))
     note = tab.page.locator(".mantine-Notification-root", has_text="Nothing has been exported yet")
     expect(note).to_be_visible()
-    tab.page.wait_for_function(
-        "one => one.getAnimations({subtree: true}).length === 0", arg=note.element_handle(), timeout=10_000
-    )
+    wait_for(lambda: note.evaluate("one => one.getAnimations({subtree: true}).length === 0"))
     box = note.bounding_box()
     others = tab.page.locator(".carts-cell-label, .carts-review-bar button, .carts-strip canvas").all()
     assert box is not None and len(others) >= 3

@@ -23,6 +23,8 @@ def roots(tmp_path: Path) -> Roots:
     (tmp_path / "allowed" / "inner").mkdir(parents=True)
     (tmp_path / "allowed" / "inner" / "a.toml").write_text("x")
     (tmp_path / "allowed" / ".hidden").mkdir()
+    (tmp_path / "allowed" / ".hidden" / "b.toml").write_text("x")
+    (tmp_path / "allowed" / "inner" / ".c.toml").write_text("x")
     (tmp_path / "secret").mkdir()
     (tmp_path / "secret" / "s.toml").write_text("x")
     (tmp_path / "allowed" / "out").symlink_to(tmp_path / "secret")
@@ -48,6 +50,9 @@ def test_folders_and_files_below_a_root_are_listed_without_links_pipes_and_hidde
         "{root}/inner/s.toml",
         "{root}/pipe",
         "{root}/nothing",
+        "{root}/.hidden",
+        "{root}/.hidden/b.toml",
+        "{root}/inner/.c.toml",
         "{root}x",
         "/etc/passwd",
         "inner",

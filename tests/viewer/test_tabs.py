@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, Route, expect
 from viewer_canvas import Canvas, eventually
 from viewer_run import run_without_end
 from viewer_tab import Tab
+from waiting import wait_in
 
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
@@ -163,7 +164,7 @@ def test_a_link_opens_its_frame_camera_and_domain_and_takes_nobody_along(
     for intent in (intents.ShowFrame(2), intents.ShowCamera("right"), intents.ShowDomain("smoke")):
         place.put(intent)
     app.wait_until_shown()
-    first.page.wait_for_function("location.search.includes('domain=smoke') && location.search.includes('frame=3')")
+    wait_in(first.page, "location.search.includes('domain=smoke') && location.search.includes('frame=3')")
     link = first.page.url
     first.type_value(first.find("Frame"), 1)
     with closing(browser.new_context()) as context:

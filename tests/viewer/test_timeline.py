@@ -10,6 +10,7 @@ from playwright.sync_api import expect
 from viewer_canvas import decoded, eventually
 from viewer_desk import Desk
 from viewer_tab import Tab
+from waiting import wait_in
 
 from carts_core.project import Figures, Key, Review, ReviewState
 from carts_viewer import intents
@@ -128,7 +129,7 @@ def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     app.page.thumbnail = noted
     tab = open_tab(app, (1280, 800))
     strip = tab.page.locator(".carts-strip canvas")
-    tab.page.wait_for_function("carts.lanes.loaded().length >= 8")
+    wait_in(tab.page, "carts.lanes.loaded().length >= 8")
     box = strip.bounding_box()
     assert box is not None
     # Pictures do not overlap, so a sequence of 60 frames needs no more than fit beside one another.
@@ -141,7 +142,7 @@ def test_the_timeline_shows_thumbnails_of_what_is_in_view_a_curve_and_a_range(
     assert all(19 <= frame <= 28 for frame in asked) and len(asked) == len(set(asked))
     # A curve: chosen in the page, asked for in view alone, with its value where the pointer is.
     tab.page.get_by_label("Curve", exact=True).select_option(index=4)
-    tab.page.wait_for_function("carts.lanes.curve()?.edges.length == 9 && carts.lanes.curve().edges[0] == 20")
+    wait_in(tab.page, "carts.lanes.curve()?.edges.length == 9 && carts.lanes.curve().edges[0] == 20")
     box = strip.bounding_box()
     assert box is not None
     tab.page.mouse.move(box["x"] + box["width"] * 1.5 / 8, box["y"] + 30)

@@ -5,6 +5,7 @@ from typing import Any
 
 from playwright.sync_api import Page
 from viewer_canvas import Canvas
+from waiting import wait_in
 
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import ViewState
@@ -75,7 +76,5 @@ class Tab:
 
     def wait_until_ready(self) -> None:
         """Wait for the first picture, and take away viser's warning that this browser has no graphics card."""
-        self.page.wait_for_function(
-            "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']", timeout=60_000
-        )
+        wait_in(self.page, "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']")
         self.page.locator(".mantine-Notification-closeButton").click(timeout=30_000)

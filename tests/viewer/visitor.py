@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from playwright.sync_api import Error, Locator, Page
+from waiting import wait_in
 
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_viewer.start.site import Site
@@ -96,7 +97,7 @@ class Visitor:
 
     def point_at(self, pixel: tuple[float, float], size: tuple[int, int]) -> None:
         """Click at a place of the image [px]."""
-        self.page.wait_for_function("window.carts && carts.imageOnScreen()", timeout=60_000)
+        wait_in(self.page, "window.carts && carts.imageOnScreen()")
         shown = self.page.evaluate("carts.imageOnScreen()")
         box = self.page.locator("canvas").first.bounding_box()
         assert box is not None

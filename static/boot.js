@@ -1,0 +1,38 @@
+// Runs before viser's client: takes the configuration of the page, and calls of the server in place of its scripts.
+(() => {
+  "use strict";
+
+  window.cartsConfiguration = JSON.parse(document.currentScript.dataset.configuration);
+
+  // The token is not needed any more, and would be copied with the address.
+  const address = new URL(location.href);
+  address.searchParams.delete("token");
+  history.replaceState(null, "", address);
+
+  /** An element with attributes and children; a text is a text, never HTML. */
+  window.cartsElement = (tag, attributes = {}, ...children) => {
+    const made = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    made.append(...children);
+    return made;
+  };
+
+  /** Call a function of `window.carts`; unknown names are ignored. */
+  function call({ name, args }) {
+    if (Object.hasOwn(window.carts ?? {}, name)) window.carts[name](...args);
+  }
+
+  // viser's client runs `Function(source)()` for a RunJavascriptMessage, which would need `unsafe-eval` in the policy. The
+  // server sends the name of a function and its arguments as JSON instead (`call` in tab_page.py). Any other source does
+  // nothing: viser's sorter of Gaussian splats, which is not used here, prepares some when it is loaded.
+  const inert = () => inert;
+  const receive = (source) => {
+    if (!String(source).startsWith("{")) return inert;
+    const message = JSON.parse(source);
+    return () => call(message);
+  };
+  window.Function = new Proxy(Function, {
+    apply: (_, __, sources) => receive(sources.at(-1)),
+    construct: (_, sources) => receive(sources.at(-1)),
+  });
+})();

@@ -1,0 +1,144 @@
+"""Nothing that a recording, a project, a batch or another site brings runs as a script in the page."""
+
+import http.server
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+
+import pytest
+from playwright.sync_api import Browser
+from playwright.sync_api import Page as Tab
+from waiting import get, wait_for, wait_in
+
+from carts_viewer.transport.document import Document
+from carts_viewer.transport.page import Page
+
+pytestmark = pytest.mark.browser
+
+
+@dataclass
+class OtherSite:
+    """A web server of somebody else, at another origin."""
+
+    address: str
+    page: str = ""
+    asked: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def other_site() -> Iterator[OtherSite]:
+    """Serves one page, and keeps what it was asked for."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            site.asked.append(self.path)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(site.page.encode())
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Says nothing."""
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        site = OtherSite(f"http://localhost:{server.server_address[1]}")
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield site
+        server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    page = Page(host="127.0.0.1", port=0, title="Scripts")
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def tab(browser: Browser, page: Page) -> Iterator[Tab]:
+    with closing(browser.new_context()) as context:
+        tab = context.new_page()
+        tab.add_init_script(
+            "window.ran = []; window.blocked = [];"
+            "document.addEventListener('securitypolicyviolation', (event) => blocked.push(event.effectiveDirective));"
+        )
+        tab.goto(page.url)
+        wait_in(tab, "window.carts && window.__viserMutable?.canvas")
+        yield tab
+
+
+@pytest.mark.parametrize(
+    ("directive", "injected"),
+    [
+        ("script-src-elem", "append(Object.assign(document.createElement('script'), {textContent: 'ran.push(1)'}))"),
+        ("script-src-elem", "append(Object.assign(document.createElement('script'), {src: OTHER + '/script.js'}))"),
+        ("script-src-attr", "innerHTML = `<img src=x onerror='ran.push(1)'>`"),
+        ("script-src-attr", "innerHTML = `<svg onload='ran.push(1)'></svg>`"),
+        ("script-src-elem", "innerHTML = `<a href='javascript:ran.push(1)'>x</a>`; box.firstChild.click()"),
+        ("img-src", "innerHTML = `<img src='${OTHER}/image.png'>`"),
+        ("img-src", "innerHTML = `<div style='background: url(${OTHER}/style.png)'>x</div>`"),
+        ("style-src-elem", "innerHTML = `<link rel='stylesheet' href='${OTHER}/style.css'>`"),
+        ("frame-src", "innerHTML = `<iframe src='${OTHER}/frame'></iframe>`"),
+        ("object-src", "innerHTML = `<object data='${OTHER}/object'></object>`"),
+        ("form-action", "innerHTML = `<form action='${OTHER}/form'></form>`; box.firstChild.submit()"),
+        ("base-uri", "append(Object.assign(document.createElement('base'), {href: OTHER}))"),
+    ],
+)
+def test_what_is_injected_into_the_page_neither_runs_nor_loads(
+    tab: Tab, other_site: OtherSite, directive: str, injected: str
+) -> None:
+    box = "const box = document.body.appendChild(document.createElement('div')); box."
+    tab.evaluate(f"() => {{ const OTHER = '{other_site.address}'; {box}{injected}; }}")
+    wait_for(lambda: directive in tab.evaluate("blocked"))
+    assert tab.evaluate("ran") == [] and other_site.asked == []
+
+
+def test_a_script_of_the_server_is_no_code_in_the_page(tab: Tab) -> None:
+    for source in ("ran.push(1)", 'carts.tell("x")', "return ran"):
+        assert tab.evaluate("(source) => typeof Function(source)() + typeof new Function(source)()", source)
+    call = '{"name": "setHints", "args": [{}]}'
+    assert (
+        tab.evaluate("(source) => { carts.setHints = (hints) => ran.push(hints); Function(source)(); }", call) is None
+    )
+    assert tab.evaluate("ran") == [{}]
+
+
+def test_of_a_document_only_what_documents_are_made_of_is_shown(tab: Tab, page: Page, other_site: OtherSite) -> None:
+    document = Document(page)
+    document.show(
+        "<h1 onclick='ran.push(1)' class='kept'>Title</h1><script>ran.push(1)</script><iframe srcdoc='<b>'></iframe>"
+        f"<img src='{other_site.address}/i.png' onerror='ran.push(1)'><img src='/media/0a.jpg'>"
+        "<a href='javascript:1'>x</a>"
+        "<svg><polyline points='0,0 1,1'/><animate onbegin='ran.push(1)'/><foreignObject><b>x</b></foreignObject></svg>"
+    )
+    tab.get_by_role("heading", name="Title").wait_for()
+    assert tab.locator("main").inner_html() == (
+        '<h1 class="kept">Title</h1><img><img src="/media/0a.jpg"><svg><polyline points="0,0 1,1"></polyline></svg>'
+    )
+    assert tab.evaluate("ran") == [] and other_site.asked == []
+    document.show("")
+
+
+def test_another_sites_page_loads_nothing_of_the_viewer_and_may_link_to_it(
+    browser: Browser, page: Page, other_site: OtherSite
+) -> None:
+    icon, script = f"{page.url}/static/icon.svg", f"{page.url}/static/boot.js"
+    other_site.page = (
+        f"<img id=icon src='{icon}'><script src='{script}' onload='window.loaded = 1'></script>"
+        f"<iframe src='{page.url}'></iframe><a href='{page.url}'>go</a>"
+    )
+    with closing(browser.new_context()) as context:
+        tab = context.new_page()
+        tab.goto(other_site.address)
+        assert tab.evaluate("[window.loaded, icon.naturalWidth]") == [None, 0]
+        tab.get_by_text("go").click()
+        wait_in(tab, "window.carts && window.__viserMutable?.canvas")
+    for path in ("/", "/static/icon.svg", "/nothing"):
+        assert get(page.url, path).headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    other_site.asked.clear()
+
+
+@pytest.mark.parametrize("path", ["//", "/./", "/index.html/", "/%69ndex.html", "/.//index.html?x"])
+def test_the_page_is_served_with_its_policy_or_not_at_all(page: Page, path: str) -> None:
+    assert get(page.url, path).status == 404
