@@ -4,11 +4,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from ..errors import SettingsError
 
 Clock = Literal["s", "ms", "us", "ns"]
+AngleUnit = Literal["rad", "deg", "percent"]
+LengthUnit = Literal["m", "dm", "cm", "mm"]
 Axes = Literal["opencv", "dvrk"]
 """Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
 
@@ -26,21 +28,23 @@ class ImportOptions:
     calibration: Mapping[str, Path] = field(default_factory=dict)
     """Camera -> its calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
     kinematics: Path | None = None
-    """Table of joint positions or tip poses (CSV, Parquet, NPY)."""
+    """Table of joint positions or tip poses (CSV, Parquet, NPY); `none` for images alone."""
     columns: Mapping[str, str] = field(default_factory=dict)
     """Joint, or `time` or `frame` -> column of that table."""
-    angle_unit: Literal["rad", "deg"] | None = None
-    """Of the table's angles."""
-    length_unit: Literal["m", "mm"] | None = None
-    """Of the table's lengths."""
+    angle_unit: AngleUnit | None = None
+    """Of the angles; `percent` is -100 to 100 of the range of each joint."""
+    length_unit: LengthUnit | None = None
+    """Of the lengths."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Joint -> its own unit, where it is another one than that of the rest."""
     flip: tuple[str, ...] = ()
-    """Joints of that table whose sign is the other way round."""
+    """Joints whose sign is the other way round."""
     clock: Clock | None = None
     """Unit of the table's times."""
     time_offset: float | None = None
     """Time in the kinematics minus time of the image [s]."""
     frame_rate: float | None = None
-    """Of images without times [1/s]."""
+    """Of images without times, or in place of a video's constant rate [1/s]."""
     arms: Mapping[str, str] = field(default_factory=dict)
     """Arm -> what the recording calls it; only these are imported."""
     robot: Mapping[str, str] = field(default_factory=dict)
@@ -58,3 +62,7 @@ class ImportOptions:
                 raise SettingsError(f"{name} is {value}; give a finite number.")
         if self.frame_rate is not None and not 0.01 <= self.frame_rate <= 1000:
             raise SettingsError(f"frame_rate is {self.frame_rate:g}; allowed is 0.01 to 1000 frames per second.")
+        for joint, unit in self.units.items():
+            if unit not in (*get_args(AngleUnit), *get_args(LengthUnit)):
+                allowed = ", ".join((*get_args(AngleUnit), *get_args(LengthUnit)))
+                raise SettingsError(f"the unit of {joint} is {unit!r}; allowed is {allowed}.")

@@ -3,15 +3,21 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ...errors import SequenceError
+from ...model.instruments import robot_file
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import SECONDS, Clock, ImportOptions
+from ...settings.importing import ImportOptions
+from ..joint_limits import LENGTH_UNITS, Joint, joints_of
 from .foreign_tables import ForeignTable
 from .found import Note
+from .joint_units import in_si, joints_of_arm, length_unit
 from .logs import ArmLog, track
+from .media import IMAGE_SUFFIXES
+from .row_matching import LogRows
 
 _ARM = re.compile(r"(?i)(?:^|[^a-z])(psm\d?)(?![a-z])")
 _FILLER = set(
@@ -41,6 +47,21 @@ _POSE = {
     **{name: f"q{axis}" for axis in "xyzw" for name in (f"q{axis}", f"orientation {axis}", f"quat {axis}")},
     **{f"rotation {axis}": f"q{axis}" for axis in "xyzw"},
 }
+_STATE = {
+    "pos",
+    "position",
+    "q",
+    "state",
+    "observation",
+    "measured",
+    "actual",
+    "rad",
+    "deg",
+    "angle",
+    "value",
+    "action",
+}
+"""Words beside the name of a joint."""
 _POSE_ORDER = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = (
     "timestamp",
@@ -54,11 +75,14 @@ _TIMES = (
     "time ms",
     "time ns",
 )
-_FRAMES = ("frame", "frame id", "frame index", "frame number", "image", "image id", "index", "id", "file", "filename")
-_DEGREES_FROM = (3.1, 1.4, 7.0, 1.8, 1.8)
-"""[rad] Yaw, pitch, roll, wrist pitch and wrist yaw of no PSM turn that far, so larger angles are degrees."""
-_MILLIMETRES_FROM = 1.0
-"""[m] No instrument is inserted that far."""
+_FRAMES = (
+    *("frame", "frame id", "frame index", "frame number", "frame no", "image", "image id", "image number", "img"),
+    *("picture", "file", "filename", "index", "id", ""),
+)
+_GENERAL = set("motor no nr number axis dof actuator encoder instrument tool robot arm arms channel ch".split())
+"""Words of numbered columns that can be joints of a PSM; another word is another robot's name."""
+_REACH = 0.5
+"""[m] Largest distance of a tip from its base or camera."""
 
 
 @dataclass(frozen=True)
@@ -72,34 +96,192 @@ class ColumnMeanings:
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
-    """What the columns of a table mean; a person's choice comes before guesses.
+    """What the columns of a table mean; a person's choice comes before names, and names before places.
 
     Raises:
-        SequenceError: a chosen column is not there.
+        SequenceError: a chosen column is not there, or columns are joints of a robot of which some are missing.
     """
-    words = {column: " ".join(re.findall(r"[a-z]+|\d+", _spaced(column))) for column in table.columns}
-    time = options.columns.get("time") or _first(words, _TIMES)
-    frame = options.columns.get("frame") or _first(words, _FRAMES)
+    others = other_robots(options)
+    _check_chosen(table, options, others)
+    spoken = {column: _words(column) for column in table.columns}
+    words = {column: text for column, text in spoken.items() if column not in _name_columns(table)}
+    words |= {column: _words(name) for column, name in _named_places(table).items()}
+    time = options.columns.get("time") or _first(words, _TIMES) or _dated(table)
+    frame = options.columns.get("frame") or _file_names(table) or _first(words, _FRAMES)
+    chosen = {joint: column for joint, column in options.columns.items() if joint not in ("time", "frame")}
+    if others:
+        arm, joints = next(iter(others.items()))
+        return ColumnMeanings(time, frame, {arm: _joints_by_name(table, words, joints, chosen)})
     arms: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         if column in (time, frame):
             continue
-        match = _ARM.search(column.replace("_", " "))
-        arm = match.group(1).upper() if match else ""
+        arm = arm_in(column)
         meaning = _meaning(re.sub(r"\bpsm ?\d?\b", "", text).strip(), _mentions_pose(column))
         if meaning is not None:
             arms.setdefault(arm, {}).setdefault(meaning, column)
     arms = {arm: _numbers_to_joints(found) for arm, found in arms.items()}
-    chosen = {joint: column for joint, column in options.columns.items() if joint not in ("time", "frame")}
     if chosen:
         arms = {next(iter(options.arms), next(iter(arms), "")): chosen}
-    for column in options.columns.values():
-        if column not in table.columns:
-            raise SequenceError(f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
     usable = {arm: found for arm, found in arms.items() if _has_joints(found) or _has_pose(found)}
     if not usable and not chosen:
         usable = _numbered_family(words, (time, frame))
     return ColumnMeanings(time, frame, usable)
+
+
+def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
+    """Arm -> joints, of the robots that were given and are no PSM.
+
+    Raises:
+        RobotError: a robot is missing or no URDF.
+    """
+    given = {arm: joints_of(robot) for arm, robot in options.robot.items() if robot_file(robot).is_file()}
+    return {arm: joints for arm, joints in given.items() if not {joint.name for joint in joints} >= set(JOINT_NAMES)}
+
+
+def _check_chosen(table: ForeignTable, options: ImportOptions, others: dict[str, tuple[Joint, ...]]) -> None:
+    known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
+    for meaning, column in options.columns.items():
+        if meaning not in ("time", "frame", *known):
+            raise SequenceError(f"--columns {meaning} is not known. Known are: {', '.join(known)}, time, frame.")
+        if column not in table.columns:
+            raise SequenceError(f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
+
+
+@lru_cache(maxsize=64)
+def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> tuple[int, ...] | None:
+    """Where the joints are among positions that have names; None where they have none of their own.
+
+    Args:
+        names: beside the positions, in their order; `outer_yaw` is yaw.
+        joints: that are wanted.
+
+    Raises:
+        SequenceError: names of joints are mixed with others, so the order is not known.
+    """
+    meanings = [_meaning(_words(name), pose=False) for name in names]
+    if set(joints) <= set(meanings):
+        return tuple(meanings.index(joint) for joint in joints)
+    known = [meaning in joints for meaning in meanings]
+    in_place = all(meaning == joint for meaning, joint, there in zip(meanings, joints, known, strict=False) if there)
+    if len(set(names)) > 1 and any(known) and not in_place:
+        raise SequenceError(
+            f"joint states have the names {', '.join(names)}, which are not those of {', '.join(joints)} and not in "
+            "their order. Correct the names, or import the positions from a table: --kinematics."
+        )
+    return None
+
+
+def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:
+    """Whether positions have names that say nothing of the joints."""
+    return len(set(names)) > 1 and order_of_names(names, joints) is None
+
+
+def arm_in(text: str) -> str:
+    """The PSM that a name speaks of, in capitals; empty without one."""
+    match = _ARM.search(text.replace("_", " "))
+    return match.group(1).upper() if match else ""
+
+
+def _words(column: str) -> str:
+    return " ".join(re.findall(r"[a-z]+|\d+", _spaced(column)))
+
+
+def _joints_by_name(
+    table: ForeignTable, words: dict[str, str], joints: tuple[Joint, ...], chosen: dict[str, str]
+) -> dict[str, str]:
+    """Joint of another robot -> the column with its name."""
+    found: dict[str, str] = {}
+    for joint in joints:
+        own = _words(joint.name)
+        fitting = [column for column, text in words.items() if re.search(rf"(^| ){re.escape(own)}( |$)", text)]
+        exact = [column for column in fitting if " ".join(w for w in words[column].split() if w not in _STATE) == own]
+        fitting = exact if len(exact) == 1 else fitting
+        if joint.name in chosen:
+            found[joint.name] = chosen[joint.name]
+        elif len(fitting) == 1:
+            found[joint.name] = fitting[0]
+    if missing := [joint.name for joint in joints if joint.name not in found and "finger" not in joint.name]:
+        raise SequenceError(
+            f"{table.path} has no column of {', '.join(missing)}; its columns are {', '.join(table.columns)}. Name "
+            f"them: --columns {missing[0]} COLUMN ..."
+        )
+    return found
+
+
+def _name_columns(table: ForeignTable) -> dict[str, re.Match[str]]:
+    """Columns `name_0`, `name_1` ... of a message with names beside its positions."""
+    found = {}
+    for column, cells in table.columns.items():
+        match = re.fullmatch(r"(?i)(.*?)(?:joint_?)?names?([._ \[]*)(\d+)\]?", column)
+        if match is not None and cells.dtype.kind in "UO":
+            found[column] = match
+    return found
+
+
+def _named_places(table: ForeignTable) -> dict[str, str]:
+    """Column of a position -> the name that the column of names gives it.
+
+    Raises:
+        SequenceError: a name changes from row to row.
+    """
+    named = {}
+    for column, match in _name_columns(table).items():
+        names = {str(cell).strip() for cell in table.columns[column]}
+        if len(names) != 1:
+            raise SequenceError(
+                f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so positions "
+                "change their meaning from row to row. Sort them, or name the columns of one order: --columns."
+            )
+        place = re.compile(rf"(?i){re.escape(match[1])}(?:joint_?)?positions?[._ \[]*0*{int(match[3])}\]?")
+        for other in table.columns:
+            if place.fullmatch(other):
+                named[other] = f"{match[1]} {names.pop()}"
+                break
+    return named
+
+
+def _file_names(table: ForeignTable) -> str | None:
+    """The column whose cells are names of image files."""
+    for column, cells in table.columns.items():
+        if cells.dtype.kind in "UO" and len(cells):
+            hits = sum(str(cell).strip().lower().endswith(IMAGE_SUFFIXES) for cell in cells)
+            if hits >= 0.9 * len(cells):
+                return column
+    return None
+
+
+def _dated(table: ForeignTable) -> str | None:
+    """The only column of dates, which are nanoseconds since 1970."""
+    found = [column for column in table.dates]
+    return found[0] if len(found) == 1 else None
+
+
+def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
+    """What the rows of a table say about images.
+
+    Raises:
+        SequenceError: a cell of the times is no number.
+    """
+    return LogRows(
+        table.path.name,
+        len(table),
+        None if meanings.time is None else table.numbers(meanings.time),
+        meanings.time or "",
+        None if meanings.frame is None else table.columns[meanings.frame],
+        meanings.frame or "",
+    )
+
+
+def samples(table: ForeignTable, most: int = 30) -> str:
+    """The columns of a table with a value of each, for errors."""
+    columns = list(table.columns.items())
+    text = ", ".join(f"{name} ({_sample(values[0])})" for name, values in columns[:most])
+    return f"{text} and {len(columns) - most} more" if len(columns) > most else text
+
+
+def _sample(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> dict[str, dict[str, str]]:
@@ -107,7 +289,7 @@ def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> d
     families: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         number = re.fullmatch(r"(.*?)(\d+)(\D*)", text)
-        if number and column not in others:
+        if number and column not in others and set(f"{number[1]} {number[3]}".split()) <= _GENERAL | _FILLER:
             families.setdefault(f"{number[1]}#{number[3]}", {})[f"#{int(number[2])}"] = column
     fitting = [family for family in families.values() if len(family) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1)]
     found = _numbers_to_joints(fitting[0]) if len(fitting) == 1 else {}
@@ -169,38 +351,6 @@ def _has_pose(found: dict[str, str]) -> bool:
     return set(_POSE_ORDER) <= set(found)
 
 
-def seconds(table: ForeignTable, column: str, clock: Clock | None, note: Callable[[Note], None]) -> np.ndarray:
-    """A column of times in seconds; its unit is guessed where it is not given.
-
-    Raises:
-        SequenceError: times do not increase.
-    """
-    values = table.numbers(column)
-    if clock is None:
-        clock = guess_clock(np.asarray(values, np.float64))
-        note(Note("guessed", f"{table.path.name}: times of column {column!r} are in {clock} (change: --clock)."))
-    if len(values) > 1 and (backwards := np.diff(values.astype(np.float64)) < 0).any():
-        row = int(np.flatnonzero(backwards)[0]) + 1
-        raise SequenceError(
-            f"{table.path}, column {column!r}: times go back from {values[row - 1]} to {values[row]}, row {row + 1}. "
-            "Sort the rows, or name another column: --columns time COLUMN."
-        )
-    return np.asarray(values, np.float64) * SECONDS[clock]
-
-
-def guess_clock(values: np.ndarray) -> Clock:
-    """The unit of times, by their size (where they count from 1970) or their spacing."""
-    largest = float(np.nanmax(np.abs(values))) if len(values) else 0.0
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
-        if largest >= least:
-            return unit  # pyright: ignore[reportReturnType]
-    step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
-    for unit, least in (("ns", 9e5), ("us", 9e2), ("ms", 0.9)):
-        if step >= least:
-            return unit  # pyright: ignore[reportReturnType]
-    return "s"
-
-
 def arm_log(
     table: ForeignTable,
     arm: str,
@@ -211,54 +361,67 @@ def arm_log(
 ) -> ArmLog:
     """The log of one arm from its columns, in radians and metres.
 
+    Args:
+        table: with the columns.
+        arm: its name.
+        found: joint or part of a pose -> column.
+        times: of the rows, or positions of their images; NaN for rows of no image.
+        options: with units and signs.
+        note: called with what was guessed.
+
     Raises:
-        SequenceError: a cell is no number, or a joint to be flipped does not exist.
+        SequenceError: a cell is no number, a unit is not clear, or a joint to be flipped does not exist.
     """
-    if _has_joints(found):
-        values = np.stack([table.numbers(found[name]).astype(np.float64) for name in JOINT_NAMES], 1)
-        columns = [found[name] for name in JOINT_NAMES]
-        angles = [index for index in range(6) if index != 2]
-        degrees, millimetres = _units(values[:, angles], values[:, 2], columns, options)
-        values[:, angles] *= np.pi / 180 if degrees else 1.0
-        values[:, 2] *= 1e-3 if millimetres else 1.0
-        for joint in options.flip:
-            if joint not in JOINT_NAMES:
-                raise SequenceError(f"--flip {joint} is no joint. Joints are: {', '.join(JOINT_NAMES)}.")
-            values[:, JOINT_NAMES.index(joint)] *= -1.0
-        note(Note("guessed", f"{arm}: joints are {', '.join(columns)} (change: --columns yaw COLUMN ...)."))
-        log = ArmLog(arm, joints=track([(time, *row) for time, row in zip(times, values, strict=True)]))
-    else:
-        values = np.stack([table.numbers(found[name]).astype(np.float64) for name in _POSE_ORDER], 1)
-        degrees, millimetres = _units(np.zeros((1, len(_DEGREES_FROM))), values[:, :3], [found["x"]], options)
-        values[:, :3] *= 1e-3 if millimetres else 1.0
-        columns = [found[name] for name in _POSE_ORDER]
-        poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
-        seen = arm in options.base
-        frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
-        note(Note("guessed", f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
-        log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses)
-    if "jaw" in found:
-        opening = table.numbers(found["jaw"]).astype(np.float64) * (np.pi / 180 if degrees else 1.0)
-        log = replace(log, jaw=track(list(zip(times, opening, strict=True))))
-    note(
-        Note(
-            "guessed",
-            f"{arm}: angles are in {'deg' if degrees else 'rad'}, lengths in {'mm' if millimetres else 'm'} "
-            "(change: --angle-unit, --length-unit).",
-        )
-    )
-    return log
+    other = other_robots(options).get(arm)
+    if other is None and not _has_joints(found):
+        return _pose_log(table, arm, found, times, options, note)
+    joints = {joint.name: joint for joint in other or joints_of_arm(arm, options)}
+    order = [*joints] if other is not None else [*JOINT_NAMES, "jaw"]
+    free = {name: Joint(name, name != "insertion", -np.inf, np.inf) for name in order}
+    chosen = [joints.get(name, free[name]) for name in order if name in found]
+    columns = [found[joint.name] for joint in chosen]
+    raw = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
+    spoken = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
+    values = in_si(raw, chosen, options, note, arm=arm, columns=spoken, instrument=other is None)
+    note(Note("guessed", f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
+    logged = track([(time, *row) for time, row in zip(times, values, strict=True)])
+    if other is not None:
+        return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in chosen), si=True)
+    jaw = None if "jaw" not in found else track(list(zip(times, values[:, order.index("jaw")], strict=True)))
+    if logged is not None:
+        logged = replace(logged, values=logged.values[:, : len(JOINT_NAMES)])
+    return ArmLog(arm, joints=logged, jaw=jaw, si=True)
 
 
-def _units(angles: np.ndarray, lengths: np.ndarray, columns: list[str], options: ImportOptions) -> tuple[bool, bool]:
-    """Whether angles are degrees and lengths millimetres: as given, as a column's name says, or by their size."""
-    text = " ".join(columns).lower()
-    degrees = re.search(r"deg|°", text) is not None or bool((np.nanmax(np.abs(angles), 0) > _DEGREES_FROM).any())
-    millimetres = re.search(r"(^|[^a-z])mm([^a-z]|$)", text) is not None or float(np.nanmax(np.abs(lengths))) > (
-        _MILLIMETRES_FROM
-    )
-    if options.angle_unit is not None:
-        degrees = options.angle_unit == "deg"
-    if options.length_unit is not None:
-        millimetres = options.length_unit == "mm"
-    return degrees, millimetres
+def _pose_log(
+    table: ForeignTable,
+    arm: str,
+    found: dict[str, str],
+    times: np.ndarray,
+    options: ImportOptions,
+    note: Callable[[Note], None],
+) -> ArmLog:
+    """The log of an arm whose tip's pose is in the table."""
+    columns = [found[name] for name in _POSE_ORDER]
+    values = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
+    unit = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])
+    if unit is None:
+        unit = length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's place")
+    values[:, :3] *= LENGTH_UNITS[unit]
+    note(Note("guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
+    poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
+    seen = arm in options.base
+    frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
+    note(Note("guessed", f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
+    log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
+    if "jaw" not in found:
+        return log
+    opening = table.numbers(found["jaw"]).astype(np.float64)
+    degrees = options.units.get("jaw", options.angle_unit) == "deg" or re.search(r"(?i)deg|°", found["jaw"]) is not None
+    opening = opening * (np.pi / 180 if degrees else 1.0) * (-1.0 if "jaw" in options.flip else 1.0)
+    return replace(log, jaw=track(list(zip(times, opening, strict=True))))
+
+
+def _unit_in_names(columns: list[str]) -> str | None:
+    text = " ".join(columns)
+    return next((unit for unit in ("mm", "cm", "dm") if re.search(rf"(?i)(^|[^a-z]){unit}([^a-z]|$)", text)), None)

@@ -1,8 +1,10 @@
 """Tables of other programs: CSV, Parquet and NumPy files as named columns of numbers."""
 
 import csv
-from collections.abc import Callable
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,11 @@ from ...errors import SequenceError
 from ...extras import needs_extra
 from ...files.decoding import decoded
 from ...files.reading import TABLE, read_text
+from ...wording import shown
 
+_LONGEST_UNIT = 12
+"""Longest word that is taken for a unit."""
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
@@ -22,6 +28,14 @@ class ForeignTable:
 
     path: Path
     columns: dict[str, np.ndarray]
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Column -> its unit, where a row of units has it."""
+    dates: tuple[str, ...] = ()
+    """Columns of dates, as nanoseconds since 1970."""
+    remarks: tuple[str, ...] = ()
+    """What was unusual and how it was read, for people."""
+    lines: tuple[int, ...] = ()
+    """Line of the file of each row, from 1; empty where there are no lines."""
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
@@ -40,8 +54,12 @@ class ForeignTable:
         try:
             return values.astype(np.float64)
         except (TypeError, ValueError) as error:
+            wrong = [row for row, cell in enumerate(values) if not _is_number(str(cell))]
+            row = wrong[0] if wrong else 0
+            where = f"line {self.lines[row]}" if self.lines else f"row {row + 1}"
             raise SequenceError(
-                f"{self.path}, column {column!r} has cells that are no numbers ({error}). Correct them."
+                f"{self.path}, column {column!r} has cells that are no numbers: {len(wrong)} of {len(values)}, the "
+                f"first in {where}: {shown(str(values[row]))}. Correct them, or name another column: --columns."
             ) from error
 
 
@@ -51,7 +69,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
     Raises:
         SequenceError: it is missing, damaged, has no rows, or is of another kind.
     """
-    readers: dict[str, Callable[[Path], dict[str, np.ndarray]]] = {
+    readers: dict[str, Callable[[Path], ForeignTable | dict[str, np.ndarray]]] = {
         ".parquet": _parquet,
         ".npy": _numpy,
         ".npz": _numpy,
@@ -63,7 +81,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
     except (OSError, ValueError, csv.Error) as error:
         kinds = ", ".join(TABLE_SUFFIXES)
         raise SequenceError(f"table {path} cannot be read ({error}). Known are {kinds}. Export it again.") from error
-    table = ForeignTable(path, columns)
+    table = columns if isinstance(columns, ForeignTable) else ForeignTable(path, columns)
     if not len(table):
         raise SequenceError(f"table {path} has no rows. Export it again.")
     return table
@@ -81,44 +99,113 @@ def read_array(path: Path) -> np.ndarray:
         raise SequenceError(f"array {path} cannot be read ({error}). Copy it again.") from error
 
 
-def _csv(path: Path) -> dict[str, np.ndarray]:
-    lines = [line for line in read_text(path, TABLE).splitlines() if line.strip()]
+def _csv(path: Path) -> ForeignTable:
+    text = read_text(path, TABLE).removeprefix("\ufeff")
+    numbered = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     # Extracted dVRK topics begin with their name and type behind a mark.
-    while lines and lines[0].lstrip().startswith("#") and len(lines) > 1 and not lines[1].lstrip()[0:1].isdigit():
-        lines = lines[1:]
-    if lines and lines[0].startswith("#"):
+    while len(numbered) > 1 and numbered[0][1].lstrip().startswith("#") and not _begins_with_digit(numbered[1][1]):
+        numbered = numbered[1:]
+    if not numbered:
+        return ForeignTable(path, {})
+    numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
+    if lines[0].startswith("#"):
         lines[0] = lines[0].lstrip("# ")
-    if not lines:
-        return {}
-    delimiter = max(",;\t", key=lines[0].count)
-    spaced = not lines[0].count(delimiter)
-    tables.check_cells(len(lines) * (lines[0].count(delimiter) + 1))
-    rows = [line.split() for line in lines] if spaced else list(csv.reader(lines, delimiter=delimiter))
-    width = len(rows[0])
-    for number, row in enumerate(rows, start=1):
-        if len(row) != width:
-            raise ValueError(f"its line {number} has {len(row)} cells, the first has {width}")
-    first = [cell.strip() for cell in rows[0]]
-    named = not all(_is_number(cell) for cell in first)
+    delimiter = _delimiter(lines[:50])
+    tables.check_cells(len(lines) * (lines[0].count(delimiter or " ") + 1))
+    rows = [line.split() for line in lines] if delimiter is None else list(csv.reader(lines, delimiter=delimiter))
+    rows, remarks = _even([[cell.strip() for cell in row] for row in rows], numbers)
+    first, width = rows[0], len(rows[0])
+    commas = delimiter != ","
+    named = not all(_is_number(cell, commas) for cell in first)
     header = first if named else [f"column_{index}" for index in range(1, width + 1)]
     if len(set(header)) < len(header):
         raise ValueError("two of its columns have the same name")
-    body = rows[1:] if named else rows
-    return {name: _typed([row[index].strip() for row in body]) for index, name in enumerate(header)}
+    body, numbers = (rows[1:], numbers[1:]) if named else (rows, numbers)
+    units: dict[str, str] = {}
+    if named and len(body) > 1 and _is_row_of_units(body[0], body[1], commas):
+        units = {name: unit for name, unit in zip(header, body[0], strict=True) if unit}
+        remarks.append(f"line {numbers[0]} has units: {', '.join(f'{name} {unit}' for name, unit in units.items())}")
+        body, numbers = body[1:], numbers[1:]
+    columns = {name: _typed([row[index] for row in body], commas) for index, name in enumerate(header)}
+    if any("," in cell for row in body[:5] for cell in row) and commas:
+        remarks.append("decimal commas are read as points")
+    dates = tuple(
+        name for index, name in enumerate(header) if body and all(_DATE.fullmatch(row[index]) for row in body)
+    )
+    if empty := sum(not cell for row in body for cell in row):
+        remarks.append(f"{empty} empty cells; rows without a joint are left out")
+    return ForeignTable(path, columns, units, dates, tuple(remarks), tuple(numbers))
 
 
-def _typed(cells: list[str]) -> np.ndarray:
+def _begins_with_digit(line: str) -> bool:
+    return line.lstrip()[0:1].isdigit()
+
+
+def _delimiter(lines: list[str]) -> str | None:
+    """What separates cells; None for blanks. Semicolons and tabs come before commas, which may be decimal."""
+    for mark in ";\t":
+        if all(mark in line for line in lines):
+            return mark
+    return "," if "," in lines[0] else None
+
+
+def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], list[str]]:
+    """Rows of one length, without empty cells behind the last column; and what was unusual."""
+    width, remarks = len(rows[0]), []
+    if width > 1 and not rows[0][-1] and all(len(row) == width and not row[-1] for row in rows):
+        rows, width = [row[:-1] for row in rows], width - 1
+    elif any(len(row) == width + 1 and not row[-1] for row in rows):
+        rows = [row[:-1] if len(row) == width + 1 and not row[-1] else row for row in rows]
+        remarks.append("an empty cell at the end of its rows is ignored")
+    for number, row in zip(numbers, rows, strict=True):
+        if len(row) != width:
+            raise ValueError(f"its line {number} has {len(row)} cells, the first has {width}")
+    return rows, remarks
+
+
+def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
+    """Whether a row under the header has units: words where the row after has numbers."""
+    numeric = [index for index, cell in enumerate(after) if cell and _is_number(cell, commas)]
+    return (
+        len(numeric) >= 0.5 * len(after)
+        and all(not _is_number(row[index], commas) for index in numeric if row[index])
+        and all(len(cell) <= _LONGEST_UNIT for cell in row)
+        and any(row[index] for index in numeric)
+    )
+
+
+def _typed(cells: list[str], commas: bool = False) -> np.ndarray:
+    if not cells:
+        return np.empty(0)
     for kind in (np.int64, np.float64):
         try:
-            return np.array(cells, dtype=str).astype(kind) if cells else np.empty(0, kind)
+            return np.array(cells, dtype=str).astype(kind)
         except (ValueError, OverflowError):
             continue
+    if all(_DATE.fullmatch(cell) for cell in cells):
+        return _nanoseconds(cells)
+    filled = [cell or "nan" for cell in cells]
+    if any(cells) and all(_is_number(cell, commas) for cell in filled):
+        return np.array([float(cell.replace(",", ".") if commas else cell) for cell in filled])
     return np.array(cells)
 
 
-def _is_number(cell: str) -> bool:
+def _nanoseconds(cells: list[str]) -> np.ndarray:
+    """Dates as nanoseconds since 1970; without a zone they are in UTC."""
+    times = []
+    for cell in cells:
+        whole, _, rest = cell.replace("Z", "+00:00").replace(",", ".").partition(".")
+        fraction = re.match(r"\d*", rest)
+        digits, zone = (fraction[0], rest[fraction.end() :]) if fraction else ("", "")
+        moment = datetime.fromisoformat(whole + zone)
+        moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+        times.append(round(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9]))
+    return np.array(times, np.int64)
+
+
+def _is_number(cell: str, commas: bool = False) -> bool:
     try:
-        float(cell)
+        float(cell.replace(",", ".", 1) if commas else cell)
     except ValueError:
         return False
     return True

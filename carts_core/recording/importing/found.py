@@ -74,6 +74,8 @@ class FoundArm:
     """What it was taken from, for people."""
     fixed: tuple[str, ...] = ()
     """Further joints of the robot, which stay at 0."""
+    beyond_limits: bool = False
+    """Whether positions exceed the robot's limits all the same, so that the sequence file has to name their units."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,7 @@
 """From a path of any kind to a sequence file."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from ...errors import SequenceError
@@ -41,14 +43,72 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     Raises:
         CartsError: it is of no known kind, damaged, or contradicts itself.
     """
-    options = options or ImportOptions()
+    options = _with_places(path.absolute(), options or ImportOptions())
+    source = detect(path, options.source)
+    for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
+        if name not in source.uses and _is_given(options, name):
+            raise SequenceError(
+                f"--{name.replace('_', '-')} is not used for {source.label}: it is known there. Leave it out, or "
+                "choose another kind: --source."
+            )
     try:
-        return completed(detect(path, options.source).read(path.absolute(), options))
+        recording = source.read(path.absolute(), options)
+        _check_names(recording, options)
+        return completed(recording, options)
     except OSError as error:
         named = "" if error.filename is None else f" {shown(str(error.filename))}"
         raise SequenceError(
             f"{path} cannot be read:{named} {error.strerror or error}. Check that it was copied whole, and its rights."
         ) from error
+
+
+def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
+    """Options whose relative paths are seen from the working directory, else from the recording."""
+    folder = path if path.is_dir() else path.parent
+
+    def placed(given: Path | str) -> str | None:
+        return next((str(place.absolute()) for place in (Path(given), folder / given) if os.path.exists(place)), None)
+
+    table = options.kinematics
+    return replace(
+        options,
+        images={name: placed(given) or given for name, given in options.images.items()},
+        calibration={name: Path(placed(given) or given) for name, given in options.calibration.items()},
+        kinematics=None if table is None else Path(placed(table) or table),
+        robot={name: placed(given) or given for name, given in options.robot.items()},
+        base={name: Path(placed(given) or given) for name, given in options.base.items()},
+    )
+
+
+def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
+    """See that all names that were given are those of arms and cameras that were found.
+
+    Raises:
+        SequenceError: one is not; it lists those that are.
+    """
+    arms = [arm.name for arm in recording.arms]
+    cameras = [camera.name for camera in recording.cameras]
+    for what, given, known in (
+        ("arms", options.arms, arms),
+        ("robot", options.robot, arms or ["PSM1"]),
+        ("base", options.base, arms),
+        ("calibration", options.calibration, cameras),
+    ):
+        if unknown := [name for name in given if name not in known]:
+            kind = "camera" if known is cameras else "arm"
+            raise SequenceError(
+                f"--{what} {unknown[0]}: {recording.name} has no {kind} of that name. It has: "
+                f"{', '.join(known) or 'none'}. Correct the name."
+            )
+    if not arms and (
+        unused := [name for name in ("flip", "units", "angle_unit", "length_unit") if _is_given(options, name)]
+    ):
+        option = f"--{unused[0].replace('_', '-')}"
+        raise SequenceError(f"{option} is not used: {recording.name} has no kinematics. Leave it out.")
+
+
+def _is_given(options: ImportOptions, name: str) -> bool:
+    return getattr(options, name) not in (None, (), {})
 
 
 def import_recording(

@@ -12,10 +12,12 @@ from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, inverse
 from ...settings.importing import ImportOptions
 from ...wording import counted
+from ..joint_limits import Joint
 from .alignment import at_times, clock_offset, nearest
 from .dvrk_files import read_base_frames
 from .found import FoundArm, Note
 from .instrument import CANDIDATES, check_instrument, fit_base_frame
+from .joint_units import in_si, joints_of_arm
 
 _SAME_BASE = 1e-3
 """[m], [rad] A base frame nearer to the identity than this was not set in the dVRK."""
@@ -51,6 +53,10 @@ class ArmLog:
     """The dVRK's `tool_type`."""
     opencv_axes: bool = False
     """Whether `poses` and `setup` are in a camera with OpenCV's axes instead of the dVRK's."""
+    names: tuple[str, ...] = ()
+    """Joints of another robot than a PSM, which `joints` has instead of six."""
+    si: bool = False
+    """Whether units and signs that were given are applied already."""
 
 
 def track(rows: list[tuple[float, ...]]) -> Track | None:
@@ -81,6 +87,12 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
     Raises:
         SequenceError: the log has neither joints nor poses, or no joints reach most of its poses.
     """
+    if log.names:
+        assert log.joints is not None
+        T_base, base_from = _base_frame(log, options, CLASSIC, note)
+        robot = options.robot[log.name]
+        return FoundArm(log.name, log.names, log.joints.values, log.joints.times, robot, T_base, base_from)
+    log = log if log.si else _in_si(log, options, note)
     geometry = _geometry(log, options, note)
     T_camera_base, base_from = _base_frame(log, options, geometry, note)
     joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, note)
@@ -108,6 +120,19 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
         base_from,
         fixed,
     )
+
+
+def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> ArmLog:
+    """The log with the units and signs that were given for it."""
+    robot = {joint.name: joint for joint in joints_of_arm(log.name, options)}
+
+    def applied(logged: Track | None, names: tuple[str, ...]) -> Track | None:
+        if logged is None:
+            return None
+        joints = [robot.get(name, Joint(name, name != "insertion", -np.inf, np.inf)) for name in names]
+        return replace(logged, values=in_si(logged.values, joints, options, note, arm=log.name))
+
+    return replace(log, joints=applied(log.joints, JOINT_NAMES), jaw=applied(log.jaw, ("jaw",)))
 
 
 def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> PsmGeometry:

@@ -2,16 +2,19 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from ...errors import SequenceError
+from ...settings.importing import ImportOptions
 from ..images import read_image
 from ..video import SUFFIXES, Video
 from ..video_index import index_video
+from .cameras import calibration_of
+from .found import FoundCamera, Note
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _NUMBER = re.compile(r"^(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)$")
@@ -34,9 +37,10 @@ class Images:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images directly in a folder, in no order."""
+    """Images directly in a folder, in no order, without hidden files (`._001.jpg` of macOS)."""
     try:
-        return [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+        return [path for path in files if not path.name.startswith(".")]
     except (OSError, ValueError):  # a name that no file can have
         return []
 
@@ -96,3 +100,23 @@ def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
     """Ids of the frames that every camera has, in the first one's order."""
     shared = set.intersection(*(set(each.ids) for each in kinds))
     return tuple(frame for frame in kinds[0].ids if frame in shared)
+
+
+def cameras_of(
+    images: dict[str, Images], options: ImportOptions, notes: list[Note], calibrations: dict[str, Path] | None = None
+) -> tuple[FoundCamera, ...]:
+    """Cameras with their images, each with the calibration that was given or found for it.
+
+    Raises:
+        SequenceError: a calibration file is not usable.
+    """
+    known = {**(calibrations or {}), **options.calibration}
+    chosen = replace(options, calibration=known)
+    cameras = []
+    for name, each in images.items():
+        notes.append(
+            Note("found", f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
+        )
+        camera = FoundCamera(name, each.size, each.path, each.pattern)
+        cameras.append(calibration_of(camera, chosen, notes))
+    return tuple(cameras)

@@ -7,9 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
-from ...model.psm_kinematics import CLASSIC, forward
+from ...settings.importing import ImportOptions
 from ...wording import counted
 from .found import FoundArm, FoundCamera, FoundRecording, Note
+from .joint_units import check_limits
+from .views import check_in_view, check_pair, tips_of
 
 MAX_GAP = 0.1
 """[s] As in the sequence format: rows that are used may be this far away."""
@@ -21,8 +23,10 @@ _BEHIND = -1.0
 """[m] Where an arm without kinematics stands: behind the camera, where no image shows it."""
 
 
-def completed(recording: FoundRecording) -> FoundRecording:
+def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecording:
     """The recording with only the frames that have kinematics, and with stand-ins; notes say which.
+
+    Joints are compared with the limits of their robots, and base frames with what the cameras see.
 
     Raises:
         SequenceError: there are no frames, no camera, or no frame has kinematics.
@@ -36,7 +40,20 @@ def completed(recording: FoundRecording) -> FoundRecording:
     notes = list(recording.notes)
     recording = _frames_with_kinematics(recording, notes.append)
     cameras = tuple(_with_intrinsics(camera, notes.append) for camera in recording.cameras)
-    arms = tuple(_placed(arm, number, notes.append) for number, arm in enumerate(recording.arms or (FoundArm("PSM1"),)))
+    if options.time_offset is not None and all(arm.times is None for arm in recording.arms):
+        raise SequenceError(
+            f"{recording.name}: --time-offset needs times, and rows are matched with images without any. Give the "
+            "images' rate (--frame-rate), or leave it out."
+        )
+    known = tuple(
+        replace(arm, beyond_limits=not check_limits(arm, notes.append)) if arm.values is not None else arm
+        for arm in recording.arms
+    )
+    check_pair(cameras, notes.append)
+    for arm in known:
+        check_in_view(arm, cameras[0], notes.append)
+    stand_in = FoundArm("PSM1", robot=options.robot.get("PSM1", FoundArm.robot))
+    arms = tuple(_placed(arm, number, notes.append) for number, arm in enumerate(known or (stand_in,)))
     return replace(recording, cameras=cameras, arms=arms, notes=tuple(notes))
 
 
@@ -107,12 +124,12 @@ def _placed(arm: FoundArm, number: int, note: Callable[[Note], None]) -> FoundAr
         T[2, 3] = _BEHIND
         note(Note("missing", f"no kinematics of {arm.name}: it is kept behind the camera, and masks are all there is."))
         return replace(arm, T_world_base=T, base_from="nothing: behind the camera")
-    tip = forward(np.median(arm.values[:, :6], axis=0), CLASSIC)[:3, 3]
+    tip = tips_of(replace(arm, values=np.median(arm.values, axis=0)[None]))[0]
     side = -1.0 if number % 2 == 0 else 1.0
     towards = np.array([0.6 * side, 0.25, 0.76])
     turn = Rotation.align_vectors([towards / np.linalg.norm(towards)], [tip / np.linalg.norm(tip)])
     T[:3, :3] = turn[0].as_matrix()
-    T[:3, 3] = [0.0, 0.0, _DISTANCE] - T[:3, :3] @ tip
+    T[:3, 3] = [0.0, 0.0, max(_DISTANCE, 0.5 * float(np.linalg.norm(tip)))] - T[:3, :3] @ tip
     note(
         Note(
             "missing",

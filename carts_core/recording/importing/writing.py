@@ -11,12 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
-from ...files.reading import ROBOT, read_text
 from ...model.instruments import SCHEME, robot_file
-from ...model.psm_kinematics import JOINT_NAMES
-from ...model.urdf_check import parsed_urdf
 from .. import Sequence
 from ..camera_motion import ORIENTATION, POSITION
+from ..joint_limits import joints_of
 from .found import FoundArm, FoundCamera, FoundRecording
 from .placing import MAX_GAP
 
@@ -63,7 +61,7 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
     frame_columns: dict[str, list[str]] = {_HANDLE: list(recording.frame_ids)}
     start = _start(recording)
     if recording.frame_times is not None:
-        frame_columns["timestamp"] = [f"{time:.6f}" for time in recording.frame_times - start]
+        frame_columns["timestamp"] = [f"{time:.9f}" for time in recording.frame_times - start]
     for camera in recording.cameras:
         if camera.numbers is not None:
             frame_columns[_column(camera)] = [str(int(number)) for number in camera.numbers]
@@ -160,8 +158,8 @@ def _arm_lines(arm: FoundArm, place: Path, timed: bool) -> list[str]:
         raise SequenceError(
             f"robot {arm.robot} of {arm.name} is missing. Give the path of a URDF (carts robot makes one)."
         )
-    joints = parsed_urdf(read_text(urdf, ROBOT), urdf).iter("joint")
-    has_jaw = any(joint.get("name") == "jaw" and joint.get("type") != "fixed" for joint in joints)
+    names = [joint.name for joint in joints_of(arm.robot)]
+    has_jaw = "jaw" in names
     lines = [
         "",
         "[[arms]]",
@@ -172,12 +170,14 @@ def _arm_lines(arm: FoundArm, place: Path, timed: bool) -> list[str]:
     ]
     if timed and arm.times is not None:
         lines.append(f"table = {_text(_table_of(arm))}")
+    if arm.beyond_limits:
+        lines += ['angle_unit = "rad"   # Some are beyond the limits of the robot (see above).', 'length_unit = "m"']
     known = arm.columns if arm.values is not None else ()
     columns = [name for name in known if name != "jaw" or has_jaw]
     prefix = "" if arm.times is not None else f"{arm.name}."
     if columns:
         lines += ["", "[arms.joints]", *(f"{name} = {_text(prefix + name)}" for name in columns)]
-    rest = [name for name in (*JOINT_NAMES, "jaw") if name not in known and (name != "jaw" or has_jaw)]
+    rest = [name for name in names if name not in known]
     if rest:
         lines += ["", "[arms.defaults]", *(f"{name} = 0.0" for name in rest)]
     return lines

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from ...errors import SequenceError
+from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
 from ..image_sources import BAG_SUFFIXES, decode_message, open_bag
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, camera_from_info, side_of
+from ..importing.columns import order_of_names, strange_names
 from ..importing.found import FoundCamera, FoundRecording, Note, recording_name
 from ..importing.logs import ArmLog, arm_from_log, track
 from .bag_messages import header_time, messages, raw_messages, stamp_of, values_of
@@ -53,10 +55,12 @@ class _Rows:
     local_poses: list[tuple[float, ...]] = field(default_factory=list)
     setup: list[tuple[float, ...]] = field(default_factory=list)
     tool: str = ""
+    names: set[tuple[str, ...]] = field(default_factory=set)
+    """Of the joints, as messages have them."""
 
 
-def read_arm_logs(reader: Any, path: Path, options: ImportOptions) -> list[ArmLog]:
-    """What a bag has logged of its arms, by the arms' names.
+def read_arm_logs(reader: Any, path: Path, options: ImportOptions, notes: list[Note]) -> list[ArmLog]:
+    """What a bag has logged of its arms, by the arms' names; notes say of joints in another order.
 
     Raises:
         SequenceError: a message is damaged, or an arm that was asked for is not there.
@@ -86,7 +90,11 @@ def read_arm_logs(reader: Any, path: Path, options: ImportOptions) -> list[ArmLo
         if role == "tool":
             entry.tool = str(message.data)
         elif (values := values_of(message, role)) is not None:
+            if role == "joints":
+                entry.names.add(tuple(message.name))
             getattr(entry, role).append((stamp_of(message, bag_time), *values))
+    for arm, entry in sorted(rows.items()):
+        notes += [note for names in sorted(entry.names) if (note := _note_on_names(arm, names)) is not None]
     return [
         ArmLog(
             arm,
@@ -99,6 +107,16 @@ def read_arm_logs(reader: Any, path: Path, options: ImportOptions) -> list[ArmLo
         )
         for arm, entry in sorted(rows.items())
     ]
+
+
+def _note_on_names(arm: str, names: tuple[str, ...]) -> Note | None:
+    order = order_of_names(names)
+    if order is not None and order != tuple(range(len(JOINT_NAMES))):
+        return Note("found", f"{arm}: joint positions are in the order {', '.join(names)}; they are taken by name.")
+    if strange_names(names):
+        text = f"{arm}: joints are called {', '.join(names)}, which says nothing of a PSM; they are taken in the order"
+        return Note("warning", f"{text} {', '.join(JOINT_NAMES)}.")
+    return None
 
 
 def _role(match: re.Match[str]) -> str | None:
@@ -214,11 +232,13 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         topics = [connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES]
         beside = separate_images(path, topics, options, notes)
         if beside is None:
+            if options.frame_rate is not None:
+                raise SequenceError("--frame-rate is not used: the images of the bag have times. Leave it out.")
             cameras, frame_times = _cameras(reader, path, options, notes)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:
             cameras, frame_times, ids = beside.cameras, beside.times, beside.ids
-        logs = read_arm_logs(reader, path, options)
+        logs = read_arm_logs(reader, path, options, notes)
         if not logs:
             known = ", ".join(sorted(connection.topic for connection in reader.connections))
             raise SequenceError(
@@ -242,5 +262,6 @@ SOURCE = Source(
     "ROS 1 or ROS 2 bag",
     "a file .bag or .mcap, or a folder with metadata.yaml",
     _detect,
+    ("images", "time_offset", "frame_rate"),
     _read,
 )

@@ -1,12 +1,14 @@
 """Messages of a bag, and the numbers in those of the dVRK."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import SequenceError
+from ...model.psm_kinematics import JOINT_NAMES
+from ..importing.columns import order_of_names
 
 
 def messages(reader: Any, connections: list[Any], path: Path) -> Iterator[tuple[Any, int, Any]]:
@@ -56,12 +58,25 @@ def stamp_of(message: Any, bag_time: int) -> float:
     return nanoseconds * 1e-9
 
 
-def values_of(message: Any, role: str, joints: int = 6) -> tuple[float, ...] | None:
-    """Joint positions, a jaw angle, or a pose (x y z, quaternion x y z w) of a message; None if it has none."""
+def values_of(message: Any, role: str, joints: Sequence[str] = JOINT_NAMES) -> tuple[float, ...] | None:
+    """Joint positions, a jaw angle, or a pose (x y z, quaternion x y z w) of a message; None if it has none.
+
+    Args:
+        message: of a topic with this role.
+        role: "joints", "jaw" or a pose.
+        joints: names in the order of the result.
+
+    Raises:
+        SequenceError: some names are those of joints and others are not, so that the order is not known.
+    """
     if role in ("joints", "jaw"):
         positions = np.asarray(message.position, np.float64)
-        count = joints if role == "joints" else 1
-        return tuple(positions[:count]) if len(positions) >= count else None
+        names = joints if role == "joints" else ("jaw",)
+        if len(positions) < len(names):
+            return None
+        order = order_of_names(tuple(message.name), tuple(names)) if role == "joints" else None
+        chosen = positions[: len(names)] if order is None else positions[list(order)]
+        return tuple(chosen.tolist())
     pose = getattr(message, "pose", None) or getattr(message, "transform", None)
     if pose is None:
         return None

@@ -17,10 +17,12 @@ from ...files.image_size import size_problem
 from ...files.reading import IMAGE, read_bytes
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
-from ..importing.assembling import cameras_of
 from ..importing.foreign_tables import read_array, read_foreign_table
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
-from ..importing.media import Images, common_ids, find_images, image_files
+from ..importing.joint_units import in_si, joints_of_arm
+from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
+from ..importing.row_matching import by_rows, frame_times
+from ..joint_limits import Joint
 from .protocol import Source
 
 _TRUTH = "green_screen"
@@ -112,11 +114,20 @@ def _read_cts(path: Path, options: ImportOptions) -> FoundRecording:
         if file.is_file():
             table = read_foreign_table(file)
             values = np.stack(list(table.columns.values())[:6], 1).astype(np.float64)
-            arms.append(_arm(name, values, ids, file, options))
+            arms.append(_arm(name, values, ids, file, options, notes))
     if not arms:
         raise SequenceError(f"{path / _TRUTH} has no psm1_js.npy or psm2_js.npy. Copy the set again, whole.")
+    found, times = _timed(arms, ids, next(iter(images.values())), options, notes)
     return FoundRecording(
-        "a set of CTS", path.name, cameras, tuple(arms), ids, None, tuple(notes), domains=_domains(domains)
+        "a set of CTS",
+        path.name,
+        cameras,
+        found,
+        ids,
+        times,
+        tuple(notes),
+        options.time_offset or 0.0,
+        domains=_domains(domains),
     )
 
 
@@ -124,7 +135,19 @@ def _domains(names: list[str]) -> dict[str, str]:
     return {name: name for name in names} if len(names) > 1 else {}
 
 
-def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions) -> FoundArm:
+def _timed(
+    arms: list[FoundArm], ids: tuple[str, ...], images: Images, options: ImportOptions, notes: list[Note]
+) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
+    """Arms whose rows have the times of their images, where a frame rate was given, and these times [s]."""
+    times = frame_times(images, ids, options, notes.append).times
+    rows = np.arange(len(ids), dtype=float)
+    found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, notes, times)
+    return found, times
+
+
+def _arm(
+    name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions, notes: list[Note]
+) -> FoundArm:
     """Rows of the frames: row n is frame n by its number where all rows are there, else by its place."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
         raise SequenceError(f"{file} does not hold six finite joint positions a row. Copy it again.")
@@ -140,6 +163,9 @@ def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, option
         )
     columns = (*JOINT_NAMES, "jaw")[: values.shape[1]]
     robot = options.robot.get(name, "builtin:psm_lnd")
+    known = {joint.name: joint for joint in joints_of_arm(name, options)}
+    joints = [known.get(column, Joint(column, column != "insertion", -np.inf, np.inf)) for column in columns]
+    values = in_si(values, joints, options, notes.append, arm=name)
     return FoundArm(name, columns, values[rows], None, robot)
 
 
@@ -165,11 +191,22 @@ def _read_ambf(path: Path, options: ImportOptions) -> FoundRecording:
     for number in range(values.shape[1] // _AMBF_COLUMNS):
         own = values[:, _AMBF_COLUMNS * number : _AMBF_COLUMNS * (number + 1)].astype(np.float64)
         joints = np.column_stack([own[:, :6], own[:, 6] + own[:, 7]])
+        chosen = options
         if np.abs(joints[:, 2]).max() > _DECIMETRES_FROM and options.length_unit is None:
-            joints[:, 2] /= 10
+            chosen = replace(options, length_unit="dm")
             notes.append(Note("guessed", f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m)."))
-        arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, options))
-    return FoundRecording("a simulated video (AMBF)", path.name, (camera,), tuple(arms), images.ids, None, tuple(notes))
+        arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, chosen, notes))
+    found, times = _timed(arms, images.ids, images, options, notes)
+    return FoundRecording(
+        "a simulated video (AMBF)",
+        path.name,
+        (camera,),
+        found,
+        images.ids,
+        times,
+        tuple(notes),
+        options.time_offset or 0.0,
+    )
 
 
 def _is_subset(path: Path) -> bool:
@@ -219,6 +256,7 @@ CTS = Source(
     "a set of CaRTS (CTS)",
     "a folder with green_screen/psm1_js.npy and DOMAIN/images_l",
     _detect_cts,
+    ("time_offset", "frame_rate"),
     _read_cts,
 )
 AMBF = Source(
@@ -226,6 +264,7 @@ AMBF = Source(
     "a simulated video of CaRTS (AMBF)",
     "a folder with kinematics.npy and images/",
     _detect_ambf,
+    ("time_offset", "frame_rate"),
     _read_ambf,
 )
 SEGSTRONG_C = Source(
@@ -233,5 +272,6 @@ SEGSTRONG_C = Source(
     "a subset of SegSTRONG-C",
     "a folder with ground_truth/ and DOMAIN/left",
     _detect_segstrong,
+    (),
     _read_segstrong,
 )

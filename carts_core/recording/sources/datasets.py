@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from ...errors import SequenceError
 from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...settings.importing import ImportOptions
-from ..importing.assembling import by_rows, cameras_of
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import ArmLog, arm_from_log, track
-from ..importing.media import common_ids, find_images, image_files
+from ..importing.media import cameras_of, common_ids, find_images, image_files
+from ..importing.row_matching import by_rows, frame_times
 from .protocol import Source
 
 _JIGSAWS_COLUMNS = 76
@@ -70,11 +70,27 @@ def _read_surgpose(path: Path, options: ImportOptions) -> FoundRecording:
         if log is None or log.values.shape[1] != 6:
             raise SequenceError(f"{file}: {recorded} needs six joint positions in every frame. Copy it again.")
         arms.append(arm_from_log(ArmLog(str(rename.get(recorded, recorded)), joints=log), options, notes.append))
-    found, kept_ids, kept = by_rows(arms, ids, notes)
+    times = frame_times(images["left"], ids, options, notes.append).times
+    if len(rows) != len(ids):
+        text = f"{file.name} has {len(rows)} rows and there are {len(ids)} images."
+        notes.append(Note("warning", f"{text} Each row is taken for the image of its number; look at the delay."))
+    found, kept_ids, kept = by_rows(arms, ids, notes, times)
     numbered = tuple(replace(camera, numbers=kept) for camera in cameras)
-    text = "the kinematics of SurgPose need compensation, and its base frames differ from trajectory to trajectory."
+    text = (
+        "the kinematics of SurgPose need compensation, its base frames differ from trajectory to trajectory, and "
+        "rows of many are up to 71 frames late: estimate the delay with carts time-offset."
+    )
     notes.append(Note("warning", text))
-    return FoundRecording("a trajectory of SurgPose", path.name, numbered, found, kept_ids, None, tuple(notes))
+    return FoundRecording(
+        "a trajectory of SurgPose",
+        path.name,
+        numbered,
+        found,
+        kept_ids,
+        found[0].times,
+        tuple(notes),
+        options.time_offset or 0.0,
+    )
 
 
 def _yaml_rows(file: Path) -> dict[int, dict]:
@@ -150,7 +166,10 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
         raise SequenceError(f"{videos} has no {path.stem}_capture1.avi. Copy the videos of the task too.")
     cameras = cameras_of(images, options, notes)
     ids = common_ids(list(images.values()))
-    times = np.arange(len(rows), dtype=float) / _JIGSAWS_RATE
+    rate = options.frame_rate or _JIGSAWS_RATE
+    times = np.arange(len(rows), dtype=float) / rate
+    if len(rows) != len(ids):
+        notes.append(Note("warning", f"{path.name} has {len(rows)} rows and there are {len(ids)} images."))
     arms: list[FoundArm] = []
     for arm, first in _JIGSAWS_ARMS.items():
         R = rows[:, first + 3 : first + 12].reshape(-1, 3, 3)
@@ -164,9 +183,9 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
             arm, jaw=jaw, poses=logged if seen else None, local_poses=None if seen else logged, opencv_axes=True
         )
         arms.append(arm_from_log(log, options, notes.append))
-    frame_times = np.arange(len(ids)) / _JIGSAWS_RATE
+    taken = frame_times(next(iter(images.values())), ids, replace(options, frame_rate=rate), notes.append).times
     offset = options.time_offset or 0.0
-    return FoundRecording("a trial of JIGSAWS", path.stem, cameras, tuple(arms), ids, frame_times, tuple(notes), offset)
+    return FoundRecording("a trial of JIGSAWS", path.stem, cameras, tuple(arms), ids, taken, tuple(notes), offset)
 
 
 SURGPOSE = Source(
@@ -174,15 +193,17 @@ SURGPOSE = Source(
     "a trajectory of SurgPose",
     "a folder with api_jp_data.yaml and regular/left_video.mp4",
     _detect_surgpose,
+    ("time_offset", "frame_rate"),
     _read_surgpose,
 )
 ENDOVIS = Source(
-    "endovis", "a sequence of EndoVis 2017 or 2018", "a folder with left_frames/", _detect_endovis, _read_endovis
+    "endovis", "a sequence of EndoVis 2017 or 2018", "a folder with left_frames/", _detect_endovis, (), _read_endovis
 )
 JIGSAWS = Source(
     "jigsaws",
     "a trial of JIGSAWS",
     "a file TASK/kinematics/AllGestures/TRIAL.txt",
     _detect_jigsaws,
+    ("time_offset", "frame_rate"),
     _read_jigsaws,
 )

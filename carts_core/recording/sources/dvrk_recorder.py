@@ -17,6 +17,7 @@ from ...settings.importing import ImportOptions
 from ..image_sources import open_bag
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, side_of
+from ..importing.columns import order_of_names
 from ..importing.foreign_tables import ForeignTable, read_foreign_table
 from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Note
 from ..importing.logs import ArmLog, Track, arm_from_log, track
@@ -208,7 +209,7 @@ def _logs(
         reader = open_bag(bags[0])
         try:
             motion = read_endoscope(reader, bags[0], start, notes.append)
-            return read_arm_logs(reader, bags[0], options), motion
+            return read_arm_logs(reader, bags[0], options, notes), motion
         finally:
             reader.close()
     return _extracted(path, options), None
@@ -238,6 +239,10 @@ def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
 def _extracted_track(file: Path, role: str) -> Track | None:
     table: ForeignTable = read_foreign_table(file)
     columns = {"joints": _JOINT_COLUMNS, "jaw": _JOINT_COLUMNS[:1]}.get(role, _POSE_COLUMNS)
+    if role == "joints":
+        names = tuple(str(table.columns[f"name.{n}"][0]) for n in range(6) if f"name.{n}" in table.columns)
+        order = order_of_names(names) if len(names) == len(columns) else None
+        columns = columns if order is None else tuple(columns[index] for index in order)
     values = [table.numbers(column).astype(np.float64) for column in columns]
     times = table.numbers("timestamp").astype(np.float64) * 1e-9
     return track(list(zip(times, *values, strict=True)))
@@ -273,5 +278,6 @@ SOURCE = Source(
     "a session of the dVRK's recorder",
     "a folder with index.json, or videos each with a .json beside it",
     _detect,
+    ("time_offset",),
     _read,
 )

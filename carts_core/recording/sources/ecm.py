@@ -34,7 +34,7 @@ def read_endoscope(reader: Any, path: Path, start: float, note: Callable[[Note],
         rows = [
             (stamp_of(message, bag_time), *values)
             for _, bag_time, message in messages(reader, [topics[found]], path)
-            if (values := values_of(message, role, len(JOINT_NAMES))) is not None
+            if (values := values_of(message, role, JOINT_NAMES)) is not None
         ]
         logged = track(rows)
         return (

@@ -6,22 +6,23 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import SequenceError
+from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
-from ..importing.assembling import by_rows, cameras_of
 from ..importing.cameras import side_of
-from ..importing.columns import ColumnMeanings, arm_log, guess_clock, guess_columns, seconds
+from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.found import FoundArm, FoundRecording, Note
 from ..importing.logs import arm_from_log
-from ..importing.media import Images, common_ids, find_images, image_files
+from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
+from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
 from ..video import SUFFIXES
 from .protocol import Source
 
 _DEPTH = 2
 _NOT_IMAGES = ("mask", "label", "segment", "ground_truth", "annot", "depth")
 _CALIBRATION_SUFFIXES = (".yaml", ".yml", ".mat", ".ini", ".json")
-_STAMPED_DIGITS = 13
-"""Names of images with numbers this long are times."""
+_NO_TABLE = Path("none")
+"""What `--kinematics` calls images without a table."""
 
 
 def _detect(path: Path) -> bool:
@@ -45,10 +46,14 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     found = []
     for folder in _folders(path):
         try:
-            found += sorted(each for each in folder.iterdir() if each.suffix.lower() in suffixes and each.is_file())
+            found += sorted(each for each in folder.iterdir() if _is_wanted(each, suffixes))
         except OSError:
             continue
     return found
+
+
+def _is_wanted(file: Path, suffixes: tuple[str, ...]) -> bool:
+    return file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
 
 
 def _tables(path: Path) -> list[Path]:
@@ -114,66 +119,105 @@ def _looks_like_calibration(file: Path) -> bool:
     )
 
 
-def _kinematics(path: Path, options: ImportOptions) -> tuple[ForeignTable, ColumnMeanings] | None:
-    """The table that has an arm, and what its columns mean."""
+def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
+    """The table that is read as kinematics or asked about: as named, with an arm, or else with many numbers.
+
+    Raises:
+        SequenceError: the table that was named is missing or damaged, or a chosen column is not there.
+    """
+    if options.kinematics == _NO_TABLE:
+        return None
     if options.kinematics is not None:
-        table = read_foreign_table(options.kinematics if options.kinematics.is_file() else path / options.kinematics)
-        meanings = guess_columns(table, options)
+        return read_foreign_table(options.kinematics if options.kinematics.is_file() else path / options.kinematics)
+    tables = [table for table in map(_readable, _tables(path)) if table is not None]
+    known = (table for table in tables if guess_columns(table, replace(options, columns={})).arms)
+    return next(known, None) or next(filter(_is_wide, tables), None)
+
+
+def _readable(file: Path) -> ForeignTable | None:
+    try:
+        return read_foreign_table(file)
+    except SequenceError:
+        return None
+
+
+def _is_wide(table: ForeignTable) -> bool:
+    """Whether a table whose columns are not known may have joints."""
+    return len(table) > 1 and sum(values.dtype.kind in "iuf" for values in table.columns.values()) >= len(JOINT_NAMES)
+
+
+def _kinematics(path: Path, options: ImportOptions, notes: list[Note]) -> list[tuple[ForeignTable, ColumnMeanings]]:
+    """The tables that have an arm, each of another one, and what their columns mean.
+
+    Raises:
+        SequenceError: a table was named or may have joints, but its columns are not recognized; or it is damaged.
+    """
+    if options.kinematics == _NO_TABLE:
+        return []
+    if options.kinematics is not None or options.columns:
+        table = kinematics_table(path, options)
+        found = [] if table is None else [(table, guess_columns(table, options))]
+    else:
+        tables = [table for table in map(_readable, _tables(path)) if table is not None]
+        found = [(table, guess_columns(table, options)) for table in tables]
+        if not any(meanings.arms for _, meanings in found):
+            for file in _tables(path):
+                if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
+                    read_foreign_table(file)  # Whose error is of more use than none at all.
+            found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
+    known: dict[str, ForeignTable] = {}
+    chosen = []
+    for table, meanings in found:
         if not meanings.arms:
-            raise SequenceError(
-                f"{table.path} has the columns {', '.join(table.columns)}, among which six joints or a tip's pose are "
-                "not recognized. Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN "
-                "wrist_pitch COLUMN wrist_yaw COLUMN."
-            )
-        return table, meanings
-    for file in _tables(path):
-        try:
-            table = read_foreign_table(file)
-        except SequenceError:
+            if options.kinematics is not None or options.columns or len(found) == 1:
+                raise _not_recognized(table)
             continue
-        if (meanings := guess_columns(table, options)).arms:
-            return table, meanings
-    return None
+        named = _of_file(table, meanings)
+        if taken := [arm for arm in named.arms if arm in known]:
+            text = f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used"
+            remedy = "(change: --kinematics). Call files of other arms by their names, say psm2.csv."
+            notes.append(Note("warning", f"{text} {remedy}"))
+            continue
+        known |= dict.fromkeys(named.arms, table)
+        chosen.append((table, named))
+    return chosen
 
 
-def _image_times(
-    path: Path, images: Images, kinematics: Path, options: ImportOptions, notes: list[Note]
-) -> np.ndarray | None:
-    """Times of the images [s]: of the video, in the names, in a table, or of a frame rate; None without any."""
-    if images.times is not None:
-        notes.append(Note("found", f"times of the images are those of {images.path.name}."))
-        return images.times
-    if all(len(frame) >= _STAMPED_DIGITS for frame in images.ids):
-        numbers = np.array([int(frame) for frame in images.ids], np.float64)
-        clock = guess_clock(numbers)
-        notes.append(Note("guessed", f"names of the images are times in {clock}."))
-        return numbers * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[clock]
+def _not_recognized(table: ForeignTable) -> SequenceError:
+    return SequenceError(
+        f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which six joints or a tip's pose "
+        "are not recognized. Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN wrist_pitch "
+        "COLUMN wrist_yaw COLUMN; give the robot if it is no PSM (--robot NAME FILE.urdf); or leave it out "
+        "(--kinematics none)."
+    )
+
+
+def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
+    """An arm that no column names is called as the file is, where that is a PSM."""
+    name = arm_in(table.path.stem)
+    if not name or "" not in meanings.arms:
+        return meanings
+    return replace(meanings, arms={arm or name: found for arm, found in meanings.arms.items()})
+
+
+def _frames(
+    path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], options: ImportOptions, notes: list[Note]
+) -> FrameTimes:
+    """The images with their times: a table with as many rows as images comes before a video's rate."""
     for file in _tables(path):
-        if file == kinematics:
+        table = None if file in kinematics else _readable(file)
+        if table is None:
             continue
-        try:
-            table = read_foreign_table(file)
-        except SequenceError:
-            continue
-        time = guess_columns(table, replace(options, columns={})).time
-        if time is not None and len(table) == len(images.ids):
+        meanings = guess_columns(table, replace(options, columns={}, kinematics=None))
+        if meanings.time is not None and not meanings.arms and len(table) == len(ids):
             notes.append(Note("guessed", f"times of the images are in {file.name}."))
-            return seconds(table, time, None, notes.append)
-    if options.frame_rate is not None:
-        return np.arange(len(images.ids)) / options.frame_rate
-    return None
-
-
-def _frame_positions(table: ForeignTable, meanings: ColumnMeanings, ids: tuple[str, ...]) -> np.ndarray | None:
-    """Which frame each row of the table is, -1 for none; None where rows do not say and are not as many as frames."""
-    if meanings.frame is not None:
-        position = {int(frame): index for index, frame in enumerate(ids)}
-        cells = table.columns[meanings.frame]
-        digits = ["".join(filter(str.isdigit, Path(str(cell)).stem)) for cell in cells]
-        rows = np.array([position.get(int(text), -1) if text else -1 for text in digits])
-        if 2 * (rows >= 0).sum() >= min(len(ids), len(rows)):
-            return rows
-    return np.arange(len(ids)) if len(table) == len(ids) else None
+            times = row_seconds(log_rows(table, meanings), None, notes.append)
+            found = frame_times(images, ids, replace(options, frame_rate=None), lambda note: None)
+            if options.frame_rate is not None:
+                text = f"--frame-rate {options.frame_rate:g} is not used: the images have times in {file.name}."
+                notes.append(Note("warning", text))
+            return replace(found, times=times, source=file.name, nominal=False)
+    return frame_times(images, ids, options, notes.append)
 
 
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
@@ -182,70 +226,74 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     cameras = cameras_of(images, options, notes, _calibrations(path, list(images), notes))
     ids = common_ids(list(images.values()))
     for name, each in images.items():
-        if len(each.ids) != len(ids):
-            notes.append(Note("warning", f"{name} has {len(each.ids)} images, of which {len(ids)} are of all cameras."))
+        if lacking := [frame for frame in each.ids if frame not in set(ids)]:
+            shown = ", ".join(lacking[:5]) + (" ..." if len(lacking) > 5 else "")
+            text = (
+                f"{name}: {len(lacking)} of {len(each.ids)} images left out, since another camera has none of that "
+                f"frame: {shown}. To keep them, import {name} alone: --images {name} {each.path.name}."
+            )
+            notes.append(Note("warning", text))
     if not ids:
         raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
-    first = next(iter(images.values()))
-    found = _kinematics(path, options)
-    if found is None:
+    found = _kinematics(path, options, notes)
+    if not found:
         notes.append(Note("missing", f"no table with joints or poses in {path}. Name one: --kinematics FILE."))
         return FoundRecording("images without kinematics", path.name, cameras, (), ids, None, tuple(notes))
-    table, meanings = found
-    notes.append(Note("guessed", f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
-    positions = _frame_positions(table, meanings, ids)
-    if positions is not None and options.time_offset is None:
-        arms = _arms(table, meanings, positions.astype(float), options, notes)
-        arms, kept_ids, kept = by_rows(arms, ids, notes)
-        notes.append(Note("guessed", "each row belongs to one image, by its number or its place."))
-        numbered = tuple(camera if camera.pattern else replace(camera, numbers=kept) for camera in cameras)
-        return FoundRecording(
-            "a folder with images and a table", path.name, numbered, arms, kept_ids, None, tuple(notes)
-        )
-    return _by_time(path, first, cameras, ids, table, meanings, options, notes)
-
-
-def _by_time(
-    path: Path,
-    first: Images,
-    cameras: tuple[FoundCamera, ...],
-    ids: tuple[str, ...],
-    table: ForeignTable,
-    meanings: ColumnMeanings,
-    options: ImportOptions,
-    notes: list[Note],
-) -> FoundRecording:
-    times = _image_times(path, first, table.path, options, notes)
-    if times is None or meanings.time is None:
-        raise SequenceError(
-            f"{path} has {len(ids)} images and {table.path.name} has {len(table)} rows, and "
-            f"{'the images have no times' if times is None else 'the table has no times'}. Make them as many, name the "
-            "column of times (--columns time COLUMN), or give the images' rate (--frame-rate)."
-        )
-    log_times = seconds(table, meanings.time, options.clock, notes.append)
-    arms = _arms(table, meanings, log_times, options, notes)
-    offset = options.time_offset
-    if offset is None:
-        apart = times[0] > log_times[-1] or times[-1] < log_times[0]
-        offset = float(log_times[0] - times[0]) if apart else 0.0
-        text = "the clocks do not overlap: the first row is taken for the time of the first image" if apart else "0 s"
-        notes.append(Note("guessed", f"time offset: {text} (change: --time-offset)."))
+    frames = _frames(path, next(iter(images.values())), ids, [table.path for table, _ in found], options, notes)
+    arms, match = _matched(found, frames, options, notes)
+    times = match.frame_times
+    if match.by_image:
+        arms, ids, kept = by_rows(arms, ids, notes, times)
+        cameras = tuple(camera if camera.pattern else replace(camera, numbers=kept) for camera in cameras)
+        times = arms[0].times
+    offset = match.time_offset if options.time_offset is None else options.time_offset
     return FoundRecording(
         "a folder with images and a table", path.name, cameras, arms, ids, times, tuple(notes), float(offset)
     )
 
 
+def _matched(
+    found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: list[Note]
+) -> tuple[tuple[FoundArm, ...], RowMatch]:
+    """The arms of all tables, and how their rows meet images, which is one way for all.
+
+    Raises:
+        SequenceError: it is not, or does not say.
+    """
+    arms: list[FoundArm] = []
+    matches: list[RowMatch] = []
+    for table, meanings in found:
+        notes.append(Note("guessed", f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
+        notes += [Note("found", f"{table.path.name}: {remark}.") for remark in table.remarks]
+        try:
+            match = match_rows(frames, log_rows(table, meanings), options, notes.append)
+        except SequenceError as error:
+            others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
+            also = f" Beside it lies {'; '.join(others)}." if others else ""
+            raise SequenceError(f"{error}{also}") from error
+        arms += _arms(table, meanings, match.rows, options, notes)
+        matches.append(match)
+    first = matches[0]
+    if any((each.by_image, each.time_offset) != (first.by_image, first.time_offset) for each in matches):
+        names = ", ".join(table.path.name for table, _ in found)
+        raise SequenceError(
+            f"rows of {names} meet the images in several ways. Give them times of one clock and --time-offset, or name "
+            "one table: --kinematics FILE."
+        )
+    return tuple(arms), first
+
+
 def _arms(
-    table: ForeignTable, meanings: ColumnMeanings, times: np.ndarray, options: ImportOptions, notes: list[Note]
+    table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, options: ImportOptions, notes: list[Note]
 ) -> tuple[FoundArm, ...]:
+    """Arms with a time for each row; rows of no image have a negative one and are left out."""
     rename = {recorded: name for name, recorded in options.arms.items()}
     arms = []
     for recorded, found in meanings.arms.items():
         if options.arms and recorded not in rename and len(meanings.arms) > 1:
             continue
         name = rename.get(recorded) or recorded or next(iter(options.arms), "PSM1")
-        known = times >= 0 if times.dtype.kind == "f" and len(times) == len(table) else np.ones(len(table), bool)
-        log = arm_log(table, name, found, np.where(known, times, np.nan), options, notes.append)
+        log = arm_log(table, name, found, rows, options, notes.append)
         arms.append(arm_from_log(log, options, notes.append))
     return tuple(arms)
 
@@ -255,5 +303,6 @@ SOURCE = Source(
     "images or videos with a table of kinematics",
     "a folder with images or videos and a .csv, .parquet, .npy or .npz file, two levels deep",
     _detect,
+    ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"),
     _read,
 )

@@ -11,13 +11,14 @@ from ...errors import SequenceError
 from ...extras import needs_extra
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..importing.assembling import by_rows
+from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, side_of
-from ..importing.columns import arm_log, guess_columns
+from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import arm_from_log
 from ..importing.media import find_images
+from ..importing.row_matching import by_rows
 from .protocol import Source
 
 _STATE = "observation.state"
@@ -70,9 +71,9 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         )
     ids = tuple(f"{number:06d}" for number in range(rows))
     arms = _arms(root, features, episode, options, notes)
-    arms, kept_ids, kept = by_rows(arms, ids, notes)
-    found = _cameras(root, episode, kept, rows, options, notes)
-    times = np.arange(rows) / rate
+    times = _times(root, episode, rate, notes)
+    arms, kept_ids, kept = by_rows(arms, ids, notes, times)
+    found = _cameras(root, episode, kept, times, options, notes)
     return FoundRecording(
         f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})",
         f"{root.name}-{episode.index:06d}",
@@ -81,7 +82,30 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         kept_ids,
         times[kept],
         tuple(notes),
+        options.time_offset or 0.0,
     )
+
+
+def _times(root: Path, episode: _Episode, rate: float, notes: list[Note]) -> np.ndarray:
+    """The times of an episode's rows, which are its images [s]: their column, else by the rate."""
+    even = np.arange(len(episode.table)) / rate
+    if "timestamp" not in episode.table.columns:
+        return even
+    times = episode.table.numbers("timestamp").astype(np.float64)
+    if times.shape != even.shape or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        text = "the column timestamp does not increase and is not used; times are those of the rate"
+        notes.append(Note("warning", f"{text}, {rate:g} images/s."))
+        return even
+    times = times - times[0]
+    if (late := np.abs(times - even).max()) > 0.5 / rate:
+        text = (
+            f"times of the column timestamp are up to {late:.3f} s from those of {rate:g} images/s. They are used; "
+            "row n is taken for image n of the episode."
+        )
+        notes.append(Note("warning", text))
+        return times
+    # Numbers of single precision are no better than the rate.
+    return even
 
 
 def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, notes: list[Note]) -> _Episode:
@@ -157,8 +181,8 @@ def _arms(
     meanings = guess_columns(table, options)
     if not meanings.arms:
         raise SequenceError(
-            f"{root}: {_STATE} has the columns {', '.join(names)}, among which six joints or a tip's pose are not "
-            "recognized. Name them: --columns yaw COLUMN pitch COLUMN ..."
+            f"{root}: {_STATE} has the columns {samples(table)}, among which six joints of a PSM or a tip's pose "
+            "are not recognized. Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf."
         )
     rename = {recorded: name for name, recorded in options.arms.items()}
     times = np.arange(len(values), dtype=float)
@@ -172,8 +196,9 @@ def _arms(
 
 
 def _cameras(
-    root: Path, episode: _Episode, kept: np.ndarray, rows: int, options: ImportOptions, notes: list[Note]
+    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, options: ImportOptions, notes: list[Note]
 ) -> tuple[FoundCamera, ...]:
+    rows = len(times)
     chosen = {name: key for name, key in options.images.items()} or {
         side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos
     }
@@ -191,7 +216,13 @@ def _cameras(
                 f"{start + rows - 1}. Copy it again."
             )
         notes.append(Note("found", f"camera {name}: {key}, {images.size[0]} x {images.size[1]}."))
-        camera = FoundCamera(name, images.size, video, numbers=start + kept)
+        numbers = start + kept
+        if start == 0 and len(images.ids) > rows and images.times is not None:
+            # A video of this episode alone, with images that have no row.
+            numbers = nearest(times, images.times - images.times[0])[kept]
+            text = f"{video.name} has {len(images.ids)} images for {rows} rows; rows meet images by time."
+            notes.append(Note("warning", text))
+        camera = FoundCamera(name, images.size, video, numbers=numbers)
         cameras.append(calibration_of(camera, options, notes))
     return tuple(cameras)
 
@@ -201,5 +232,6 @@ SOURCE = Source(
     "a LeRobot data set, v2.1 or v3.0",
     "a folder with meta/info.json, or an episode's .parquet file in one",
     _detect,
+    ("images", "columns", "time_offset"),
     _read,
 )

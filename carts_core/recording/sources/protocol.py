@@ -20,5 +20,7 @@ class Source:
     """What shows that a folder or file is of this kind, for people."""
     detect: Callable[[Path], bool]
     """Whether a path is of this kind; quick, and without an error whatever the path is."""
+    uses: tuple[str, ...]
+    """Names of the `ImportOptions` that it uses beside those of arms, robots and calibrations, which all do."""
     read: Callable[[Path, ImportOptions], FoundRecording]
     """Everything that is found; raises a `CartsError` for what is damaged or contradicts itself."""

@@ -9,14 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SequenceError
-from ...settings.importing import SECONDS, ImportOptions
-from ..importing.assembling import cameras_of
-from ..importing.columns import guess_clock
+from ...settings.importing import ImportOptions
 from ..importing.found import FoundArm, FoundCamera, Note
-from ..importing.media import Images, common_ids, find_images
-
-_STAMPED_DIGITS = 13
-"""Names of images with numbers this long are times."""
+from ..importing.media import cameras_of, common_ids, find_images
+from ..importing.row_matching import frame_times
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +40,7 @@ def separate_images(path: Path, topics: list[str], options: ImportOptions, notes
     """The images that were named as files or folders; None where they are topics of the bag, or nobody named any.
 
     Args:
-        path: of the bag; names are relative to its folder, or to where the command is run.
+        path: of the bag; names are relative to where the command is run, or to its folder.
         topics: of its images.
         options: with the names.
         notes: what was found is added.
@@ -60,26 +56,14 @@ def separate_images(path: Path, topics: list[str], options: ImportOptions, notes
         raise SequenceError("images are either all topics of the bag or all files beside it. Name one kind.")
     images = {name: find_images(place) for name, place in files.items()}
     ids = common_ids(list(images.values()))
-    first = next(iter(images.values()))
-    known = dict(zip(first.ids, _times(first, options, notes), strict=True))
     if not ids:
         raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
-    return SeparateImages(cameras_of(images, options, notes), ids, np.array([known[name] for name in ids]))
+    first = next(iter(images.values()))
+    times = frame_times(first, ids, options, notes.append).times
+    if times is None:
+        raise SequenceError(f"images in {first.path} have no times. Say how many there are a second: --frame-rate.")
+    return SeparateImages(cameras_of(images, options, notes), ids, times)
 
 
 def _place(path: Path, given: str) -> Path | None:
-    return next((place for place in (path.parent / given, Path(given)) if os.path.exists(place)), None)
-
-
-def _times(images: Images, options: ImportOptions, notes: list[Note]) -> np.ndarray:
-    if images.times is not None:
-        notes.append(Note("found", f"times of the images are those of {images.path.name}."))
-        return images.times
-    if all(len(frame) >= _STAMPED_DIGITS for frame in images.ids):
-        numbers = np.array([int(frame) for frame in images.ids], np.float64)
-        clock = guess_clock(numbers)
-        notes.append(Note("guessed", f"names of the images are times in {clock}."))
-        return numbers * SECONDS[clock]
-    if options.frame_rate is None:
-        raise SequenceError(f"images in {images.path} have no times. Say how many there are a second: --frame-rate.")
-    return np.arange(len(images.ids)) / options.frame_rate
+    return next((place for place in (Path(given), path.parent / given) if os.path.exists(place)), None)

@@ -15,11 +15,11 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..importing.assembling import by_rows, cameras_of
 from ..importing.foreign_tables import read_foreign_table
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import ArmLog, Track, arm_from_log, track
-from ..importing.media import Images, common_ids, find_images, image_files
+from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
+from ..importing.row_matching import by_rows, frame_times
 from .protocol import Source
 
 _ARMS = ("PSM1", "PSM2", "PSM3")
@@ -60,11 +60,13 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
             arms.append(arm_from_log(log, options, notes.append))
     if not arms:
         raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy it again, whole.")
-    found, kept_ids, kept = by_rows(arms, ids, notes)
+    times = frame_times(next(iter(images.values())), ids, options, notes.append).times
+    found, kept_ids, kept = by_rows(arms, ids, notes, times)
     if packed:
         cameras = tuple(replace(camera, numbers=kept) for camera in cameras)
     kind = "an episode of SurgSync" if packed else "a clip of SurgSync"
-    return FoundRecording(kind, path.name, cameras, found, kept_ids, None, tuple(notes))
+    offset = options.time_offset or 0.0
+    return FoundRecording(kind, path.name, cameras, found, kept_ids, found[0].times, tuple(notes), offset)
 
 
 def _calibrations(path: Path, sides: tuple[str, ...]) -> dict[str, Path]:
@@ -167,5 +169,6 @@ SOURCE = Source(
     "a raw clip or packed episode of SurgSync",
     "a folder with video_raw/ and PSM1.parquet, or with image/left and kinematic/",
     _detect,
+    ("time_offset", "frame_rate"),
     _read,
 )

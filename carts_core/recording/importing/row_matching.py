@@ -1,0 +1,398 @@
+"""Which image each row of a log belongs to: by times, a frame rate, file names, numbers, or order.
+
+Times win, then a frame rate that was given, then a column with the images' file names or numbers, then the order of
+rows that are as many as the images. A video's own times are only its nominal rate: one row for each image comes before
+them. Every way is said by a note, and so is what was left out.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PureWindowsPath
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ...errors import SequenceError
+from ...settings.importing import SECONDS, Clock, ImportOptions
+from ...wording import counted
+from .found import FoundArm, Note
+from .media import Images
+
+_STAMPED_DIGITS = 13
+"""Names of images with numbers this long are times."""
+_FEW = 0.1
+"""Share of rows without an image up to which a column of numbers is taken for numbers of images."""
+_INDEX = ("index", "id", "", "unnamed 0", "row", "seq", "sequence")
+"""Names of columns that may count rows instead of images."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTimes:
+    """The images of a recording and the times at which they were taken."""
+
+    ids: tuple[str, ...]
+    stems: tuple[str, ...]
+    """File names without suffix; the ids for a video."""
+    times: Float[np.ndarray, " frames"] | None
+    """[s]; None where not known."""
+    source: str
+    """What the times are from, for people."""
+    nominal: bool = False
+    """Whether they are a video's constant rate."""
+    given: bool = False
+    """Whether they are the frame rate that was given."""
+    counted: bool = False
+    """Whether the ids are counted from 0, as those of a video, instead of read from names."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogRows:
+    """What the rows of a log say about images."""
+
+    name: str
+    """Of the log, for people."""
+    count: int
+    times: np.ndarray | None = None
+    """Raw values of the column of times; None without one."""
+    time_column: str = ""
+    images: np.ndarray | None = None
+    """Cells of the column with file names or numbers of images; None without one."""
+    image_column: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class RowMatch:
+    """How rows meet images."""
+
+    rows: Float[np.ndarray, " rows"]
+    """Time of each row [s], or where `by_image` the position of its image, NaN for none."""
+    by_image: bool
+    frame_times: Float[np.ndarray, " frames"] | None
+    """[s]; None where rows are images and nothing has times."""
+    time_offset: float = 0.0
+    """Time in the log minus time of the image [s]."""
+
+
+def frame_times(
+    images: Images, ids: tuple[str, ...], options: ImportOptions, note: Callable[[Note], None]
+) -> FrameTimes:
+    """The times of images: those in their names, the frame rate that was given, or those of a video.
+
+    Args:
+        images: of the leading camera.
+        ids: of the frames that count, in order.
+        options: with `frame_rate`.
+        note: called with what was found.
+    """
+    stems = tuple(
+        PureWindowsPath(images.pattern.format(frame=frame, domain="")).stem if images.pattern else frame
+        for frame in ids
+    )
+    found = FrameTimes(ids, stems, None, "", counted=not images.pattern)
+    if images.pattern and all(len(frame) >= _STAMPED_DIGITS for frame in ids):
+        numbers = np.array([int(frame) for frame in ids], np.float64)
+        clock = guess_clock(numbers)
+        note(Note("guessed", f"names of the images are times in {clock}."))
+        return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), options, note)
+    video = None
+    if images.times is not None:
+        position = {frame: index for index, frame in enumerate(images.ids)}
+        video = images.times[[position[frame] for frame in ids]]
+        spacing = np.diff(video)
+        if len(spacing) and np.ptp(spacing) > 0.1 * np.median(spacing):
+            note(Note("found", f"times of the images are those of {images.path.name}."))
+            return _without_rate(replace(found, times=video, source=images.path.name), options, note)
+    if options.frame_rate is not None:
+        times = _numbered(ids, note) / options.frame_rate
+        if video is not None and len(video) > 1:
+            rate = (len(video) - 1) / (video[-1] - video[0])
+            if abs(rate / options.frame_rate - 1) > 0.01:
+                text = (
+                    f"{images.path.name} has {rate:.4g} images/s; --frame-rate {options.frame_rate:g} is used instead."
+                )
+                note(Note("warning", text))
+        note(Note("found", f"times of the images are those of {options.frame_rate:g} images/s."))
+        return replace(found, times=times, source="--frame-rate", given=True)
+    if video is not None:
+        note(Note("found", f"times of the images are those of {images.path.name}."))
+        return replace(found, times=video, source=images.path.name, nominal=True)
+    return found
+
+
+def _without_rate(found: FrameTimes, options: ImportOptions, note: Callable[[Note], None]) -> FrameTimes:
+    if options.frame_rate is not None:
+        text = f"--frame-rate {options.frame_rate:g} is not used: the images have times of their own ({found.source})."
+        note(Note("warning", text))
+    return found
+
+
+def _numbered(ids: tuple[str, ...], note: Callable[[Note], None]) -> np.ndarray:
+    """Images counted from 0, with the gaps that single numbers leave in their names."""
+    numbers = np.array([int(frame) for frame in ids], np.float64)
+    steps = np.diff(numbers)
+    step = float(np.median(steps)) if len(steps) else 1.0
+    places = (numbers - numbers[0]) / step if step > 0 else np.arange(len(ids), dtype=float)
+    if not np.array_equal(places, np.round(places)) or np.any(np.diff(places) <= 0):
+        return np.arange(len(ids), dtype=float)
+    if places[-1] != len(ids) - 1:
+        missing = int(places[-1]) + 1 - len(ids)
+        note(Note("guessed", f"{counted(missing, 'image')} missing in the numbering; they keep their place in time."))
+    return places
+
+
+def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
+    """The unit of times: by their size where they count from 1970, else by spacing and by what they should last.
+
+    Args:
+        values: of one column.
+        span: how long the images last, where that is known [s].
+    """
+    values = np.asarray(values, np.float64)
+    values = values[np.isfinite(values)]
+    largest = float(np.max(np.abs(values))) if len(values) else 0.0
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
+        if largest >= least:
+            return unit  # pyright: ignore[reportReturnType]
+    step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+    guess: Clock = "s"
+    for unit, least in (("ns", 9e5), ("us", 9e2), ("ms", 0.9)):
+        if step >= least:
+            guess = unit  # pyright: ignore[reportAssignmentType]
+            break
+    if span is not None and span > 0 and len(values) > 1 and values[-1] > values[0]:
+        lasts = {unit: (values[-1] - values[0]) * factor / span for unit, factor in SECONDS.items()}
+        if not 0.2 <= lasts[guess] <= 50.0:
+            best = min(lasts, key=lambda unit: abs(np.log(lasts[unit])))
+            if 0.2 <= lasts[best] <= 50.0:
+                return best  # pyright: ignore[reportReturnType]
+    return guess
+
+
+def row_seconds(
+    rows: LogRows, clock: Clock | None, note: Callable[[Note], None], span: float | None = None
+) -> Float[np.ndarray, " rows"] | None:
+    """The times of rows [s]; their unit is guessed where it is not given.
+
+    Raises:
+        SequenceError: times go back.
+    """
+    if rows.times is None:
+        return None
+    values = rows.times
+    if clock is None:
+        clock = guess_clock(values, span)
+        note(Note("guessed", f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock)."))
+    steps = np.diff(values.astype(np.float64))
+    if (steps < 0).any():
+        row = int(np.flatnonzero(steps < 0)[0]) + 1
+        raise SequenceError(
+            f"{rows.name}, column {rows.time_column!r}: times go back from {values[row - 1]} to {values[row]}, row "
+            f"{row + 1}. Sort the rows, or name another column: --columns time COLUMN."
+        )
+    if repeated := int((steps == 0).sum()):
+        text = f"{rows.name}: {counted(repeated, 'row')} with the time of the row before; the first of each is used."
+        note(Note("warning", text))
+    return np.asarray(values, np.float64) * SECONDS[clock]
+
+
+def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: Callable[[Note], None]) -> RowMatch:
+    """Find how rows meet images.
+
+    Args:
+        frames: with their times, where known.
+        rows: with their times and images, where known.
+        options: what was given.
+        note: called with how it is done, and what is left out.
+
+    Raises:
+        SequenceError: neither times, names, numbers nor order decide; it names the option that does.
+    """
+    explicit = "frame" in options.columns
+    named = _named(frames, rows, note)
+    if explicit and named is None:
+        raise SequenceError(
+            f"{rows.name}: column {rows.image_column!r} names no images (theirs are {frames.stems[0]} to "
+            f"{frames.stems[-1]}). Name another one: --columns frame COLUMN."
+        )
+    span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
+    times = row_seconds(rows, options.clock, note, span)
+    one_each = named if named is not None and _is_one_each(named, frames) else None
+    in_order = one_each is None and named is None and rows.count == len(frames.ids)
+    if in_order:
+        one_each = np.arange(rows.count)
+    if times is not None and frames.times is not None and not explicit:
+        apart = frames.times[0] > times[-1] or frames.times[-1] < times[0]
+        own_clock = options.time_offset is None and not frames.given and (apart or frames.nominal)
+        if not (own_clock and one_each is not None):
+            return _by_time(frames, rows, times, apart, named, options, note)
+    if explicit or named is not None:
+        assert named is not None
+        if not explicit and one_each is None and _counts_rows(named, rows, times):
+            raise SequenceError(
+                f"{rows.name}: column {rows.image_column!r} counts {rows.count} rows and there are "
+                f"{counted(len(frames.ids), 'image')}, so it does not say which row is of which image. Give the "
+                f"images' rate (--frame-rate), or say that it does: --columns frame {rows.image_column!r}."
+            )
+        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", note)
+    if in_order:
+        return _by_image(frames, rows, np.arange(rows.count), times, "their order", note)
+    lacking = "the images have no times" if times is not None else "the table has no times"
+    raise SequenceError(
+        f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
+        f"{lacking}. Make them as many, name the column of times (--columns time COLUMN) or of the images' names "
+        "(--columns frame COLUMN), or give the images' rate (--frame-rate)."
+    )
+
+
+def _by_time(
+    frames: FrameTimes,
+    rows: LogRows,
+    times: np.ndarray,
+    apart: bool,
+    named: np.ndarray | None,
+    options: ImportOptions,
+    note: Callable[[Note], None],
+) -> RowMatch:
+    assert frames.times is not None
+    dropped = (
+        f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named is not None else ""
+    )
+    text = f"rows meet images by time: column {rows.time_column!r} and {frames.source}{dropped}."
+    note(Note("guessed", text))
+    offset = options.time_offset
+    if offset is None:
+        offset = float(times[0] - frames.times[0]) if apart else 0.0
+        text = "the clocks do not overlap: the first row is taken for the time of the first image" if apart else "0 s"
+        note(Note("guessed", f"time offset: {text} (change: --time-offset)."))
+    return RowMatch(times, False, frames.times, float(offset))
+
+
+def _by_image(
+    frames: FrameTimes,
+    rows: LogRows,
+    positions: np.ndarray,
+    times: np.ndarray | None,
+    how: str,
+    note: Callable[[Note], None],
+) -> RowMatch:
+    note(Note("guessed", f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
+    if unnamed := int((positions < 0).sum()):
+        note(Note("warning", f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image."))
+    known = positions[positions >= 0]
+    if repeated := len(known) - len(np.unique(known)):
+        text = f"{rows.name}: {counted(repeated, 'row')} of an image that has a row already; the first one is used."
+        note(Note("warning", text))
+    taken = frames.times
+    if times is not None and not frames.given:
+        own = np.full(len(frames.ids), np.nan)
+        own[known[::-1]] = times[positions >= 0][::-1]
+        there = own[np.isfinite(own)]
+        if len(there) and (np.diff(there) > 0).all():
+            taken = own
+            if frames.times is not None:
+                note(Note("found", f"times of the images are those of their rows instead of those of {frames.source}."))
+    return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
+
+
+def _counts_rows(named: np.ndarray, rows: LogRows, times: np.ndarray | None) -> bool:
+    """Whether a column of numbers may count rows: it has a general name, and many rows have no image."""
+    assert rows.images is not None
+    general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
+    return general and rows.images.dtype.kind in "iuf" and (named < 0).mean() > _FEW
+
+
+def _is_one_each(named: np.ndarray, frames: FrameTimes) -> bool:
+    known = named[named >= 0]
+    return len(np.unique(known)) == len(known) and (named < 0).mean() <= _FEW and len(known) >= 0.5 * len(frames.ids)
+
+
+def _named(frames: FrameTimes, rows: LogRows, note: Callable[[Note], None]) -> Int[np.ndarray, " rows"] | None:
+    """The position of each row's image, -1 for none; None where fewer than half of the rows or images are found."""
+    if rows.images is None:
+        return None
+    by_stem = {stem: index for index, stem in enumerate(frames.stems)}
+    numbers = [_number(cell) for cell in rows.images.tolist()]
+    exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in rows.images.tolist()]
+    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, note))
+    enough = 2 * (named >= 0).sum() >= min(len(frames.ids), len(named))
+    return named if enough else None
+
+
+def _stem(cell: str) -> str:
+    return PureWindowsPath(cell.strip()).stem
+
+
+def _number(cell: object) -> int | None:
+    """A whole number, or the last one in a file name."""
+    if isinstance(cell, str):
+        found = re.findall(r"\d+", _stem(cell))
+        return int(found[-1]) if found else None
+    return int(cell) if isinstance(cell, int | float) and np.isfinite(cell) and cell == int(cell) else None
+
+
+def _numbers_to_positions(
+    numbers: list[int | None], frames: FrameTimes, rows: LogRows, note: Callable[[Note], None]
+) -> list[int]:
+    ids = [int(frame) for frame in frames.ids]
+    position = {number: index for index, number in enumerate(ids)}
+    known = [number for number in numbers if number is not None]
+    best, shift = sum(number in position for number in known), 0
+    for other in (-1, 1):
+        hits = sum(number + other in position for number in known)
+        # Counted from the other end of the first step: every row has an image then, and not all have one without.
+        if hits > best and hits == len(known) and min(known) + other == ids[0]:
+            best, shift = hits, other
+    if shift:
+        begin = "1" if shift < 0 else "0"
+        kind = "found" if frames.counted else "warning"
+        text = (
+            f"{rows.name}: column {rows.image_column!r} counts from {min(known)} and the images from {ids[0]}; its "
+            f"first row is taken for the first image (rename the images to begin with {min(known)} if it is not)."
+        )
+        text = f"{rows.name}: column {rows.image_column!r} counts from {begin}." if frames.counted else text
+        note(Note(kind, text))
+    return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
+
+
+def by_rows(
+    arms: Sequence[FoundArm],
+    ids: Sequence[str],
+    notes: list[Note],
+    times: Float[np.ndarray, " frames"] | None = None,
+) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
+    """Arms whose times are numbers of frames, for the frames that all of them have.
+
+    Args:
+        arms: `times` are positions in `ids`.
+        ids: of all frames.
+        notes: what is left out is added.
+        times: of the frames [s]; rows get them, so that their delay can be estimated and changed.
+
+    Returns:
+        The arms, the ids that remain, and their positions in `ids`.
+
+    Raises:
+        SequenceError: no frame remains.
+    """
+    keep = np.ones(len(ids), bool)
+    positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
+    for rows in positions.values():
+        present = np.zeros(len(ids), bool)
+        present[rows[(rows >= 0) & (rows < len(ids))]] = True
+        keep &= present
+    if not keep.any():
+        raise SequenceError("no frame has joint positions of all arms. Leave an arm out: --arms.")
+    if not keep.all():
+        notes.append(Note("warning", f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions."))
+    kept = np.flatnonzero(keep)
+    timed = times is not None and bool(np.isfinite(times[kept]).all() and (np.diff(times[kept]) > 0).all())
+    result = []
+    for arm in arms:
+        if arm.times is None or arm.values is None:
+            result.append(arm)
+            continue
+        row_of = {int(position): row for row, position in enumerate(positions[arm.name])}
+        values = arm.values[[row_of[int(position)] for position in kept]]
+        result.append(replace(arm, times=times[kept] if timed and times is not None else None, values=values))
+    return tuple(result), tuple(ids[int(position)] for position in kept), kept
