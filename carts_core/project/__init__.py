@@ -18,6 +18,7 @@ from .layers import PartLabels as PartLabels
 from .place import default_path as default_path
 from .place import rescued_copies as rescued_copies
 from .project import Project as Project
+from .project import read_state as read_state
 from .queries import between_kept as between_kept
 from .queries import by_hand as by_hand
 from .queries import frames_in as frames_in

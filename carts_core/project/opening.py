@@ -60,8 +60,8 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> Writable | ReadOnly
         raise
 
 
-def read(path: Path, identity: SequenceIdentity) -> ProjectState:
-    """What the project of a sequence says.
+def read(path: Path, identity: SequenceIdentity | None) -> ProjectState:
+    """State of the project of a sequence, or with None of any sequence.
 
     Raises:
         DamagedProject, ProjectError, OSError, sqlite3.Error: it cannot be read.
@@ -82,7 +82,7 @@ def _begin(path: Path, identity: SequenceIdentity) -> None:
 
 
 def _load(
-    path: Path, identity: SequenceIdentity, *, keep_what_is_left: bool
+    path: Path, identity: SequenceIdentity | None, *, keep_what_is_left: bool
 ) -> tuple[sqlite3.Connection, ProjectState, digests.Seal]:
     """A copy of the file in memory, migrated, and what it says."""
     content = snapshot.read(path)
@@ -97,8 +97,7 @@ def _load(
         state, seal = _checked(copy)
     except (ProjectError, sqlite3.Error, *UNREADABLE) as error:
         raise _damaged(path, identity, copy, error, keep_what_is_left=keep_what_is_left) from error
-    difference = state.identity.difference(identity)
-    if difference is not None:
+    if identity is not None and (difference := state.identity.difference(identity)) is not None:
         copy.connection.close()
         raise ProjectError(
             f"project {path} belongs to another sequence ({state.identity.name!r}, not {identity.name!r}): "
@@ -117,14 +116,14 @@ def _checked(copy: snapshot.Copy) -> tuple[ProjectState, digests.Seal]:
 
 
 def _damaged(
-    path: Path, identity: SequenceIdentity, copy: snapshot.Copy, error: BaseException, *, keep_what_is_left: bool
+    path: Path, identity: SequenceIdentity | None, copy: snapshot.Copy, error: BaseException, *, keep_what_is_left: bool
 ) -> ProjectError:
     """The error for a damaged file; what can be read of it is in a new file by then, where that is asked for."""
     reason = (
         str(error).rstrip(".") if isinstance(error, ProjectError | sqlite3.Error) else f"unreadable values ({error})"
     )
     begin = f"project {path} is damaged: {reason}. It was not changed."
-    if not keep_what_is_left:
+    if not keep_what_is_left or identity is None:
         return database.DamagedProject(f"{begin} Open it for writing to have what can be read of it rescued.")
     rescued = rescue(copy, identity)
     copy.connection.close()

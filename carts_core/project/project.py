@@ -298,6 +298,16 @@ class Project:
         return change
 
 
+def read_state(path: Path) -> ProjectState:
+    """State of a project file, whatever sequence it belongs to; the file may be open elsewhere.
+
+    Raises:
+        ProjectError: it is not there, or cannot be read.
+    """
+    with database.errors_explained(path):
+        return opening.read(path, None)
+
+
 def _step_name(name: str) -> str:
     text = " ".join(name.encode("utf-8", "replace").decode().split())
     if not 1 <= len(text) <= LONGEST_NAME:

@@ -1,10 +1,11 @@
-"""Which sequences were opened lately, with a small picture and how far their review is."""
+"""Recently opened sequences, with a small picture and the progress of their review."""
 
 import json
 import math
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import numpy as np
 from carts_core.errors import CartsError
 from carts_core.files import write_bytes, write_text
 from carts_core.files.reading import TABLE, read_bytes, read_text
-from carts_core.project import ReviewState
+from carts_core.project import ProjectState, ReviewState, read_state
+from carts_core.project.companions import LOG, beside
 from carts_core.project.place import data_dir
 from carts_viewer.app import ViewerApp
 
@@ -39,7 +41,7 @@ class RecentProject:
     corrected: int
     """Frames whose joints differ from the measured ones."""
     changed: float
-    """When it was closed last [s since 1970]."""
+    """When the project was changed or left last [s since 1970]."""
 
     @property
     def thumbnail(self) -> Path:
@@ -58,6 +60,43 @@ def recent_projects() -> list[RecentProject]:
         return []
 
 
+def up_to_date(project: RecentProject) -> RecentProject:
+    """The entry with the numbers of its project file as it is now; another program may have changed it.
+
+    Raises:
+        ProjectError: the project cannot be read.
+    """
+    path = Path(project.project)
+    stamp = _changed(path), _changed(beside(path, LOG))
+    if not stamp[0]:
+        return replace(project, reviewed=0, corrected=0)
+    # A project that nothing has written to since it was left here is not read again.
+    if max(stamp) <= project.changed:
+        return project
+    reviewed, corrected = _read_numbers(path, stamp)
+    return replace(project, reviewed=reviewed, corrected=corrected, changed=max(stamp))
+
+
+@lru_cache(maxsize=_KEPT)
+def _read_numbers(path: Path, stamp: tuple[float, float]) -> tuple[int, int]:
+    return _numbers(read_state(path))
+
+
+def _numbers(state: ProjectState) -> tuple[int, int]:
+    """How many frames are reviewed, and how many are corrected."""
+    frames = range(len(state.identity.frame_ids))
+    reviewed = sum(state.review(index).state in _DONE for index in frames)
+    return reviewed, sum(bool(state.joints(index)) for index in frames)
+
+
+def _changed(path: Path) -> float:
+    """When a file was changed last [s since 1970]; 0 where there is none."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
 def thumbnail(project: RecentProject) -> bytes | None:
     """A JPEG file, None without one."""
     try:
@@ -67,16 +106,15 @@ def thumbnail(project: RecentProject) -> bytes | None:
 
 
 def remember(app: ViewerApp) -> None:
-    """Put the sequence of an open viewer at the head of the list."""
-    state = app.project.state
-    frames = len(app.sequence)
+    """Put the sequence of a viewer, open or closed, at the head of the list."""
+    reviewed, corrected = _numbers(app.project.state)
     entry = RecentProject(
         sequence=str(app.sequence.path),
         name=app.sequence.name,
         project=str(app.project.path),
-        frames=frames,
-        reviewed=sum(state.review(index).state in _DONE for index in range(frames)),
-        corrected=sum(bool(state.joints(index)) for index in range(frames)),
+        frames=len(app.sequence),
+        reviewed=reviewed,
+        corrected=corrected,
         changed=time.time(),
     )
     _write([entry, *(each for each in recent_projects() if each.sequence != entry.sequence)])

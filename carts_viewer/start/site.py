@@ -212,11 +212,12 @@ class Site:
             place.close()
         if app is not None:
             try:
+                app.close()
+            finally:
+                self.incident = app.project.incident or self.incident
+                # What was under way is saved by now.
                 with suppress(CartsError):
                     remember(app)
-            finally:
-                app.close()
-                self.incident = app.project.incident or self.incident
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:

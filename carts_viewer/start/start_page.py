@@ -5,12 +5,13 @@ from pathlib import Path
 
 import cv2
 
+from carts_core.errors import CartsError
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer.recording.draft import DraftSummary, delete_draft, drafts
 from carts_viewer.start.browser import FileBrowser
 from carts_viewer.start.host import Host
-from carts_viewer.start.recent import RecentProject, forget, recent_projects, thumbnail
+from carts_viewer.start.recent import RecentProject, forget, recent_projects, thumbnail, up_to_date
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import button, escaped
 
@@ -54,8 +55,9 @@ class StartPage:
                 delete_draft(value)
             case "sample":
                 return self._site.open_sample()
-            case "recent" if value in {project.sequence for project in recent_projects()}:
-                return self._site.open_sequence(Path(value))
+            case "recent" if value in (known := {project.sequence: project.project for project in recent_projects()}):
+                own = Path(known[value])
+                return self._site.open_sequence(Path(value), project=own if own.is_file() else None)
             case "forget":
                 forget(value)
             case "open":
@@ -87,11 +89,15 @@ class StartPage:
         return "" if self._browser is None else f"<h2>Open</h2>{self._browser.html()}"
 
     def _card(self, project: RecentProject) -> str:
-        share = project.reviewed / max(project.frames, 1)
-        progress = (
-            f'<progress max="1" value="{share:.3f}"></progress><small>{project.reviewed} of {project.frames} frames '
-            f"reviewed, {project.corrected} corrected · {_ago(project.changed)}</small>"
-        )
+        try:
+            now = up_to_date(project)
+            share = now.reviewed / max(now.frames, 1)
+            progress = (
+                f'<progress max="1" value="{share:.3f}"></progress><small>{now.reviewed} of {now.frames} frames '
+                f"reviewed, {now.corrected} corrected · {_ago(now.changed)}</small>"
+            )
+        except CartsError as error:
+            progress = f"<small>Progress unknown: {escaped(str(error))}</small>"
         actions = button("recent", "Open", project.sequence, kind="main") + button(
             "forget", "Remove from this list", project.sequence, kind="quiet"
         )

@@ -8,7 +8,10 @@ import pytest
 
 from carts_core.errors import SettingsError
 from carts_core.optimization.hand_eye import ImagePoint
+from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
+from carts_core.recording import Sequence
 from carts_core.settings.importing import ImportOptions
+from carts_viewer import intents
 from carts_viewer.recording.draft import Draft, DraftFile, Step, delete_draft, drafts
 from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.recent import forget, recent_projects, thumbnail
@@ -109,6 +112,45 @@ def test_a_sequence_is_opened_left_and_remembered_with_its_picture(
     assert site.incident is None
     path.unlink()
     assert recent_projects() == []
+
+
+def test_a_card_has_the_numbers_of_its_project_whatever_program_changed_it(
+    site: Site, tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    def card() -> str:
+        site.post(site.show_start)
+        site.wait(120)
+        return site.document.content
+
+    path, other = tiny_sequence(frames=3), tmp_path / "labs" / "other.carts"
+    with site:
+        site.post(lambda: site.open_sequence(path, project=other))
+        site.wait(120)
+        assert site.app is not None
+        # A note that is still under the hand is saved when the sequence is left.
+        site.app.queue.put(intents.SetReview(ReviewState.ACCEPTED))
+        site.app.queue.put(intents.SetNote("smoke"))
+        assert "1 of 3 frames reviewed, 0 corrected" in card()
+        solved = JointCorrection(
+            (0.1,) * len(Sequence.open(path).scene.arms[0].robot.joint_names), Provenance(Source.HAND)
+        )
+        with Project.open(Sequence.open(path), other) as project:
+            project.apply("Solve", {Key.joints(index, "PSM1"): solved for index in range(3)})
+            project.apply("Accept", {Key.review(2): Review(ReviewState.REJECTED)})
+            # Also while it is open elsewhere.
+            assert "1 of 3 frames reviewed, 3 corrected" in card()
+        assert "1 of 3 frames reviewed, 3 corrected" in card()
+        place = site.place
+        assert place is not None
+        site.post(lambda: place.choose("recent", str(path)))
+        site.wait(120)
+        assert site.app is not None and site.app.project.path == other
+        site.post(site.show_start)
+        site.wait(120)
+        other.write_bytes(b"not a project")
+        assert "Progress unknown" in card()
+        other.unlink()
+        assert "0 of 3 frames reviewed, 0 corrected" in card()
 
 
 def test_a_sequence_that_cannot_be_opened_leads_back_with_the_reason(site: Site, tmp_path: Path) -> None:
