@@ -1,10 +1,13 @@
-"""How many pixels an encoded image has, from its header, so that too large ones are refused before they are decoded."""
+"""Headers of encoded images: size, bits, transparency and orientation, known before anything is decoded."""
 
 import io
 import warnings
+from dataclasses import dataclass
 
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
+TIFF = {b"II*\0": "little", b"MM\0*": "big"}
+"""How files begin, and the byte order of these."""
 LARGEST_IMAGE = 40_000_000
 """Most pixels of an image or of a video's frame; 8K has 33 million."""
 
@@ -15,7 +18,82 @@ _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
 _MOST_SCANS = 200
 """A progressive JPEG is decoded as often as it has scans."""
 _TIFF_TILE = (322, 323)
+_ORIENTATION = 0x0112
+_EXIF = b"Exif\0\0"
+_ALPHA = (4, 6)
+"""Colour types of PNG with transparency; type 3 is a palette."""
+_PALETTE = 3
+_MOST_TAGS = 1000
 _FAR_TOO_LARGE = (0, LARGEST_IMAGE)
+
+
+@dataclass(frozen=True)
+class ImageTraits:
+    """Properties of an encoded image that change what its pixels mean."""
+
+    orientation: int = 1
+    """EXIF's, 1 to 8; 1 is upright."""
+    turned_already: bool = False
+    """Whether decoders apply the orientation by themselves, as for TIFF."""
+    alpha: bool = False
+    palette: bool = False
+    lossy: bool = False
+
+
+def image_traits(content: bytes) -> ImageTraits:
+    """Traits of a PNG, JPEG or TIFF image; the usual ones for other kinds and damaged headers.
+
+    Args:
+        content: of the file, at least its beginning.
+    """
+    if content.startswith(PNG):
+        return _png_traits(content)
+    if content.startswith(JPEG):
+        return ImageTraits(_jpeg_orientation(content), lossy=True)
+    orientation = _tiff_orientation(content) if content[:4] in TIFF else 1
+    return ImageTraits(orientation, turned_already=True)
+
+
+def _png_traits(content: bytes) -> ImageTraits:
+    kind = content[25] if len(content) > 25 else 0
+    orientation, position = 1, len(PNG)
+    while position + 12 <= len(content):
+        length = int.from_bytes(content[position : position + 4], "big")
+        name, data = content[position + 4 : position + 8], content[position + 8 : position + 8 + length]
+        if name == b"eXIf":
+            orientation = _tiff_orientation(data)
+        elif name == b"tRNS" and kind != _PALETTE:
+            kind = 6
+        position += 12 + length
+    return ImageTraits(orientation, alpha=kind in _ALPHA, palette=kind == _PALETTE)
+
+
+def _jpeg_orientation(content: bytes) -> int:
+    position = 2
+    while position + 4 <= len(content) and content[position] == 0xFF and content[position + 1] != _START_OF_SCAN:
+        length = int.from_bytes(content[position + 2 : position + 4], "big")
+        segment = content[position + 4 : position + 2 + length]
+        if content[position + 1] == 0xE1 and segment.startswith(_EXIF):
+            return _tiff_orientation(segment[len(_EXIF) :])
+        position += 2 + length
+    return 1
+
+
+def _tiff_orientation(content: bytes) -> int:
+    """The tag's value in the first directory of a TIFF file, as EXIF data are; 1 without it."""
+    order = TIFF.get(content[:4])
+    if order is None:
+        return 1
+
+    def number(place: int, length: int) -> int:
+        return int.from_bytes(content[place : place + length], order)  # type: ignore[arg-type]
+
+    first = number(4, 4)
+    for row in range(min(number(first, 2), _MOST_TAGS)):
+        entry = first + 2 + 12 * row
+        if number(entry, 2) == _ORIENTATION:
+            return value if 1 <= (value := number(entry + 8, 2)) <= 8 else 1
+    return 1
 
 
 def size_problem(content: bytes) -> str | None:

@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
-from ..errors import CartsError
-from ..files.image_size import size_problem
+from ..errors import CartsError, SequenceError
 
 LARGEST = 64 * 2**20
 """Of a message [bytes]."""
@@ -132,12 +131,12 @@ def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width
                 f"image of {camera}: {len(image.data)} bytes are not {image.width} x {image.height} pixels of rgb8."
             )
         return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
-    if problem := size_problem(image.data):
-        raise StreamError(f"image of {camera} {problem}.")
-    found = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if found is None:
-        raise StreamError(f"image of {camera} cannot be decoded. Send JPEG, PNG, or rgb8 with width and height.")
-    return np.ascontiguousarray(found[..., ::-1])
+    from ..recording.images import decode_image  # noqa: PLC0415 - clients send, and never decode
+
+    try:
+        return decode_image(image.data, f"image of {camera}")
+    except SequenceError as error:
+        raise StreamError(f"{error} Send JPEG, PNG, or rgb8 with width and height.") from error
 
 
 def encoded_masks(masks: Mapping[str, np.ndarray]) -> dict[str, bytes]:

@@ -27,6 +27,13 @@ LAST_ROW_TOLERANCE = 1e-6
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
 
+FOCAL_RANGE = 0.3, 20.0
+"""Focal lengths of cameras, in the image's longer side [1]: from a view of 118 degrees to one of 3 degrees."""
+CENTRE_RANGE = 0.25, 0.75
+"""Principal points of cameras, in width and height of the image [1]."""
+SQUARE_RANGE = 0.9, 1.1
+"""Ratios fx / fy of cameras with nearly square pixels [1]."""
+
 FARTHEST = 1e6
 """Largest coordinate of a transform [m], of a focal length and of a principal point [px]."""
 
@@ -70,6 +77,50 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
         left, _, right = np.linalg.svd(rotation)
         matrix[:3, :3] = left @ right
     return matrix
+
+
+def implausible_intrinsics(
+    width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
+) -> str | None:
+    """What is unusual about a calibration for images of a size, in words that follow "it has"; None if nothing.
+
+    Args:
+        width, height: of the images [px].
+        intrinsics: fx, fy, cx, cy [px].
+        distortion: OpenCV's coefficients.
+    """
+    fx, fy, cx, cy = intrinsics
+    size = f"images of {width} x {height} px"
+    if min(fx, fy) <= 0:
+        return f"focal lengths of {fx:g} and {fy:g} px, which must be positive"
+    low, high = (share * max(width, height) for share in FOCAL_RANGE)
+    if not (low <= fx <= high and low <= fy <= high):
+        unit = "; it may be in millimetres, which are divided by the size of a pixel" if max(fx, fy) < low else ""
+        return f"focal lengths of {fx:g} and {fy:g} px for {size}; usual are {low:.0f} to {high:.0f}{unit}"
+    if not SQUARE_RANGE[0] <= fx / fy <= SQUARE_RANGE[1]:
+        return (
+            f"focal lengths of {fx:g} and {fy:g} px, which differ by {abs(fx / fy - 1):.0%}; pixels would be no squares"
+        )
+    for what, value, side in (("cx", cx, width), ("cy", cy, height)):
+        if not CENTRE_RANGE[0] * side <= value <= CENTRE_RANGE[1] * side:
+            place = "outside of" if not 0 <= value <= side else "near the edge of"
+            return f"the principal point {cx:g}, {cy:g} px, {place} {size} ({what})"
+    if distortion and _folds(width, height, intrinsics, distortion):
+        return f"distortion {list(distortion)} that maps two places of {size} onto one; the model may be another one"
+    return None
+
+
+def _folds(
+    width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...]
+) -> bool:
+    """Whether radial distortion is not monotonic over the image; its corners are where it begins."""
+    fx, fy, cx, cy = intrinsics
+    k = [*distortion, *[0.0] * 8]
+    reach = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    r = np.linspace(0.0, reach, 200)
+    numerator = 1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6
+    distorted = r * numerator / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    return bool((np.diff(distorted) <= 0).any())
 
 
 # Identity is equality here: comparing arrays element by element would not give one truth value.

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -11,7 +12,7 @@ from trimesh.resolvers import FilePathResolver
 
 from ..errors import RobotError
 from ..files.image_size import size_problem
-from ..files.reading import IMAGE, MESH, is_regular, read_bytes
+from ..files.reading import IMAGE, MESH, is_regular, open_regular, read_bytes
 from ..wording import shown
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
@@ -21,6 +22,10 @@ MOST_PARTS = 1_000
 """Instances of meshes in one file."""
 FARTHEST = 100.0
 """Largest coordinate of a mesh after scaling [m]; instruments and robots are far smaller."""
+_HEAD = 2**16
+"""Bytes of a COLLADA file in which its unit and up axis are looked for."""
+_UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")
+_UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)\s*</up_axis>")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 _PACKAGE_LEVELS = 6
@@ -52,6 +57,18 @@ def mesh_path(urdf_folder: Path, name: str) -> Path:
     return urdf_folder / (unquote(urlsplit(name).path) if scheme == "file" else rest)
 
 
+def collada_asset(path: Path) -> tuple[float, str]:
+    """Unit [m] and up axis ("X_UP", "Y_UP", "Z_UP") of a COLLADA file; 1 and "" of other files and where not stated."""
+    if path.suffix.lower() != ".dae" or not is_regular(path):
+        return 1.0, ""
+    with open_regular(path, MESH) as file:
+        # The document's own asset comes first.
+        head = file.read(_HEAD)
+    unit, axis = _UNIT.search(head), _UP_AXIS.search(head)
+    metres = float(unit[1]) if unit is not None else 1.0
+    return metres if 0 < metres < np.inf else 1.0, "" if axis is None else axis[1].decode()
+
+
 class _BesideTheMesh(FilePathResolver):
     """Materials and textures that a mesh names: regular files below its folder, of a bounded size."""
 
@@ -73,7 +90,9 @@ class _BesideTheMesh(FilePathResolver):
 
 
 def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[trimesh.Trimesh]:
-    """The triangle meshes of a file.
+    """The triangle meshes of a file, those of COLLADA files scaled by their unit.
+
+    The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> is for coordinates as they are stored.
 
     Args:
         path: the file.
@@ -101,6 +120,7 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[trimesh.Trimesh
         raise
     except Exception as error:  # trimesh raises whatever its format readers raise
         raise RobotError(f"mesh {path} cannot be read ({error}). {allowed}") from error
+    scale = scale * collada_asset(path)[0]
     if not meshes:
         raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
     for mesh in meshes:

@@ -1,7 +1,7 @@
 """A robot: degrees of freedom, forward kinematics and the meshes of its links, from any URDF."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,10 +14,11 @@ from torch import Tensor
 
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
+from ..wording import listed
 from . import mesh_cache
 from .instruments import robot_file
 from .kinematics import Kinematics, exact_right_angles
-from .mesh_files import mesh_path
+from .mesh_files import collada_asset, mesh_path
 from .meshes import Decimation, LinkMesh, build_link_meshes, load_visual
 from .urdf_check import parsed_urdf
 
@@ -42,6 +43,8 @@ class Robot:
         link_names: the links that carry a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: how many triangles were taken away, and how far surfaces moved.
+        remarks: sentences on what is changed about the files' meshes: scaled by their unit, simplified further than
+            asked for; and on up axes, which are not applied.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class Robot:
         link_names: tuple[str, ...],
         meshes: tuple[LinkMesh, ...],
         decimation: Decimation,
+        remarks: tuple[str, ...] = (),
     ) -> None:
         self.name = name
         self.urdf = urdf
@@ -62,6 +66,7 @@ class Robot:
         self.link_names = link_names
         self.meshes = meshes
         self.decimation = decimation
+        self.remarks = remarks
         self._kinematics = kinematics
 
     def __repr__(self) -> str:
@@ -117,7 +122,8 @@ class Robot:
         )
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
-        return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation)
+        remarks = _remarks(_mesh_files(model, urdf))
+        return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation, remarks)
 
     def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:
         """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
@@ -151,15 +157,34 @@ class Robot:
         return self.joint_names.index(joint_name)
 
 
+def _mesh_files(model: yourdfpy.URDF, urdf: Path) -> list[Path]:
+    """The mesh files of a URDF that are there."""
+    geometries = [visual.geometry for link in model.robot.links for visual in link.visuals]
+    names = [each.mesh.filename for each in geometries if each is not None and each.mesh is not None]
+    return [path for name in names if is_regular(path := mesh_path(urdf.parent, name))]
+
+
 def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
     """What link meshes are made from; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
-    mesh_files = [
-        mesh_path(urdf.parent, visual.geometry.mesh.filename)
-        for link in model.robot.links
-        for visual in link.visuals
-        if visual.geometry is not None and visual.geometry.mesh is not None
-    ]
-    return mesh_cache.fingerprint([urdf, *filter(is_regular, mesh_files)], kinematics.base_link, *limits)
+    files = _mesh_files(model, urdf)
+    # Meshes in units other than metres were not scaled before.
+    units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
+    settings = (kinematics.base_link, *limits, units) if units else (kinematics.base_link, *limits)
+    return mesh_cache.fingerprint([urdf, *files], *settings)
+
+
+def _remarks(files: Iterable[Path]) -> tuple[str, ...]:
+    found: dict[str, list[str]] = {}
+    for file in dict.fromkeys(files):
+        metres, axis = collada_asset(file)
+        if metres != 1.0:
+            found.setdefault(f"scaled by the unit of the COLLADA file, {metres:g} m", []).append(file.name)
+        if axis not in ("", "Z_UP"):
+            text = (
+                f"up axis {axis} of the COLLADA file is not applied, as in RViz; turn the mesh by the URDF's <origin>"
+            )
+            found.setdefault(text, []).append(file.name)
+    return tuple(f"{listed(names, 3)}: {text}." for text, names in found.items())
 
 
 def _prepared_meshes(

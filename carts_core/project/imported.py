@@ -16,6 +16,9 @@ from .state import ProjectState
 if TYPE_CHECKING:
     from ..recording.annotations import Annotations
 
+_SHOWN = 5
+"""Remarks in a sentence."""
+
 
 @dataclass(frozen=True)
 class ImportReport:
@@ -33,6 +36,8 @@ class ImportReport:
     """Images of the source that belong to no frame."""
     changed: bool
     """Whether the project changed; False where it had all of it already."""
+    remarks: tuple[str, ...] = ()
+    """What was decided about masks, and annotations that were left out, each with its reason."""
 
     def sentence(self) -> str:
         """For people."""
@@ -44,6 +49,9 @@ class ImportReport:
             text = f"The project has these {' and '.join(parts)} already; nothing was changed."
         if self.unknown:
             text += f" {counted(len(self.unknown), 'image')} of no frame left out, say {self.unknown[0]}."
+        if self.remarks:
+            more = f"; and {len(self.remarks) - _SHOWN} more" if len(self.remarks) > _SHOWN else ""
+            text += f" Remarks: {'; '.join(self.remarks[:_SHOWN])}{more}."
         return text
 
 
@@ -66,7 +74,8 @@ def import_annotations(
     edits, masks, keypoints = _edits(state, annotations)
     unknown = tuple(annotations.unknown)
     if not edits:
-        there = f"Its images are called {listed([repr(name) for name in unknown[:3]])}. " if unknown else ""
+        left = f"{listed(annotations.remarks, 3)}. " if annotations.remarks else ""
+        there = left + f"Its images are called {listed([repr(name) for name in unknown[:3]])}. " if unknown else left
         raise ProjectError(
             f"nothing in {source} belongs to a frame. {there}Frames are called "
             f"{listed(list(state.identity.frame_ids[:3]))}, ...; cameras {listed(state.identity.cameras)}."
@@ -81,7 +90,10 @@ def import_annotations(
         )
     change = project.apply(f"Import from {source}"[:200], edits)
     labels = edits[Key.imported_labels()].names
-    return ImportReport(annotations.kind, masks, keypoints, labels, unknown, change is not None)
+    remarks = tuple(
+        text if count == 1 else f"{text} ({counted(count, 'image')})" for text, count in annotations.remarks.items()
+    )
+    return ImportReport(annotations.kind, masks, keypoints, labels, unknown, change is not None, remarks)
 
 
 def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[Any], Any], int, int]:

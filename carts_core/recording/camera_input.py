@@ -6,13 +6,13 @@ from pathlib import Path
 
 from ..errors import SequenceError
 from ..files.reading import is_regular
-from ..model.camera import Camera
+from ..model.camera import Camera, implausible_intrinsics
 from .calibration import take_camera
 from .camera_motion import take_camera_motion
 from .frame_files import check_present, frame_files
 from .frame_list import FrameList, numbers_of_frames
 from .image_sources import BagImages, Cropped
-from .images import ImageFiles, ImageSource
+from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
 from .matching import PoseSamples
 from .patterns import expand, is_glob, is_per_frame
 from .rows import Rows
@@ -31,6 +31,16 @@ class CameraInput:
     background: Mapping[str, Path]
     motion: PoseSamples | None
     """Of what carries it; None for a camera that stays."""
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is changed about images and masks before they are used, and what is unusual about the calibration."""
+        camera = self.camera
+        files = {file: None for domain in self.masks.values() for file in domain if file is not None}
+        found = [text for source in self.images.values() for text in _remarks_of(source)]
+        found += mask_remarks(list(files))
+        unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
+        found += [f"its calibration has {unusual}. Check `size`, `K` and `distortion`."] if unusual else []
+        return tuple(dict.fromkeys(f"{camera.name}: {text}" for text in found))
 
 
 def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
@@ -60,6 +70,13 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
         raise table.error("background", "does not go with `motion`: it would be another one in every frame. Remove it.")
     table.finish()
     return CameraInput(camera, images, masks, background, motion)
+
+
+def _remarks_of(source: ImageSource) -> tuple[str, ...]:
+    try:
+        return source.remarks()
+    except SequenceError:  # It is an error where the image is used.
+        return ()
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
@@ -101,6 +118,10 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
     key = table.name("images")
     topic, numbers = table.take("topic", str, ""), frames.video_frames
     message_time, video_frame = table.take("message_time", str, ""), table.take("video_frame", str, "")
+    bits = table.take("bits", int, None)
+    if bits is not None and bits not in DEPTHS:
+        raise table.error("bits", f"is {bits}. Give the bits of the images' values: {', '.join(map(str, DEPTHS))}.")
+    deinterlace = table.take("deinterlace", bool, True)
     if topic:
         path = table.path(expand(pattern, key, domain=domain, camera=camera))
         return BagImages(path, topic, _message_times(table, message_time, frames))
@@ -116,10 +137,10 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
                 f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
                 f"or name a video ({', '.join(SUFFIXES)}).",
             )
-        return Video(path, numbers)
+        return Video(path, numbers, deinterlace=deinterlace)
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
     check_present(key, files, frames)
-    return ImageFiles(files)
+    return ImageFiles(files, bits)
 
 
 def _message_times(table: TomlTable, column: str, frames: FrameList) -> tuple[int, ...]:

@@ -50,6 +50,8 @@ class Description:
     """How joint positions are matched with frames by time; None where every row of the tables is a frame."""
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
+    remarks: tuple[str, ...] = ()
+    """What is changed about images and masks before they are used, and what is unusual about calibrations."""
 
     def at_frames(self, samples: JointSamples) -> Float[np.ndarray, "frames dofs"]:
         """The joint positions of every frame [rad, m].
@@ -98,6 +100,11 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     cameras = [take_camera_input(table, rows, domains) for table in root.take_tables("cameras")]
     root.finish()
     scene = Scene(tuple(entry.arm for entry in arms), tuple(entry.camera for entry in cameras), light)
+    remarks = tuple(remark for camera in cameras for remark in camera.remarks())
+    remarks += tuple(dict.fromkeys(f"{robot.name}: {text}" for robot in robots.values() for text in robot.remarks))
+    if progress is not None:
+        for remark in remarks:
+            progress(f"note: {remark}")
     return Description(
         path=path,
         name=name,
@@ -107,6 +114,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
         matching=rows.matching,
         cameras={entry.camera.name: entry for entry in cameras},
         arms={entry.arm.name: entry for entry in arms},
+        remarks=remarks,
     )
 
 

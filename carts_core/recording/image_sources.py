@@ -11,9 +11,8 @@ from jaxtyping import UInt8
 
 from ..errors import SequenceError
 from ..extras import needs_extra
-from ..files.image_size import size_problem
 from .bag_limits import check_bag, limit_expansion
-from .images import ImageSource, find_damage
+from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File names that are taken for ROS bags; a folder with `metadata.yaml` is one, too."""
@@ -55,6 +54,10 @@ class Cropped:
                 f"{left + width} x {top + height}. Correct crop = [left, top, width, height] in the sequence file."
             )
         return np.ascontiguousarray(image[top : top + height, left : left + width])
+
+    def remarks(self) -> tuple[str, ...]:
+        """Those of the whole images."""
+        return self.source.remarks()
 
 
 class BagImages:
@@ -102,6 +105,10 @@ class BagImages:
             raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
         return decode_message(message, self.name(index))
 
+    def remarks(self) -> tuple[str, ...]:
+        """None: messages are used as they are."""
+        return ()
+
 
 def open_bag(path: Path) -> Any:
     """An opened `rosbags` reader.
@@ -139,14 +146,7 @@ def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3
         SequenceError: it is damaged or of an encoding that is not known.
     """
     if not hasattr(message, "encoding"):
-        content = np.asarray(message.data, np.uint8)
-        data = content.tobytes()
-        if (problem := None if (damage := find_damage(data)) else size_problem(data)) is not None:
-            raise SequenceError(f"{what} {problem}. Record smaller images.")
-        image = None if damage else cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise SequenceError(f"{what} is damaged: {damage or f'no {message.format} image'}. Copy the bag again.")
-        return np.ascontiguousarray(image[..., ::-1])
+        return decode_image(np.asarray(message.data, np.uint8).tobytes(), what)
     encoding = message.encoding.lower()
     channels = 1 if encoding in _ONE_CHANNEL else 4 if encoding in ("rgba8", "bgra8") else 3
     if encoding not in _ONE_CHANNEL and encoding not in _CHANNELS:

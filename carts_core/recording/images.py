@@ -1,6 +1,11 @@
-"""Image files, decoded strictly: a file that is cut off is an error and not a half grey image."""
+"""Image files and masks: decoded strictly, turned upright, in 8 bits; each change to the stored pixels is stated.
+
+A file that is cut off is an error and not a half grey image.
+"""
 
 import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,11 +15,22 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
-from ..files.image_size import JPEG, PNG, size_problem
-from ..files.reading import IMAGE, read_bytes
+from ..files.image_size import JPEG, PNG, TIFF, ImageTraits, image_traits, size_problem
+from ..files.reading import IMAGE, open_regular, read_bytes
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 _REMEDY = "Copy or export it again."
+_HEADER = 2**18
+"""Bytes at the beginning of an image that hold its traits."""
+DEPTHS = (8, 10, 12, 14, 16)
+"""Bits of a value that cameras have."""
+_SAMPLED = 12
+"""Images of a camera in which bits are counted, and masks in which grey borders are looked for."""
+_NEAR = 16
+"""Values of compressed masks this near to black or white are black or white."""
+_MOST_LABELS = 32
+_ONE_COLOUR = 0.35
+"""How far the colours of one label may be apart, in parts of their brightest channel."""
 
 
 class ImageSource(Protocol):
@@ -28,12 +44,22 @@ class ImageSource(Protocol):
         """The image of frame `index` as recorded, RGB."""
         ...
 
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what is changed about stored images before they are used: turned, scaled, deinterlaced."""
+        ...
 
-@dataclass(frozen=True)
+
 class ImageFiles:
-    """An image file per frame."""
+    """An image file per frame.
 
-    files: tuple[Path, ...]
+    Args:
+        files: their paths.
+        bits: of a value in files of 16 bits; None takes the bits in use, counted in some of them.
+    """
+
+    def __init__(self, files: tuple[Path, ...], bits: int | None = None) -> None:
+        self.files = files
+        self._given, self._counted = bits, bits
 
     def name(self, index: int) -> str:
         """Path of the file."""
@@ -43,39 +69,209 @@ class ImageFiles:
         """The decoded file, RGB.
 
         Raises:
-            SequenceError: it is missing, truncated or not an image.
+            SequenceError: it is missing, truncated, not an image, or has more bits than the others.
         """
-        return read_image(self.files[index])
+        return read_image(self.files[index], self.bits)
+
+    def bits(self) -> int:
+        """Bits of a value; 8 where files have no more."""
+        if self._counted is None:
+            self._counted = bits_of_files(self.files)
+        return self._counted
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is changed about some of the images."""
+        bits = () if self._given is not None else bits_remark(self.files)
+        return (*image_remarks(spread_files(self.files)), *bits)
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """An image file as RGB, with the pixels where the file has them (orientation tags are ignored).
+def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
+    """An image file as RGB, turned as its EXIF orientation says.
+
+    Args:
+        path: of the file.
+        bits: of the values of a file of 16 bits; by default those in use.
 
     Raises:
-        SequenceError: the file is missing, truncated or not an image.
+        SequenceError: the file is missing, truncated or not an image, or has more bits.
     """
-    # A calibrated camera's pixels may not be turned, whatever the file's tags say.
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.ascontiguousarray(image[..., ::-1])
+    return _eight_bits(_decode(path, colour=True), f"image {path}", bits)
+
+
+def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3"]:
+    """As `read_image`, of an encoded image that lies in another file or came over a network.
+
+    Args:
+        content: PNG, JPEG, TIFF, BMP, WebP or PPM.
+        what: how errors call it.
+
+    Raises:
+        SequenceError: it is damaged, too large or not an image.
+    """
+    return _eight_bits(_raster(content, what, colour=True), what)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """A mask file; half of what its pixels can hold (128 of 255) and more is instrument.
+    """A mask file: white, or one colour, or opaque on transparent is instrument; half bright (128 of 255) is white.
 
     Raises:
         SequenceError: the file is missing, truncated, not an image, or has labels instead of black and white.
     """
-    image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    white = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1
-    if 0 < (brightest := image.max()) < 0.5 * white:
+    raster = _decode(path, colour=False)
+    mask = _white_part(raster, f"mask {path}")
+    if mask is not None:
+        return mask
+    image, white = raster.grey, raster.white
+    allowed = f"Masks are 0 (background) and {white} (instrument)"
+    if image is None:
         raise SequenceError(
-            f"mask {path} has no value above {brightest}. Masks are 0 (background) and {white} (instrument): "
-            f"multiply a mask of 0 and 1 by {white}, choose the instrument's label in a label image."
+            f"mask {path} has several colours. {allowed}: choose the instrument's colour, or import the labels with "
+            "`carts import-masks`."
         )
-    return image >= 0.5 * white
+    if (brightest := image.max()) < 0.5 * white:
+        raise SequenceError(
+            f"mask {path} has no value above {brightest}. {allowed}: multiply a mask of 0 and 1 by {white}, choose the "
+            "instrument's label in a label image."
+        )
+    values = ", ".join(str(int(value)) for value in _flat_values(image)[:6])
+    raise SequenceError(
+        f"mask {path} has areas of the values {values}. {allowed}: choose the instrument's labels, or import them with "
+        "`carts import-masks`."
+    )
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """A label image: one value per pixel, a colour per pixel, or a mask."""
+
+    mask: Bool[np.ndarray, "height width"] | None
+    """Where it is white; None where it has labels."""
+    values: np.ndarray | None
+    """[height, width]: grey values in full depth, or palette indices; None for colours."""
+    colours: UInt8[np.ndarray, "height width 3"]
+    """RGB"""
+    remarks: tuple[str, ...]
+    """What was changed or decided, in words that follow the file's name."""
+
+
+def read_labels(path: Path) -> LabelImage:
+    """An image of labels or a mask, in full depth.
+
+    Raises:
+        SequenceError: it is missing, damaged, or its transparency contradicts its colours.
+    """
+    raster = _decode(path, colour=False)
+    grey, remarks = raster.grey, _orientation_remarks([raster.traits])
+    mask = _white_part(raster, f"mask {path}")
+    if grey is None and raster.indices is not None:
+        grey, mask = raster.indices, None
+        remarks.append("labels are the indices of the palette")
+    elif raster.opaque is not None:
+        remarks.append("the mask is the opaque part (alpha)")
+    elif grey is not None and mask is not None:
+        if mask.any() and grey.max() < raster.white - _NEAR:
+            mask = None
+        elif ((grey > 0) & (grey < raster.white)).any():
+            remarks.append(f"grey borders, of which {(raster.white + 1) // 2} and more count as instrument")
+    colours = raster.pixels if raster.pixels.ndim == 3 else np.repeat(raster.pixels[..., None], 3, -1)
+    colours = colours if colours.dtype == np.uint8 else (colours >> 8).astype(np.uint8)
+    return LabelImage(mask, grey, colours, tuple(remarks))
+
+
+def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
+    """What is changed about some of the mask files; errors are left to those who use them."""
+    found: list[str] = []
+    chosen = spread_files([*files])
+    for file in chosen:
+        try:
+            found += read_labels(file).remarks
+        except SequenceError:
+            continue
+    return tuple(f"masks: {text} ({count} of {len(chosen)} looked at)." for text, count in Counter(found).items())
+
+
+def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
+    """What is changed about images when they are read, by their headers; missing ones are left out."""
+    traits = []
+    for file in files:
+        try:
+            with open_regular(file, IMAGE) as stream:
+                traits.append(image_traits(stream.read(_HEADER)))
+        except OSError:
+            continue
+    found = [f"images: {text} ({len(traits)} looked at)." for text in _orientation_remarks(traits)]
+    if any(each.alpha for each in traits):
+        found.append("images: transparency (alpha) is not used.")
+    return tuple(found)
+
+
+def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
+    """What is said of images of 16 bits; nothing for 8."""
+    if not is_deep(files):
+        return ()
+    bits = bits_of_files(files)
+    return (
+        f"images: of 16 bits, {bits} are in use, and values are scaled from 0 to {2**bits - 1} (change: `bits` of the "
+        f"camera in the sequence file, one of {', '.join(map(str, DEPTHS))}).",
+    )
+
+
+def is_deep(files: Sequence[Path]) -> bool:
+    """Whether the first of the images has more than 8 bits."""
+    try:
+        return _decode(files[0], colour=True).pixels.dtype != np.uint8
+    except (SequenceError, IndexError):
+        return False
+
+
+def bits_of_files(files: Sequence[Path]) -> int:
+    """Bits in use of the values of a camera's images, counted in some of them; 8 where files have no more."""
+    largest = 0
+    for file in spread_files(files) if is_deep(files) else ():
+        try:
+            largest = max(largest, int(_decode(file, colour=True).pixels.max()))
+        except SequenceError:
+            continue
+    return _fewest_bits(largest)
+
+
+def spread_files(files: Sequence[Path]) -> list[Path]:
+    """Some of the files, from the first to the last."""
+    if not files:
+        return []
+    rows = np.unique(np.linspace(0, len(files) - 1, min(_SAMPLED, len(files))).round().astype(int))
+    return [files[row] for row in rows]
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """A decoded image file, upright."""
+
+    pixels: np.ndarray
+    """[height, width] or [height, width, 3], RGB, of 8 or 16 bits."""
+    opaque: np.ndarray | None
+    """Where it is opaque, for an image that is not so everywhere."""
+    indices: np.ndarray | None
+    """Of its palette."""
+    traits: ImageTraits
+
+    @property
+    def white(self) -> int:
+        """Largest value of a pixel."""
+        return int(np.iinfo(self.pixels.dtype).max)
+
+    @property
+    def grey(self) -> np.ndarray | None:
+        """The values of an image without colours; None for one with colours."""
+        if self.pixels.ndim == 2:
+            return self.pixels
+        first = self.pixels[..., :1]
+        tolerance = 2 * _NEAR if self.traits.lossy else 0
+        same = np.abs(self.pixels.astype(np.int32) - first).max(initial=0) <= tolerance
+        return self.pixels[..., 1] if same else None
+
+
+def _decode(path: Path, *, colour: bool) -> _Raster:
     try:
         content = read_bytes(path, IMAGE)
     except (FileNotFoundError, IsADirectoryError) as error:
@@ -84,17 +280,129 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         ) from error
     except OSError as error:
         raise SequenceError(f"image {path} cannot be read: {error}.") from error
+    return _raster(content, f"image {path}", colour=colour)
+
+
+def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
+    """The pixels of an encoded image.
+
+    Args:
+        content: of the file.
+        what: how errors call it.
+        colour: RGB in any case, without transparency.
+    """
     if (damage := find_damage(content)) is not None:
-        raise SequenceError(f"image {path} is damaged: {damage}. {_REMEDY}")
+        raise SequenceError(f"{what} is damaged: {damage}. {_REMEDY}")
     if (problem := size_problem(content)) is not None:
-        raise SequenceError(f"image {path} {problem}. {_REMEDY}")
+        raise SequenceError(f"{what} {problem}. {_REMEDY}")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if colour else cv2.IMREAD_UNCHANGED
     try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
+    if image is None and colour and content[:4] in TIFF:
+        return _raster(content, what, colour=False)  # For the error: it has no colours of 8 or 16 bits.
     if image is None:
-        raise SequenceError(f"image {path} cannot be decoded; its content is damaged. {_REMEDY}")
-    return image
+        raise SequenceError(f"{what} cannot be decoded; its content is damaged. {_REMEDY}")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise SequenceError(f"{what} has pixels of the type {image.dtype}. Save it with 8 or 16 bits.")
+    traits = image_traits(content)
+    indices = _palette_indices(content) if traits.palette and not colour else None
+    if not traits.turned_already:
+        image = _TURNS[traits.orientation](image)
+        indices = None if indices is None else _TURNS[traits.orientation](indices)
+    opaque = None
+    if image.ndim == 3:
+        white = 255 if image.dtype == np.uint8 else 65535
+        if image.shape[2] == 4 and image[..., 3].min() < white:
+            opaque = 2 * image[..., 3].astype(np.int64) >= white
+        image = image[..., 2::-1]
+    return _Raster(np.ascontiguousarray(image), opaque, indices, traits)
+
+
+_TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.swapaxes(0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: image.swapaxes(0, 1)[::-1, ::-1],
+    8: np.rot90,
+}
+"""What turns stored pixels upright, by EXIF's orientation."""
+
+
+def _palette_indices(content: bytes) -> np.ndarray:
+    import io  # noqa: PLC0415
+
+    from PIL import Image  # noqa: PLC0415 - OpenCV gives the colours alone
+
+    return np.array(Image.open(io.BytesIO(content), formats=("PNG",)))
+
+
+def _fewest_bits(largest: int) -> int:
+    return next(depth for depth in DEPTHS if largest < 2**depth)
+
+
+def _eight_bits(
+    raster: _Raster, what: str, bits: Callable[[], int] | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
+    if raster.pixels.dtype == np.uint8:
+        return raster.pixels
+    needed = _fewest_bits(int(raster.pixels.max(initial=0)))
+    used = needed if bits is None else bits()
+    if needed > used:
+        raise SequenceError(
+            f"{what} has values of {needed} bits, but the other images of its camera are taken to have {used}. Write "
+            f"`bits = {needed}` into the camera's table in the sequence file."
+        )
+    return (raster.pixels >> (used - 8)).astype(np.uint8)
+
+
+def _white_part(raster: _Raster, what: str) -> Bool[np.ndarray, "height width"] | None:
+    """Where a mask is instrument; None for an image of labels."""
+    grey = raster.grey
+    brightness = raster.pixels.max(-1) if grey is None else grey
+    lit = brightness >= 0.5 * raster.white
+    if raster.opaque is not None:
+        decided = grey is not None and 0 < lit.mean() < 1 and _is_two_valued(grey, raster)
+        if decided and not np.array_equal(lit & raster.opaque, raster.opaque | lit):
+            raise SequenceError(
+                f"{what} is white in other places than where it is opaque. Save it without transparency (alpha)."
+            )
+        return raster.opaque
+    if grey is None:
+        hues = raster.pixels[lit] / brightness[lit][:, None]
+        if not lit.any() or (np.ptp(hues, axis=0) > _ONE_COLOUR).any():
+            return None
+    return lit if _is_two_valued(brightness, raster) else None
+
+
+def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
+    """Whether the areas of an image, without their borders, are black or as bright as it is anywhere."""
+    top = int(grey.max())
+    flat = _flat_values(grey).astype(np.int64)
+    noisy = raster.traits.lossy or len(np.unique(grey)) > _MOST_LABELS
+    tolerance = _NEAR if noisy else 0
+    near = (flat <= tolerance) | (flat >= top - tolerance)
+    return top == 0 or (top >= 0.5 * raster.white and bool(near.all()))
+
+
+def _flat_values(grey: np.ndarray) -> np.ndarray:
+    """The values of the areas of an image: those that a pixel shares with all its neighbours."""
+    kernel = np.ones((3, 3), np.uint8)
+    return np.unique(grey[cv2.erode(grey, kernel) == cv2.dilate(grey, kernel)])
+
+
+def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
+    """Words on images that are turned."""
+    turned = Counter(each.orientation for each in traits if each.orientation != 1)
+    return [
+        f"{'' if count == len(traits) else f'{count} '}turned as EXIF orientation {orientation} says"
+        f"{', width and height change places' if orientation > 4 else ''}"
+        for orientation, count in sorted(turned.items())
+    ]
 
 
 def find_damage(content: bytes) -> str | None:

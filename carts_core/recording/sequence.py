@@ -71,6 +71,8 @@ class Sequence:
         measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
         truth: arm -> true joint positions of all frames, or None; only the arms that have one.
+        remarks: sentences on what is changed about images and masks before they are used (turned, scaled to 8 bits,
+            deinterlaced), and on what is unusual about calibrations.
     """
 
     def __init__(self, description: Description) -> None:
@@ -86,6 +88,7 @@ class Sequence:
         self.truth = {
             name: description.at_frames(arm.truth) for name, arm in description.arms.items() if arm.truth is not None
         } or None
+        self.remarks = description.remarks
         self._mounts = description.mounts()
         self._description = description
         self._cameras = description.cameras
@@ -230,7 +233,7 @@ class Sequence:
         camera = entry.camera
         if domain in entry.background:
             path = entry.background[domain]
-            image = read_image(path)
+            image = read_image(path, getattr(entry.images[domain], "bits", None))
             self._check_size(image, camera.name, f"background {path}")
             return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
         indices = spread(len(self))

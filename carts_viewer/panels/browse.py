@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 import viser
 
 from carts_core.project import Source
+from carts_core.wording import counted
 from carts_viewer import intents
 from carts_viewer.finding import SOLVED, copied
 from carts_viewer.handlers.browsing import SPEEDS
@@ -54,6 +55,12 @@ class BrowsePanel:
                 visible=offset is not None,
                 hint="Clock of the kinematics minus clock of the images. Make it smaller when the overlay runs ahead.",
             )
+            if sequence.remarks:
+                lines = "".join(f"<li>{escaped(remark)}</li>" for remark in sequence.remarks)
+                count = counted(len(sequence.remarks), "remark")
+                gui.add_html(
+                    f"<details class='carts-remarks'><summary>⚠ {count} on the files</summary>{lines}</details>"
+                )
             self._error = gui.add_html("", visible=False)
             self._caption = gui.add_html("")
         on_input(self._frame, lambda value: intents.ShowFrame(int(value) - 1), emit)

@@ -118,16 +118,7 @@ def test_run_lengths_of_coco_that_are_not_compressed_are_read(sequence: Sequence
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"images": []}, "annotations name image 7, which is not there"),
-        ({"categories": []}, "3 is missing"),
         ({"images": [{"id": 7, "file_name": "left_2.png", "width": 10**9, "height": 5}]}, "its size is 1000000000 x 5"),
-        ({"annotations": [{"image_id": 7, "category_id": 3, "segmentation": [[1, 2, 3]]}]}, "cannot be read"),
-        (
-            {"annotations": [{"image_id": 7, "category_id": 3, "segmentation": {"size": [9, 9], "counts": "1"}}]},
-            "9 x 9",
-        ),
-        ({"annotations": [{"image_id": 7, "category_id": 3, "segmentation": [[1e300] * 6]}]}, "lies nowhere"),
-        ({"annotations": [{"image_id": 7, "category_id": 3, "keypoints": [1, 2, 2] * 3}]}, "3 keypoints have 2 names"),
         ({"annotations": 5}, "is not a COCO file"),
     ],
 )
@@ -162,9 +153,6 @@ def test_polygons_masks_and_points_of_cvat_are_read_in_their_order(sequence: Seq
         ("<!DOCTYPE a [<!ENTITY x 'y'>]><annotations/>", "declares a document type"),
         ("<annotations><image", "is not a CVAT file"),
         ("<annotations/>", "there is no <image>"),
-        (CVAT.format(more='<mask label="a" left="90" top="0" width="10" height="1" rle="10"/>'), "is not inside"),
-        (CVAT.format(more='<mask label="a" left="0" top="0" width="10" height="1" rle="4"/>'), "do not make 10 x 1"),
-        (CVAT.format(more='<polygon label="a" points="1,nan;2,3;4,5"/>'), "a point lies nowhere"),
     ],
 )
 def test_a_wrong_cvat_file_is_refused_with_what_is_wrong(
@@ -174,6 +162,64 @@ def test_a_wrong_cvat_file_is_refused_with_what_is_wrong(
     path.write_text(text)
     with pytest.raises(SequenceError, match=message):
         all_of(path, sequence)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ('<mask label="a" left="90" top="0" width="10" height="1" rle="10"/>', "is not inside"),
+        ('<mask label="a" left="0" top="0" width="10" height="1" rle="4"/>', "do not make 10 x 1"),
+        ('<polygon label="a" points="1,nan;2,3;4,5"/>', "a point lies nowhere"),
+    ],
+)
+def test_a_wrong_shape_of_cvat_is_left_out_and_named(
+    sequence: Sequence, tmp_path: Path, shape: str, message: str
+) -> None:
+    (tmp_path / "annotations.xml").write_text(CVAT.format(more=""))
+    wanted, _, _ = all_of(tmp_path / "annotations.xml", sequence)
+    (tmp_path / "annotations.xml").write_text(CVAT.format(more=shape))
+    found = read_annotations(tmp_path / "annotations.xml", sequence)
+    frames = {(each.frame, each.camera): each for each in found.frames}
+    for at, each in wanted.items():
+        found_labels = frames[at].labels
+        assert found_labels is not None and np.array_equal(found_labels, each.labels)
+    (remark,) = found.remarks
+    assert message in remark and "left out" in remark
+
+
+TRIANGLE = [10, 10, 40, 10, 40, 40]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"segmentation": {"size": [HEIGHT, WIDTH], "counts": [5, 7]}}, "the run lengths do not make 96 x 72 pixels"),
+        ({"segmentation": {"size": [9, 9], "counts": "1"}}, "a mask is 9 x 9 in an image of 96 x 72"),
+        ({"segmentation": [[10, 10, 40, 10, 40]]}, "a polygon has 5 numbers, which are not x and y"),
+        ({"segmentation": [[1, 2, 3, 4]]}, "a polygon has 4 numbers"),
+        ({"segmentation": [[1e300] * 6]}, "lies nowhere"),
+        ({"segmentation": [TRIANGLE], "category_id": 9}, "category 9 is not in the file"),
+        ({"segmentation": [TRIANGLE], "image_id": 8}, "image 8 is not in the file"),
+        ({"keypoints": [1, 2, 2] * 3}, "3 keypoints have 2 names"),
+        ({"keypoints": [1, 2]}, "its keypoints have 2 numbers"),
+    ],
+)
+def test_a_wrong_annotation_of_coco_is_left_out_and_named(
+    sequence: Sequence, tmp_path: Path, wrong: dict, message: str
+) -> None:
+    good = {"id": 1, "image_id": 7, "category_id": 3, "segmentation": [[50, 50, 60, 50, 60, 60]]}
+    marked = [good, {"id": 52, "image_id": 7, "category_id": 3, **wrong}]
+    found = read_annotations(write_coco(tmp_path / "labels.json", annotations=marked), sequence)
+    (frame,) = found.frames
+    assert frame.labels is not None and frame.labels.sum() == 55
+    (remark,) = found.remarks
+    assert remark.startswith("annotation 52 left out: ") and message in remark
+
+
+def test_a_polygon_without_a_list_around_it_is_a_polygon(sequence: Sequence, tmp_path: Path) -> None:
+    marked = [{"id": 1, "image_id": 7, "category_id": 3, "segmentation": [10, 10, 30, 10, 30, 20, 10, 20]}]
+    frames, _, _ = all_of(write_coco(tmp_path / "labels.json", annotations=marked), sequence)
+    assert frames[1, "left"].labels.sum() == 200
 
 
 def write_png(path: Path, values: np.ndarray) -> None:
@@ -246,7 +292,7 @@ def test_masks_that_do_not_fit_are_refused(
 
 def test_a_damaged_mask_and_a_folder_without_masks_are_refused(sequence: Sequence, tmp_path: Path) -> None:
     (tmp_path / "none").mkdir()
-    with pytest.raises(SequenceError, match=r"has no masks \(.png, .bmp\)"):
+    with pytest.raises(SequenceError, match=r"has no masks \(.png, .bmp, .tif"):
         all_of(tmp_path / "none", sequence)
     write_png(tmp_path / "left" / "001.png", disc(1) * np.uint8(255))
     file = tmp_path / "left" / "001.png"

@@ -1,5 +1,6 @@
 """CVAT for images 1.1: masks, polygons and points."""
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,11 +23,15 @@ def is_cvat(path: Path) -> bool:
     return path.suffix.lower() == ".xml"
 
 
-def read_cvat(path: Path) -> Iterator[ForeignImage]:
+def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The images of a CVAT file.
 
+    Args:
+        path: of the file.
+        remarks: shapes that are not usable are added, with the reason, and left out.
+
     Raises:
-        SequenceError: it is not CVAT's, or contradicts itself.
+        SequenceError: it is not CVAT's.
     """
     try:
         text = read_text(path, VALUES)
@@ -41,10 +46,10 @@ def read_cvat(path: Path) -> Iterator[ForeignImage]:
     except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
         raise SequenceError(f"{path} is not a CVAT file ({error}). Export it again.") from error
     for image in images:
-        yield _image(path, image)
+        yield _image(path, image, remarks)
 
 
-def _image(path: Path, image: Element) -> ForeignImage:
+def _image(path: Path, image: Element, remarks: Counter[str]) -> ForeignImage:
     name = image.get("name", "")
     where = f"{path}: image {name!r}"
     try:
@@ -63,7 +68,8 @@ def _image(path: Path, image: Element) -> ForeignImage:
             try:
                 mask = _mask(shape, height, width)
             except (ValueError, TypeError) as error:
-                raise SequenceError(f"{where} cannot be read ({error}). Export it again.") from error
+                remarks[f"a {shape.tag} ({shape.get('label', 'no label')}) of {name} left out: {error}"] += 1
+                continue
             yield shape.get("label", "instrument"), mask
 
     return ForeignImage(name, parts, points)

@@ -1,6 +1,7 @@
 """Folders of mask images: white on black, labels as grey values, or labels as colours (EndoVis 2017 and 2018)."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,18 @@ from jaxtyping import Bool
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, is_regular, parse_json, read_text
-from ..images import read_image
+from ..images import read_labels
 from .found import MOST_IMAGES, ForeignImage
 
 _SUFFIXES = (".png", ".bmp")
+_OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
+"""Looked for where there are none of these, since masks lie beside images."""
 _DEEPEST = 4
 _MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
+_MOST_UNNAMED = 32
+"""Values of one image; more come from interpolation."""
 _BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
 """How EndoVis 2018 begins the names of what belongs to an instrument; everything else is anatomy or thread."""
@@ -30,19 +35,22 @@ def is_mask_folder(path: Path) -> bool:
     return path.is_dir()
 
 
-def read_mask_folder(path: Path, *, confined: bool = False) -> Iterator[ForeignImage]:
+def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:
     """The images below a folder; files of one name in folders beside one another belong to one frame.
 
     Args:
         path: of the folder.
+        remarks: what was changed or decided about how many files is added while they are decoded.
         confined: whether links are left out, and what values mean is not looked for above the folder.
 
     Raises:
         SequenceError: there are none, or it is not known what their values mean.
     """
-    files = [file for file in _files(_finest(path)) if not (confined and file.is_symlink())]
+    there = [file for file in _files(_finest(path)) if not (confined and file.is_symlink())]
+    files = [file for file in there if file.suffix.lower() in _SUFFIXES] or there
     if not files:
-        raise SequenceError(f"{path} has no masks ({', '.join(_SUFFIXES)}). Name the folder that holds them.")
+        known = ", ".join((*_SUFFIXES, *_OTHER_SUFFIXES))
+        raise SequenceError(f"{path} has no masks ({known}). Name the folder that holds them.")
     meanings: dict[Path, Any] = {}
     for file in files:
         above = _meaning_file(file, path if confined else path.parent, confined)
@@ -50,7 +58,7 @@ def read_mask_folder(path: Path, *, confined: bool = False) -> Iterator[ForeignI
             meanings[above] = _meaning(above)
         meaning = None if above is None else meanings[above]
         yield ForeignImage(
-            file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning)
+            file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning, remarks)
         )
 
 
@@ -64,7 +72,8 @@ def _files(folder: Path) -> list[Path]:
     for place, folders, names in os.walk(folder):
         if len(Path(place).relative_to(folder).parts) >= _DEEPEST:
             folders.clear()
-        found += [Path(place) / name for name in names if name.lower().endswith(_SUFFIXES)]
+        chosen = [name for name in names if name.lower().endswith((*_SUFFIXES, *_OTHER_SUFFIXES))]
+        found += [Path(place) / name for name in chosen if not name.startswith(".")]
         if len(found) > MOST_IMAGES:
             raise SequenceError(f"{folder} has more than {MOST_IMAGES} masks. Name a folder with fewer.")
     # Files of one frame follow each other: tools have folders of their own beside one another.
@@ -90,20 +99,26 @@ def _meaning(path: Path) -> Any:
         raise SequenceError(f"{path} cannot be read ({error}). Correct it or remove it.") from error
 
 
-def _parts(file: Path, meaning: Any) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
-    image = read_image(file)
+def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    image = read_labels(file)
     tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
-    yield "", np.zeros(image.shape[:2], bool)
+    yield "", np.zeros(image.colours.shape[:2], bool)
     try:
         if isinstance(meaning, list):
-            yield from _by_colour(image, _colours(meaning), file)
-        elif not (image == image[..., :1]).all():
+            yield from _by_colour(image.colours, _colours(meaning), file)
+            return
+        names = _names(meaning, file.parent.name)
+        remarks.update(image.remarks)
+        if image.mask is not None and not names:
+            if image.mask.any():
+                yield tool or _INSTRUMENT, image.mask
+        elif image.values is None:
             raise SequenceError(
                 f"{file} has colours, and no labels.json in its folder or above says what they mean. Add one as "
                 'EndoVis 2018 has it: [{"name": ..., "color": [r, g, b]}, ...].'
             )
         else:
-            yield from _by_value(image[..., 0], _names(meaning, file.parent.name), tool)
+            yield from _by_value(image.values, names, tool, file)
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise SequenceError(f"what the values of {file} mean cannot be read ({error}).") from error
 
@@ -127,19 +142,19 @@ def _by_colour(
 
 
 def _by_value(
-    image: np.ndarray, names: Mapping[int, str], tool: str
+    image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
 ) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
     values = [int(value) for value in np.unique(image) if value]
-    white = values == [255] and not names
+    unknown = [value for value in values if value not in names]
+    if len(unknown) > _MOST_UNNAMED:
+        raise SequenceError(
+            f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}. Labels that were resized "
+            "with interpolation have such: resize them by the nearest neighbour, or name each value in labels.json."
+        )
     for value in values:
-        name = _INSTRUMENT if white else names.get(value, f"label {value}")
-        if name.lower() in _BACKGROUND:
-            continue
-        if tool and not white:
-            name = f"{tool}.{name}"
-        elif tool:
-            name = tool
-        yield name, image == value
+        name = names.get(value, f"label {value}")
+        if name.lower() not in _BACKGROUND:
+            yield f"{tool}.{name}" if tool else name, image == value
 
 
 def _names(meaning: Any, folder: str) -> dict[int, str]:

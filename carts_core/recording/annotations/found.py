@@ -1,5 +1,6 @@
 """What a reader of foreign annotations gives: images as the file has them, and then frames of the sequence."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -76,3 +77,6 @@ class Annotations:
     """Of label 1 and so on; complete once all frames were gone through."""
     unknown: list[str]
     """Names of images that belong to no frame; complete likewise."""
+    remarks: Counter[str] = field(default_factory=Counter)
+    """What was decided about masks, and annotations that were left out with the reason, and how often; complete
+    likewise."""

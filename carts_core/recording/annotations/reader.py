@@ -1,6 +1,7 @@
 """Foreign annotations as frames of a sequence."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -28,7 +29,7 @@ _OWN_EXPORT = "export.json"
 class _Format:
     kind: str
     fits: Callable[[Path], bool]
-    read: Callable[[Path], Iterator[ForeignImage]]
+    read: Callable[[Path, Counter[str]], Iterator[ForeignImage]]
 
 
 _FORMATS = (
@@ -68,10 +69,10 @@ def read_annotations(
             "keypoints of SurgPose (.yaml), or a folder of PNG masks."
         )
     own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
-    labels, unknown = Labels(), []
+    labels, unknown, remarks = Labels(), [], Counter()
     reader = _FrameReader(sequence, camera, source.name, labels, unknown, undistorted=own)
-    images = read_mask_folder(place, confined=confined) if place.is_dir() else chosen.read(place)
-    return Annotations(chosen.kind, reader.frames(images), labels.names, unknown)
+    images = read_mask_folder(place, remarks, confined=confined) if place.is_dir() else chosen.read(place, remarks)
+    return Annotations(chosen.kind, reader.frames(images), labels.names, unknown, remarks)
 
 
 class _FrameReader:

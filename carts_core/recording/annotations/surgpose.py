@@ -1,6 +1,7 @@
 """Keypoints of SurgPose: `keypoints_left.yaml`, a table of numbered points for every frame."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,12 +16,13 @@ def is_surgpose(path: Path) -> bool:
     return path.suffix.lower() in (".yaml", ".yml")
 
 
-def read_surgpose(path: Path) -> Iterator[ForeignImage]:
-    """The frames of a file of keypoints.
+def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+    """The frames of a file of keypoints; nothing is remarked about them.
 
     Raises:
         SequenceError: it is none.
     """
+    del remarks
     try:
         content = parse_yaml(read_text(path, VALUES))
         if not isinstance(content, dict) or len(content) > MOST_IMAGES:

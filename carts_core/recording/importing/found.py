@@ -48,6 +48,8 @@ class FoundCamera:
     masks: str = ""
     """Pattern of its masks, below `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False
+    bits: int | None = None
+    """Of the values of images with 16; None for 8."""
     crop: tuple[int, int, int, int] | None = None
     """Left, top, width, height of its part of each image [px]."""
     topic: str = ""

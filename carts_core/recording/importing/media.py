@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
-from ..images import read_image
+from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import SUFFIXES, Video
 from ..video_index import index_video
 from .cameras import calibration_of
@@ -34,6 +34,10 @@ class Images:
     """Width and height [px]."""
     times: Float[np.ndarray, " frames"] | None = None
     """Presentation times of a video [s]."""
+    bits: int | None = None
+    """Of the values of images with 16; None for 8."""
+    remarks: tuple[str, ...] = ()
+    """What is changed about stored images before they are used."""
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -61,8 +65,10 @@ def find_images(path: Path, only: str = "") -> Images:
     if not files:
         raise SequenceError(f"{path} has no images ({', '.join(IMAGE_SUFFIXES)}) and is no video. Name another place.")
     pattern, ids = _numbered(files, path)
-    first = read_image(path / pattern.format(frame=ids[0]))
-    return Images(path, pattern, ids, (first.shape[1], first.shape[0]))
+    source = ImageFiles(tuple(path / pattern.format(frame=name) for name in ids))
+    first, remarks = source.read(0), (*image_remarks(source.files), *bits_remark(source.files))
+    bits = source.bits() if is_deep(source.files) else None
+    return Images(path, pattern, ids, (first.shape[1], first.shape[0]), None, bits, remarks)
 
 
 def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
@@ -91,9 +97,10 @@ def _video(path: Path) -> Images:
     index = index_video(path)
     if not index.count:
         raise SequenceError(f"video {path} has no frames. Copy it again.")
-    first = Video(path, (0,)).read(0)
+    video = Video(path, (0,))
+    first = video.read(0)
     ids = tuple(f"{number:06d}" for number in range(index.count))
-    return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps)
+    return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps, remarks=video.remarks())
 
 
 def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
@@ -117,6 +124,7 @@ def cameras_of(
         notes.append(
             Note("found", f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
         )
-        camera = FoundCamera(name, each.size, each.path, each.pattern)
+        notes += [Note("guessed", f"{name}: {text}") for text in each.remarks]
+        camera = FoundCamera(name, each.size, each.path, each.pattern, bits=each.bits)
         cameras.append(calibration_of(camera, chosen, notes))
     return tuple(cameras)

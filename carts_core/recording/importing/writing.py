@@ -200,6 +200,8 @@ def _camera_lines(camera: FoundCamera, place: Path, moves: bool) -> list[str]:
     if any(camera.distortion):
         lines.append(f"distortion = {[float(value) for value in camera.distortion]}")
     lines.append(f"images = {_text(images)}")
+    if camera.bits is not None:
+        lines.append(f"bits = {camera.bits}")
     if camera.crop is not None:
         lines.append(f"crop = {list(camera.crop)}")
     if camera.topic:

@@ -9,14 +9,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ...errors import SequenceError
-from ...files.image_size import size_problem
-from ...files.reading import IMAGE, read_bytes
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
+from ..images import mask_remarks, read_mask, spread_files
 from ..importing.foreign_tables import read_array, read_foreign_table
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.joint_units import in_si, joints_of_arm
@@ -32,7 +30,6 @@ _AMBF_FIELD_OF_VIEW = 1.2
 """[rad] Vertical, of the simulated camera."""
 _DECIMETRES_FROM = 0.3
 """[m] No instrument is inserted that far; older simulations count in decimetres."""
-_WHITE = 128
 
 
 def _subfolders(path: Path) -> list[Path]:
@@ -77,12 +74,14 @@ def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: 
     if not shared:
         notes.append(Note("warning", f"{folder}: no mask is of a frame; they are left out."))
         return camera
-    content = read_bytes(folder / masks.pattern.format(frame=shared[0]), IMAGE)
-    first = None if size_problem(content) else cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if first is not None and 0 < first.max() < _WHITE:
-        text = "are labels instead of 0 and 255; they are left out. Write masks with 255 where the instrument is."
-        notes.append(Note("missing", f"masks in {folder} {text}"))
+    files = [folder / masks.pattern.format(frame=frame) for frame in shared]
+    try:
+        for file in spread_files(files):
+            read_mask(file)
+    except SequenceError as error:
+        notes.append(Note("missing", f"{camera.name}: masks in {folder} are left out: {error}"))
         return camera
+    notes += [Note("found", f"{camera.name}: {text}") for text in mask_remarks(files)]
     return replace(camera, masks=str(folder / masks.pattern), sparse_masks=len(shared) < len(ids))
 
 

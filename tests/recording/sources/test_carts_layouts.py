@@ -97,7 +97,7 @@ def test_label_images_are_no_masks_and_that_is_said(tmp_path):
     (path / "segmentations").rmdir()
     write_masks(path / "segmentations", value=31)
     found = find(path)
-    assert not found.cameras[0].masks and any("are labels instead of 0 and 255" in note.text for note in found.notes)
+    assert not found.cameras[0].masks and any("has no value above 31. Masks are 0" in note.text for note in found.notes)
 
 
 def test_missing_images_of_one_domain_are_left_out_in_all(tmp_path):
