@@ -1,7 +1,11 @@
 """Words of messages and reports."""
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from itertools import islice
+
+_LONGEST_COMPARED, _MOST_COMPARED = 100, 200
+"""Misspellings are looked for in names up to this length, and in so many: comparing takes the product of lengths."""
 
 
 def counted(number: int, what: str) -> str:
@@ -30,3 +34,13 @@ def shortened(text: str, length: int = 200) -> str:
 def shown(value: object, length: int = 200) -> str:
     """A value that somebody gave, as it is quoted in an error: like `repr`, shortened in its middle."""
     return shortened(repr(value), length)
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """` Did you mean 'X'?` when one of `known` resembles `name`, else nothing."""
+    known, number = list(known), name.lstrip("0")
+    same = [one for one in known if one.casefold() == name.casefold()]
+    same = same or [one for one in known if name.isdecimal() and one.lstrip("0") == number]
+    if len(name) <= _LONGEST_COMPARED:
+        same = same or get_close_matches(name, known[:_MOST_COMPARED], n=1, cutoff=0.5)
+    return f" Did you mean {same[0]!r}?" if same else ""

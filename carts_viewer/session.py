@@ -21,9 +21,8 @@ from carts_core.project import (
     Key,
     ProjectState,
     Provenance,
-    Source,
 )
-from carts_core.project.calibrated import calibrated, corrected_state
+from carts_core.project.calibrated import calibrated, corrected_state, source_of
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.editing import Editor
 from carts_viewer.joint_range import JointRange, joint_range
@@ -113,8 +112,7 @@ class Session:
         """The frame's pose as a state of the project says, by default the present one with its draft."""
         project = self.editor.view if project is None else project
         state = corrected_state(self.scene, frame, project)
-        sources = {correction.provenance.source for correction in project.joints(frame.index).values()}
-        return Pose(state, next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED))
+        return Pose(state, source_of(project, frame.index))
 
     def ignored(
         self, index: int, cameras: Iterable[str], target: Target = NETWORK
@@ -262,10 +260,6 @@ def joint_correction(
     """A correction [rad, m] with its standard deviations, as far as any is known."""
     std = None if joint_std is None or not np.isfinite(joint_std).any() else tuple(joint_std.tolist())
     return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
-
-
-_SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
-"""Of a frame whose arms come from different sources, the first one of these is shown."""
 
 
 def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> CorrectedTransform:

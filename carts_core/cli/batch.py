@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -38,6 +38,9 @@ class Batch:
     """Only every N-th job, from the I-th on: `I/N`. Shards may run anywhere that sees the same folder."""
     scheduler: str | None = None
     """Give jobs to dask.distributed: address of its scheduler, or `local` for workers on this machine."""
+    project: Literal["beside", "none"] = "beside"
+    """Jobs that correct nothing themselves evaluate and export their recording as the project beside it corrects it;
+    `none`: as measured."""
     again: bool = False
     """Take steps again that are done; each redoes what has changed since."""
     report_only: bool = False
@@ -87,9 +90,12 @@ class Batch:
 
         from ..batch.pool import Pool
         from ..extras import needs_extra
-        from .batch_job import BatchWork
+        from .batch_job import BatchWork, with_project
 
-        workers, work = self.workers or os.cpu_count() or 1, BatchWork(folder, self.again, _inference(folder))
+        workers, work = (
+            self.workers or os.cpu_count() or 1,
+            BatchWork(folder, self.again, _inference(folder), self.project),
+        )
         if self.scheduler is None:
             engine = Pool(work, min(workers, len(jobs)), self.threads)
         else:
@@ -97,6 +103,9 @@ class Batch:
             from ..batch.cluster import Cluster
 
             engine = Cluster(work, self.scheduler, min(workers, len(jobs)), self.threads)
+        if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):
+            counts_of = f"{those} of {counted(len(jobs), 'job')} evaluated or exported as the project beside corrects"
+            console.print(f"{counts_of}; the logs have the counts; --project none for recordings as measured")
         failed, counts = {}, Counter()
         kept = f"{folder} holds what is done; the same command goes on from there"
         with when_stopped(kept), Bar(console=console) as bar:

@@ -4,10 +4,10 @@ import contextlib
 import io
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -28,6 +28,7 @@ from .evaluate import Evaluate
 from .export import Export
 from .import_ import Import
 from .optimize import Optimize
+from .selection import NO_PROJECT, FromProject
 
 _COMMANDS: dict[Step, type] = {
     "import": Import,
@@ -39,6 +40,8 @@ _COMMANDS: dict[Step, type] = {
 }
 _GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
 """What a job sets itself."""
+_CORRECTING: tuple[Step, ...] = ("import", "calibrate", "optimize", "sequence")
+"""After these, a job's evaluations and exports are of what it made itself."""
 _CODE = ("**/*.py",)
 
 
@@ -50,11 +53,14 @@ class BatchWork:
         folder: of the batch.
         again: whether steps that are done are taken again, whatever they were made from.
         inference: who runs the surface network where a step's options do not say; the same on all machines.
+        project: whether recordings are evaluated and exported as the project beside them corrects them; see
+            `with_project`.
     """
 
     folder: OutputPath
     again: bool = False
     inference: Inference = "auto"
+    project: Literal["beside", "none"] = "beside"
 
     def __call__(self, job: Job) -> Outcome:
         """Do a job; what is done of it is not done again."""
@@ -79,6 +85,12 @@ class BatchWork:
 def job_folder(batch: OutputPath, job: Job) -> OutputPath:
     """Where all of a job lies."""
     return batch / "jobs" / job.name
+
+
+def with_project(job: Job) -> Path | None:
+    """The project beside a job's recording, which the job evaluates or exports; None for a job that corrects itself."""
+    used = {"evaluate", "export"} & set(job.steps) and not set(_CORRECTING) & set(job.steps)
+    return FromProject().path(job.recording) if used else None
 
 
 def check_options(jobs: Sequence[Job]) -> None:
@@ -118,10 +130,15 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
     tune_process(keep_memory=True)
     log_to_stderr()
     done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
+    project = with_project(job) if work.project == "beside" else None
     sequence = job.recording
     for step in job.steps:
         options = (*job.options.get(step, ()), *_inference(step, job, work.inference))
-        key = fingerprint(key, step, job.camera, job.domain, options, [_inputs(Path(text)) for text in options])
+        if project is None and step in ("evaluate", "export") and not _given(options, "--project"):
+            options = (*options, "--project", NO_PROJECT)
+        inputs = [_inputs(Path(text)) for text in options]
+        corrections = [] if project is None else [_inputs(project), _inputs(project.with_name(f"{project.name}-wal"))]
+        key = fingerprint(key, step, job.camera, job.domain, options, inputs, *corrections)
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
@@ -140,10 +157,13 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
     """The option that has every machine run the network alike, for steps that run it on a CPU."""
-    given = {option.partition("=")[0] for option in job.options.get(step, ())}
-    if step in ("import", "export") or "--device" in given:
+    if step in ("import", "export") or _given(job.options.get(step, ()), "--device"):
         return ()
     return ("--device", "cpu" if inference == "auto" else f"cpu:{inference}")
+
+
+def _given(options: Iterable[str], name: str) -> bool:
+    return any(option.partition("=")[0] == name for option in options)
 
 
 _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}

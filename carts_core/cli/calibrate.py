@@ -34,9 +34,11 @@ class Calibrate:
     """Folder to write to; by default `runs/NAME/calibration`."""
     overwrite: bool = False
     """Replace an earlier calibration there."""
-    frames: str = f"{_SPREAD}20"
-    """Positions of the frames to calibrate with: `spread:20` for 20, spread evenly over the sequence, or as in
-    `carts evaluate`: `all`, `0-9,15`, `::3`."""
+    frames: str | None = None
+    """Frames to calibrate with: `spread:20` (the default) for 20, spread evenly over the sequence, or by id as in
+    `carts evaluate`: `all`, `001-010,015`, `::3`."""
+    positions: str | None = None
+    """Frames by position, counted from 1 as in the page, instead: `1-10,15`."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name; all take part at once."""
     domain: str | None = None
@@ -59,7 +61,7 @@ class Calibrate:
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
-        indices = frame_indices(self.frames, sequence)
+        indices = frame_indices(self.frames, self.positions, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
         observer.check(sequence, indices, cameras, [self.domain])
@@ -79,8 +81,9 @@ class Calibrate:
             )
             result = _optimized(optimizer, console)
             residuals = frame_residuals(sequence, frames, result)
+            named = [sequence.frame_ids[index] for index in indices]
             write_calibration(folder, output.path, sequence, result, residuals)
-            write_text(folder / MARKER, json.dumps(self._summary(observer.weights, indices, cameras), indent=1))
+            write_text(folder / MARKER, json.dumps(self._summary(observer.weights, named, cameras), indent=1))
         for camera in cameras:
             if (means := mean_dice(residuals, camera)) is not None:
                 console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
@@ -88,14 +91,14 @@ class Calibrate:
         console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
         print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
 
-    def _summary(self, weights: str, indices: list[int], cameras: list[str]) -> dict:
+    def _summary(self, weights: str, frames: list[str], cameras: list[str]) -> dict:
         """How the folder was made."""
         return {
             "format": "calibration",
             "sequence": str(self.sequence),
             "weights": weights,
             **self.network.observed,
-            "frames": indices,
+            "frames": frames,
             "cameras": cameras,
             "domain": self.domain,
             "joint_prior_deg": self.joint_prior_deg,
@@ -104,17 +107,20 @@ class Calibrate:
         }
 
 
-def frame_indices(text: str, sequence: "Sequence") -> list[int]:
-    """Positions that `--frames` means.
+def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence") -> list[int]:
+    """0-based indices that `--frames` or `--positions` chooses.
 
     Raises:
-        SettingsError: the text is not readable, names no frame or leaves the sequence.
+        SettingsError: they are not readable, or name no frame of the sequence.
     """
-    if not text.startswith(_SPREAD):
-        return Selection(frames=text).frame_indices(sequence)
-    count = text.removeprefix(_SPREAD)
+    frames = f"{_SPREAD}20" if frames is None and positions is None else frames
+    if frames is None or not frames.startswith(_SPREAD):
+        return Selection(frames, positions).frame_indices(sequence)
+    count = frames.removeprefix(_SPREAD)
     if not (count.isdecimal() and int(count) >= 1):
-        raise SettingsError(f"--frames {text!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+        raise SettingsError(f"--frames {frames!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+    if positions is not None:
+        raise SettingsError("--frames and --positions are both given. Give one of them.")
     from ..recording import spread
 
     return spread(len(sequence), int(count))

@@ -13,7 +13,7 @@ from ..errors import SettingsError
 from ..stopping import when_stopped
 from ..wording import counted
 from .observing import Observing
-from .selection import Mode, Perturbation, Selection, SequencePath, check_writable
+from .selection import FromProject, Mode, Perturbation, Selection, SequencePath, check_writable
 from .solver_options import FreeInFrames, SolverOptions
 
 _WIDTH = 110
@@ -22,7 +22,10 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Optimize frames and compare masks and joints with the truth."""
+    """Optimize frames and compare masks and joints with the truth, before and after.
+
+    They start as the project beside the sequence corrects them, or as measured without one.
+    """
 
     sequence: SequencePath
     """Sequence file."""
@@ -32,6 +35,7 @@ class Evaluate:
     """Optimize each frame alone, or all together, so that frames inform each other (docs: sequences)."""
     together: bool = False
     """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
+    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
@@ -62,6 +66,7 @@ class Evaluate:
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)
         domains = self.select.domain_names(sequence)
+        sequence = self.source.corrected(sequence, frames, console)
         observer = self.network.observer(self.solving.chosen, sequence)
         observer.check(sequence, frames, cameras, domains)
         run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
@@ -96,5 +101,7 @@ class Evaluate:
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:
-            write_text(self.json, json.dumps({**self.network.observed, **to_json(scores)}, indent=1))
+            project = self.source.path(sequence.path)
+            made_from = {} if project is None else {"project": str(project)}
+            write_text(self.json, json.dumps({**self.network.observed, **made_from, **to_json(scores)}, indent=1))
             console.print(f"wrote {self.json}")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -11,12 +11,19 @@ from ..errors import SettingsError
 from ..settings import FormatName, Parts
 from ..stopping import when_stopped
 from ..wording import counted
-from .selection import Selection, SequencePath
+from .selection import FromProject, Selection, SequencePath
+
+if TYPE_CHECKING:
+    from ..export import ExportFrame
+    from ..recording import Sequence
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats."""
+    """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats.
+
+    Frames are as the project beside the sequence corrects them, or as measured without one.
+    """
 
     sequence: SequencePath
     """Sequence file."""
@@ -25,7 +32,8 @@ class Export:
     format: FormatName
     """What to write."""
     kinematics: Path | None = None
-    """Export the frames of this table (what `carts optimize` wrote) instead of the measured kinematics."""
+    """Export the frames of this table (what `carts optimize` wrote) instead of those of a project or as measured."""
+    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     parts: Parts = "arms"
     """Give every arm a category of its own, or every part of it (shaft, wrist, jaws), or every link."""
     images: bool = True
@@ -38,23 +46,20 @@ class Export:
 
     def run(self) -> None:
         """Write the export; on Ctrl-C or an error nothing of it is left."""
-        from ..export import Dataset, Monitor, corrected_frames, export, measured_frames, read_kinematics_csv
+        from ..export import Dataset, Monitor, export
         from ..recording import Sequence
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
-        indices = self.select.frame_indices(sequence)
-        if self.kinematics is None:
-            frames = measured_frames(sequence, indices)
-        else:
-            frames = corrected_frames(sequence, indices, read_kinematics_csv(self.kinematics, sequence.scene))
         domains = self.select.domain_names(sequence)
         if len(domains) > 1:
             raise SettingsError(f"--domain: {len(domains)} domains were given; an export holds one. Name one.")
+        cameras = self.select.camera_names(sequence.scene)
+        sequence, frames = self._frames(sequence, cameras, console)
         dataset = Dataset(
             sequence,
             tuple(frames),
-            sequence.scene.with_cameras(self.select.camera_names(sequence.scene)),
+            sequence.scene.with_cameras(cameras),
             domains[0],
             parts=self.parts,
             images=self.images,
@@ -66,3 +71,31 @@ class Export:
             with when_stopped(f"nothing was written to {self.output}"):
                 path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         console.print(f"wrote {path}")
+
+    def _frames(
+        self, sequence: "Sequence", cameras: list[str], console: Terminal
+    ) -> "tuple[Sequence, list[ExportFrame]]":
+        """What is exported, and the recording that it belongs to."""
+        from ..export import corrected_frames, measured_frames, project_frame, read_kinematics_csv
+
+        indices = self.select.frame_indices(sequence)
+        if self.kinematics is not None:
+            if self.source.named:
+                raise SettingsError("--kinematics and --project are both given. Give one of them.")
+            if (beside := self.source.path(sequence.path)) is not None:
+                console.print(f"{beside} is left out, since --kinematics is given", soft_wrap=True)
+            return sequence, corrected_frames(sequence, indices, read_kinematics_csv(self.kinematics, sequence.scene))
+        project = self.source.read(sequence)
+        if project is None:
+            return sequence, measured_frames(sequence, indices)
+        from ..project.calibrated import corrected_sequence
+        from ..rendering import Renderer
+
+        console.print(self.source.sentence(sequence, project, indices), soft_wrap=True)
+        corrected = corrected_sequence(sequence, project)
+        renderers = {camera: Renderer(corrected.scene, cameras=[camera]) for camera in cameras}
+        frames = [
+            project_frame(corrected, project, index, cameras, lambda pose, name: renderers[name].segment(pose)[0] >= 0)
+            for index in indices
+        ]
+        return corrected, frames

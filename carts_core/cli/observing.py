@@ -70,7 +70,7 @@ class Observer:
             if without and (self.every or (self.given is not None and len(without) == len(frames))):
                 raise SettingsError(
                     f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
-                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}, position {without[0]}. Choose "
+                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose "
                     "others with --frames and --camera, or leave them to the network with --observe both."
                 )
 

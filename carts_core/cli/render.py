@@ -8,12 +8,12 @@ import tyro
 
 from ..console import Terminal, track
 from ..stopping import when_stopped
-from .selection import Perturbation, Selection, SequencePath, output_folder
+from .selection import FromProject, Perturbation, Selection, SequencePath, output_folder
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render the arms at the measured joint positions, over the frames or alone."""
+    """Render the arms over the frames or alone, as the project beside the sequence corrects them, else as measured."""
 
     sequence: SequencePath
     """Sequence file."""
@@ -23,6 +23,7 @@ class Render:
     """The rendering blended over the frame, alone, or its mask."""
     opacity: float = 0.6
     """Of the rendering in an overlay, 0 to 1."""
+    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
@@ -38,6 +39,7 @@ class Render:
         sequence = Sequence.open(self.sequence, progress=console.print)
         folder = output_folder(self.output, sequence.name, "render")
         frames = self.select.frame_indices(sequence)
+        sequence = self.source.corrected(sequence, frames, console)
         with locked_folder(folder), when_stopped(f"the pictures in {folder} are whole, some are missing"):
             for domain in self.select.domain_names(sequence):
                 for camera in self.select.camera_names(sequence.scene):

@@ -191,7 +191,7 @@ def frame_score(
         frame=frame.frame_id,
         camera=camera,
         domain=frame.domain,
-        dice_before=overlap(sequence.scene.with_cameras([camera]).state(start)),
+        dice_before=overlap(sequence.scene.with_cameras([camera]).state(start, mounts=frame.mounts)),
         dice_after=overlap(state.to("cpu")),
         joint_mae_deg_before=mae(start),
         joint_mae_deg_after=mae(joint_positions),

@@ -19,3 +19,4 @@ from .overlay import outlined as outlined
 from .overlay import overlay as overlay
 from .png import image_png as image_png
 from .png import mask_png as mask_png
+from .project_frames import project_frame as project_frame

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import RobotError
+from ..wording import closest
 from .camera import Camera
 from .robot import Robot
 
@@ -99,7 +100,8 @@ class Scene:
         for arm in self.arms:
             if arm.name == name:
                 return arm
-        raise RobotError(f"no arm is called {name!r}. The arms are: {', '.join(arm.name for arm in self.arms)}.")
+        known = [arm.name for arm in self.arms]
+        raise RobotError(f"no arm is called {name!r}. The arms are: {', '.join(known)}.{closest(name, known)}")
 
     def camera(self, name: str) -> Camera:
         """The camera of that name.
@@ -110,8 +112,8 @@ class Scene:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        known = ", ".join(camera.name for camera in self.cameras)
-        raise RobotError(f"no camera is called {name!r}. The cameras are: {known}.")
+        known = [camera.name for camera in self.cameras]
+        raise RobotError(f"no camera is called {name!r}. The cameras are: {', '.join(known)}.{closest(name, known)}")
 
     def with_cameras(self, names: Sequence[str] | None) -> "Scene":
         """The scene seen by these cameras only (all of them for None), in this order."""

@@ -15,10 +15,16 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
         model: direction, and the time between frames whose times are not known.
 
     Raises:
-        SettingsError: there are no frames, or times do not increase.
+        SettingsError: there are no frames, some have times and others none, or times do not increase.
     """
     if not times:
         raise SettingsError("there are no frames to correct. Choose at least one.")
+    without = [index for index, seconds in sorted(times.items()) if seconds is None]
+    if 0 < len(without) < len(times):
+        raise SettingsError(
+            f"{len(without)} of {len(times)} frames have no time; the first is frame {without[0]}. Give all frames "
+            "times, or none."
+        )
     known = {
         index: index * model.frame_seconds if seconds is None else seconds for index, seconds in sorted(times.items())
     }

@@ -1,15 +1,55 @@
-"""The pose of a frame as a project says: joints as corrected or measured, in the corrected calibration."""
+"""A recording as its project corrects it: joints as corrected or measured, in the corrected calibration."""
 
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..model.scene import Scene, SceneState
-from ..recording import Frame
+from ..recording import Frame, Sequence
 from .keys import Key
 from .state import ProjectState
+from .values import Source
+
+_SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
+"""Of a frame whose arms come from different sources, the first one of these counts."""
+
+
+def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
+    """The recording with the project's time offset, calibration and joint positions in place of the measured ones.
+
+    Raises:
+        SequenceError: with the project's time offset, a frame has no joint positions.
+    """
+    offset = project.get(Key.time_offset())
+    if offset is not None and sequence.matching is not None and offset.seconds != sequence.matching.time_offset:
+        sequence = sequence.with_time_offset(offset.seconds)
+    measured = {name: rows.copy() for name, rows in sequence.measured.items()}
+    for index in project.records.keys() & set(range(len(sequence))):
+        for name, found in project.joints(index).items():
+            measured[name][index] = found.joint_positions
+    return sequence.corrected(calibrated_scene(sequence.scene, project), measured)
+
+
+def calibrated_scene(scene: Scene, project: ProjectState) -> Scene:
+    """The scene with base frames, extrinsics and intrinsics as the project corrects them."""
+    arms, cameras = [], []
+    for arm in scene.arms:
+        base = project.get(Key.base_frame(arm.name))
+        arms.append(arm if base is None else replace(arm, T_world_base=np.array(base.transform)))
+    for camera in scene.cameras:
+        extrinsics, intrinsics = project.get(Key.extrinsics(camera.name)), project.get(Key.intrinsics(camera.name))
+        moved = camera if extrinsics is None else replace(camera, T_camera_world=np.array(extrinsics.transform))
+        cameras.append(moved if intrinsics is None else replace(moved, intrinsics=intrinsics.intrinsics))
+    return replace(scene, arms=tuple(arms), cameras=tuple(cameras))
+
+
+def source_of(project: ProjectState, frame: int) -> Source:
+    """Who or what made the joint positions of a frame."""
+    sources = {correction.provenance.source for correction in project.joints(frame).values()}
+    return next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED)
 
 
 def corrected_state(scene: Scene, frame: Frame, project: ProjectState) -> SceneState:

@@ -9,8 +9,8 @@ from ..errors import RobotError, SequenceError, SettingsError
 from ..files.reading import VALUES, parse_json, read_text
 from ..model.camera import HALF_PIXEL, Camera, rigid_transform
 from ..model.instruments import SCHEME, robot_file
-from ..wording import listed, shown
-from .toml_table import TomlTable, closest
+from ..wording import closest, listed, shown
+from .toml_table import TomlTable
 
 
 def take_value(table: TomlTable, key: str, default: Any) -> Any:

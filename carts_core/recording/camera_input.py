@@ -7,6 +7,7 @@ from pathlib import Path
 from ..errors import SequenceError
 from ..files.reading import is_regular
 from ..model.camera import Camera, implausible_intrinsics
+from ..wording import closest
 from .calibration import take_camera
 from .camera_motion import take_camera_motion
 from .frame_files import check_present, frame_files
@@ -16,7 +17,7 @@ from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
 from .matching import PoseSamples
 from .patterns import expand, is_glob, is_per_frame
 from .rows import Rows
-from .toml_table import TomlTable, closest
+from .toml_table import TomlTable
 from .video import SUFFIXES, Video
 
 

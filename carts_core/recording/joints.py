@@ -8,8 +8,9 @@ from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..model.robot import Robot
+from ..wording import closest
 from .table import Table
-from .toml_table import TomlTable, closest
+from .toml_table import TomlTable
 
 _UNITS = {"revolute": {"rad": 1.0, "deg": float(np.pi / 180)}, "prismatic": {"m": 1.0, "mm": 1e-3}}
 

@@ -6,8 +6,7 @@ from string import Formatter
 
 from ..errors import SequenceError
 from ..files.reading import LARGEST_NAME, check_path
-from ..wording import shown
-from .toml_table import closest
+from ..wording import closest, shown
 
 _WIDTH_DIGITS = 6
 _PLACEHOLDERS = ("frame", "index", "domain", "camera")

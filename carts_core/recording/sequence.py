@@ -1,7 +1,8 @@
 """A recording: frames with images, measured joint positions, and where known masks and truth."""
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,14 +12,13 @@ from jaxtyping import Bool, Float, UInt8
 from ..errors import SequenceError
 from ..model.camera import Camera
 from ..model.scene import Scene
-from ..wording import counted
+from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, spread
 from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
 from .images import ImageSource, read_image, read_mask
 from .matching import TimeMatching
-from .toml_table import closest
 
 CACHE_BYTES = 192 * 2**20
 """Memory for decoded images and masks of one sequence."""
@@ -125,6 +125,19 @@ class Sequence:
         # Images and masks do not depend on it.
         moved._cache = self._cache
         return moved
+
+    def corrected(self, scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]]) -> "Sequence":
+        """The same images with another calibration of the same arms and cameras, and other joint positions.
+
+        Args:
+            scene: arms and cameras.
+            measured: arm -> joint positions of all frames [rad, m], in place of the measured ones.
+        """
+        corrected = copy(self)
+        corrected.scene, corrected.measured = scene, dict(measured)
+        # Where the arms are decides what is background.
+        corrected._backgrounds, corrected._background_lock = {}, threading.Lock()
+        return corrected
 
     def __len__(self) -> int:
         return len(self.frame_ids)

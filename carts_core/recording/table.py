@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..files.reading import TABLE, open_regular
-from ..wording import listed, shown
-from .toml_table import closest
+from ..wording import closest, listed, shown
 
 MOST_CELLS = 10_000_000
 """Largest table; an hour at 100 rows per second has room for 27 columns."""

@@ -2,27 +2,18 @@
 
 import difflib
 from collections.abc import Iterable
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from ..errors import SequenceError
 from ..files import allowed_names, name_fault
 from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_text
-from ..wording import listed, shown
+from ..wording import closest, listed, shown
 
-_LONGEST_COMPARED, _MOST_COMPARED = 100, 200
-"""Misspellings are looked for in names up to this length, and in so many: comparing takes the product of lengths."""
+_MOST_COMPARED = 200
+"""Keys that a missing one is compared with."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
-
-
-def closest(name: str, known: Iterable[str]) -> str:
-    """' Did you mean ...?' when one of `known` resembles `name`, else nothing."""
-    if len(name) > _LONGEST_COMPARED:
-        return ""
-    matches = difflib.get_close_matches(name, list(islice(known, _MOST_COMPARED)), n=1, cutoff=0.5)
-    return f" Did you mean {matches[0]!r}?" if matches else ""
 
 
 def read_toml(path: Path) -> "TomlTable":

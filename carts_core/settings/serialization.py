@@ -1,12 +1,12 @@
 """Settings as plain data and back: what results keep, and what people write in a settings file."""
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from enum import StrEnum
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from ..errors import SettingsError
+from ..wording import closest
 from .stages import Stage
 
 _Settings = TypeVar("_Settings")
@@ -40,9 +40,9 @@ def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
     values: dict[str, Any] = {}
     for name, value in table.items():
         if name not in types:
-            close = difflib.get_close_matches(name, types, 1)
-            hint = f" Did you mean {close[0]!r}?" if close else ""
-            raise SettingsError(f"{where} has no setting {name!r}.{hint} Its settings are: {', '.join(types)}.")
+            raise SettingsError(
+                f"{where} has no setting {name!r}.{closest(name, types)} Its settings are: {', '.join(types)}."
+            )
         present = getattr(base, name)
         of_stages = name == "stages" or (isinstance(present, tuple) and present and type(present[0]) in get_args(Stage))
         values[name] = _stages(value, f"{where}.{name}") if of_stages else _like(value, present, f"{where}.{name}")

@@ -1,27 +1,21 @@
 """What intents about files do: the shown mask as a download, and frames in any format into the project's folder."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatchmethod
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Bool
-
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportFrame, Monitor, Parts, export, mask_png
+from carts_core.export import FORMATS, Dataset, Monitor, Parts, export, mask_png, project_frame
 from carts_core.files import OutputPath, file_name, output_path
-from carts_core.model.scene import SceneState
-from carts_core.project import Key, MaskCorrection, ProjectState, ReviewState, Source, frames_in
+from carts_core.project import ProjectState, ReviewState, frames_in
+from carts_core.project.calibrated import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_viewer import intents
 from carts_viewer.archive import zipped
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.running import scene_at
-from carts_viewer.session import Session
 from carts_viewer.state import ExportState
 from carts_viewer.stepping import Stepped
 
@@ -45,13 +39,6 @@ _STEMS = {
     "dvrk-suj": "suj",
 }
 """How a file is called where the format's own name would say nothing."""
-_SOURCES = {
-    Source.MEASURED: "measured",
-    Source.HAND: "edited",
-    Source.OPTIMIZER: "optimized",
-    Source.PROPAGATED: "propagated",
-}
-"""As the tables of `carts optimize` say it, so that `--keyframes` finds what was made by hand."""
 _BIT = 0.05
 """How long the page waits for an export at a time [s]; a step that takes longer is finished."""
 
@@ -156,12 +143,12 @@ class ExportingHandler:
                 f"No frame is in this choice ({intent.frames.lower()}{where}). Review frames, or choose others."
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
-        scene = scene_at(session.scene, state.pose.scene).with_cameras(cameras)
+        scene = calibrated_scene(session.scene, view).with_cameras(cameras)
         renderer, sequence, images = self._context.renderer, session.sequence, bool(intent.images)
 
         def make(monitor: Monitor) -> Dataset:
             indices = Monitor(cancelled=monitor.cancelled).track(chosen)
-            frames = tuple(export_frame(session, renderer, view, index, cameras) for index in indices)
+            frames = tuple(project_frame(sequence, view, index, cameras, renderer.mask) for index in indices)
             return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
 
         return make, len(chosen)
@@ -195,46 +182,6 @@ def shown_mask(context: Context) -> tuple[str, bytes]:
     if painted is not None:
         mask = mask | (painted.labels() > 0)
     return name, mask_png(mask)
-
-
-class CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
-    """Camera -> the corrected mask of a frame, for the cameras that have a correction; made when it is asked for."""
-
-    def __init__(self, renderer: OverlayRenderer, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
-        self._renderer, self._pose, self._corrections = renderer, pose, corrections
-
-    def __getitem__(self, camera: str) -> Bool[np.ndarray, "height width"]:
-        return self._renderer.mask(self._pose, camera, self._corrections[camera])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._corrections)
-
-    def __len__(self) -> int:
-        return len(self._corrections)
-
-
-def export_frame(
-    session: Session, renderer: OverlayRenderer, project: ProjectState, index: int, cameras: list[str]
-) -> ExportFrame:
-    """A frame as a project has it: joint positions, their deviations and source, and masks that were painted on."""
-    frame = session.sequence.frame(index, cameras=[])
-    pose = session.pose(frame, project)
-    known = {name: value.standard_deviations for name, value in project.joints(index).items()}
-    painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
-    labels = {camera: project.get(Key.part_labels(index, camera)) for camera in cameras}
-    verdict, figures = project.verdict(index), project.figures(index)
-    return ExportFrame(
-        frame.frame_id,
-        _SOURCES[pose.source],
-        session.joints(pose.scene),
-        {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
-        None if verdict is None else verdict.verdict,
-        index=index,
-        review=project.review(index).state.value,
-        dice=None if figures is None else figures.dice,
-        part_labels={name: value.labels() for name, value in labels.items() if value is not None},
-        masks=CorrectedMasks(renderer, pose.scene, {name: p for name, p in painted.items() if p is not None}),
-    )
 
 
 def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:

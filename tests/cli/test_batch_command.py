@@ -38,10 +38,10 @@ def manifest(sequence: Path, count: int = 1, *, steps: str = '"optimize", "expor
     path = sequence.parent / "archive.toml"
     job = (
         f'[[jobs]]\nrecordings = ["{sequence.name}"]\ndomains = {domains}\nsteps = [{steps}]\n'
-        '[jobs.options]\noptimize = ["--solver", "none", "--frames", "0"]\n'
+        '[jobs.options]\noptimize = ["--solver", "none", "--frames", "001"]\n'
     )
     if "export" in steps:
-        job += 'export = ["--format", "coco", "--frames", "0"]\n'
+        job += 'export = ["--format", "coco", "--frames", "001"]\n'
 
     path.write_text('format = "carts-batch/1"\n' + count * job + further)
     return path
@@ -73,7 +73,7 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
     assert (batch / "inference.txt").read_text() in ("torch", "onnx")
     for domain in ("regular", "dark"):
         plain = tmp_path / "plain" / domain
-        chosen = ["--domain", domain, "--frames", "0"]
+        chosen = ["--domain", domain, "--frames", "001"]
         main(["optimize", str(sequence), "--output", str(plain / "optimize"), "--solver", "none", *chosen])
         table = plain / "optimize" / domain / "left" / "kinematics.csv"
         export = ["export", str(sequence), str(plain / "export"), "--format", "coco", "--kinematics", str(table)]
@@ -112,7 +112,7 @@ def test_a_base_frame_that_drifts_is_reported(sequence: Path, tmp_path: Path) ->
     T = [[1, 0, 0, 0.003], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     moved.write_text(sequence.read_text().replace("[arms.joints]", f"T_world_base = {T}\n[arms.joints]"))
     further = '[[jobs]]\nrecordings = ["moved.toml"]\nsteps = ["optimize"]\n[jobs.options]\n'
-    further += 'optimize = ["--solver", "none", "--frames", "0"]\n'
+    further += 'optimize = ["--solver", "none", "--frames", "001"]\n'
     jobs, batch = read_manifest(manifest(sequence, steps='"optimize"', further=further)), output_path(tmp_path / "b")
     assert [BatchWork(batch)(job).status for job in jobs] == ["done"] * 3
     write_batch_report(batch, "drift", jobs)
@@ -145,7 +145,7 @@ def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: 
     assert statuses() == ["done", "done"] and statuses() == ["known", "known"]
     sequence.write_text(sequence.read_text() + "# another\n")
     assert statuses() == ["done", "done"] and statuses() == ["known", "known"]
-    path.write_text(path.read_text().replace('"--frames", "0"]', '"--frames", "1"]'))
+    path.write_text(path.read_text().replace('"--frames", "001"]', '"--frames", "002"]'))
     assert statuses() == ["done", "done"]
     (batch / "jobs" / read_manifest(path)[0].name / FILE).path.write_text("{")
     assert statuses() == ["done", "known"]

@@ -38,7 +38,7 @@ def test_calibrate_writes_a_sequence_file_that_evaluates_as_reported(
     assert np.array_equal(before.scene.cameras[0].T_camera_world, after.scene.cameras[0].T_camera_world)
     assert {unknown["unit"] for unknown in content["unknowns"]} == {"deg", "mm"}
     assert len(content["unknowns"]) == 12 and all(unknown["deviation"] > 0 for unknown in content["unknowns"])
-    arguments = ["--frames", "0,2", "--camera", "right", "--solver", "none", "--json", str(scores)]
+    arguments = ["--frames", "001,003", "--camera", "right", "--solver", "none", "--json", str(scores)]
     main(["evaluate", str(output / "sequence.toml"), *arguments])
     evaluated = [frame["dice_before"] for frame in json.loads(scores.read_text())["frames"]]
     assert evaluated == pytest.approx([frame["dice_after"]["right"] for frame in content["frames"]], abs=1e-6)
@@ -73,7 +73,7 @@ def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Pat
 def test_an_earlier_calibration_is_replaced_only_on_request(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--frames", "0"]
+    command = ["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--frames", "001"]
     main(command)
     with pytest.raises(SystemExit) as stop:
         main(command)
@@ -90,7 +90,7 @@ def test_an_earlier_calibration_is_replaced_only_on_request(
     ("arguments", "message"),
     [
         (["--frames", "spread:0"], "names no frame"),
-        (["--frames", "7"], "frame 7 is outside"),
+        (["--frames", "7"], "--frames 7: there is no '7'"),
         (["--no-base-frames", "--no-extrinsics"], "nothing of the calibration is free"),
         (["--settings", "prior_deg=0"], "prior_deg is 0"),
         (["--camera", "third"], "no camera is called 'third'"),

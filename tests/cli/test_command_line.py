@@ -12,7 +12,7 @@ import cv2
 import pytest
 
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.cli.selection import parse_frames
+from carts_core.cli.selection import chosen_frames
 from carts_core.errors import SettingsError
 
 SCORE_KEYS = {
@@ -29,7 +29,18 @@ def sequence(tiny_sequence: Callable[..., Path]) -> str:
 def test_evaluate_writes_scores_of_every_frame_into_a_folder_that_it_makes(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "scores" / "out.json"
     main(
-        ["evaluate", sequence, "--json", str(file), "--domain", "all", "--frames", "0,2", "--settings", "iterations=2"]
+        [
+            "evaluate",
+            sequence,
+            "--json",
+            str(file),
+            "--domain",
+            "all",
+            "--frames",
+            "001,003",
+            "--settings",
+            "iterations=2",
+        ]
     )
     scores = json.loads(file.read_text())
     assert [(s["frame"], s["domain"]) for s in scores["frames"]] == [
@@ -55,7 +66,7 @@ def test_evaluate_without_truth_gives_null(tiny_sequence: Callable[..., Path], t
 
 def test_a_perturbed_start_is_that_far_off_the_truth(sequence: str, tmp_path: Path) -> None:
     file = tmp_path / "out.json"
-    main(["evaluate", sequence, "--json", str(file), "--perturb-deg", "2", "--solver", "none", "--frames", "0"])
+    main(["evaluate", sequence, "--json", str(file), "--perturb-deg", "2", "--solver", "none", "--frames", "001"])
     assert json.loads(file.read_text())["frames"][0]["joint_mae_deg_before"] == pytest.approx(2.0, abs=1e-3)
 
 
@@ -72,7 +83,7 @@ def test_a_start_that_was_kept_is_told(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     output = ["--output", str(tmp_path / "out")] if command == "optimize" else ["--json", str(tmp_path / "out.json")]
-    main([command, sequence, "--frames", "0", "--perturb-deg", "0.001", *output])
+    main([command, sequence, "--frames", "001", "--perturb-deg", "0.001", *output])
     assert "left: the start was kept in 1 of 1 run" in " ".join(capsys.readouterr().out.split())
     if command == "evaluate":
         (score,) = json.loads((tmp_path / "out.json").read_text())["frames"]
@@ -83,7 +94,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--settings", "iterations=2"]
-    main([*command, "--frames", "0-1"])
+    main([*command, "--frames", "001-002"])
     folder = tmp_path / "out" / "regular" / "left"
     first = (folder / "masks" / "001.png").stat().st_mtime_ns
     main(command)
@@ -172,7 +183,7 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
 @pytest.mark.parametrize("solver", ["acs", "l1"])
 def test_a_solver_is_chosen_by_its_name(sequence: str, tmp_path: Path, solver: str) -> None:
     file = tmp_path / "out.json"
-    command = ["evaluate", sequence, "--solver", solver, "--settings", "iterations=2", "--frames", "0"]
+    command = ["evaluate", sequence, "--solver", solver, "--settings", "iterations=2", "--frames", "001"]
     main([*command, "--json", str(file)])
     (score,) = json.loads(file.read_text())["frames"]
     assert (score["iterations"], score["stopped"]) == (2, "iterations")
@@ -184,7 +195,7 @@ def test_all_settings_are_printed_as_a_file_and_explained_on_request(
     main(["evaluate", sequence, "--print-settings"])
     path = tmp_path / "settings.toml"
     path.write_text(capsys.readouterr().out, encoding="utf-8")
-    main(["evaluate", sequence, "--settings", str(path), "iterations=1", "--frames", "0"])
+    main(["evaluate", sequence, "--settings", str(path), "iterations=1", "--frames", "001"])
     capsys.readouterr()
     main(["evaluate", "--help-all"])
     text = capsys.readouterr().out
@@ -194,8 +205,8 @@ def test_all_settings_are_printed_as_a_file_and_explained_on_request(
     assert "--print-settings is for" in capsys.readouterr().err
 
 
-def test_the_help_of_a_command_shows_at_most_twenty_flags(capsys: pytest.CaptureFixture[str]) -> None:
-    for command, most in (("evaluate", 20), ("calibrate", 20), ("optimize", 22)):
+def test_the_help_of_a_command_shows_at_most_two_dozen_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, most in (("evaluate", 22), ("calibrate", 22), ("optimize", 24)):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         flags = re.findall(r"^[│ ] (--[a-z][-a-z]*)", capsys.readouterr().out, re.MULTILINE)
@@ -203,11 +214,11 @@ def test_the_help_of_a_command_shows_at_most_twenty_flags(capsys: pytest.Capture
 
 
 def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--settings", "iterations=1"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "001", "--settings", "iterations=1"]
     main(command)
     main(command)
-    main(["evaluate", sequence, "--frames", "0", "--settings", "iterations=1"])
-    main(["export", sequence, str(tmp_path / "export"), "--frames", "0", "--format", "masks"])
+    main(["evaluate", sequence, "--frames", "001", "--settings", "iterations=1"])
+    main(["export", sequence, str(tmp_path / "export"), "--frames", "001", "--format", "masks"])
     printed = " ".join(capsys.readouterr().out.split())
     for words in (
         "1 of 1 frame already there",
@@ -220,7 +231,7 @@ def test_one_frame_is_not_called_frames(sequence: str, tmp_path: Path, capsys: p
 
 
 def test_optimize_does_not_mix_settings(sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "001"]
     main([*command, "--settings", "iterations=1"])
     main([*command, "--settings", "iterations=2"])
     assert "1 of 1 frame redone: the settings changed" in " ".join(capsys.readouterr().out.split())
@@ -252,7 +263,7 @@ def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
 def test_results_are_replaced_by_frames_and_not_by_an_error(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "0", "--settings", "iterations=1"]
+    command = ["optimize", sequence, "--output", str(tmp_path / "out"), "--frames", "001", "--settings", "iterations=1"]
     main([*command, "--domain", "smoke"])
     folder = tmp_path / "out" / "smoke" / "left"
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -283,7 +294,7 @@ def test_render_writes_a_picture_per_frame(sequence: str, tmp_path: Path, style:
         (["evaluate", "SEQUENCE", "--domain", "fog"], "domain 'fog' is not in"),
         (["evaluate", "SEQUENCE", "--camera", "third"], "no camera is called 'third'. The cameras are: left"),
         (["evaluate", "SEQUENCE", "--arms", "PSM9"], "no arm is called 'PSM9'"),
-        (["evaluate", "SEQUENCE", "--frames", "7"], "frame 7 is outside"),
+        (["evaluate", "SEQUENCE", "--frames", "7"], "--frames 7: there is no '7'"),
         (["evaluate", "SEQUENCE", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
     ],
 )
@@ -303,15 +314,46 @@ def test_a_device_that_does_not_exist_is_named(sequence: str, capsys: pytest.Cap
     assert "'abacus' does not exist on this machine. Available: cpu" in " ".join(capsys.readouterr().err.split())
 
 
+IDS = ["001", "002", "a-1", "a-2", "010"]
+"""Of frames, in the recording's order."""
+
+
 @pytest.mark.parametrize(
-    ("text", "expected"),
-    [("all", [0, 1, 2, 3, 4]), ("2", [2]), ("0-2,4", [0, 1, 2, 4]), ("::2", [0, 2, 4]), ("3:", [3, 4])],
+    ("frames", "positions", "expected"),
+    [
+        (None, None, [0, 1, 2, 3, 4]),
+        ("all", None, [0, 1, 2, 3, 4]),
+        ("010", None, [4]),
+        ("001-a-1,010", None, [0, 1, 2, 4]),
+        ("a-1-a-2", None, [2, 3]),
+        ("a-1", None, [2]),
+        ("::2", None, [0, 2, 4]),
+        (None, "1-2,5", [0, 1, 4]),
+        (None, "::3", [0, 3]),
+    ],
 )
-def test_frames_are_numbers_ranges_and_slices(text: str, expected: list[int]) -> None:
-    assert parse_frames(text, 5) == expected
+def test_frames_are_chosen_by_id_and_by_position_counted_from_1(
+    frames: str | None, positions: str | None, expected: list[int]
+) -> None:
+    assert chosen_frames(frames, positions, IDS) == expected
 
 
-@pytest.mark.parametrize("text", ["", "a", "5", "1-9", "-1", "3-2"])
-def test_frames_that_mean_nothing_are_refused(text: str) -> None:
-    with pytest.raises(SettingsError, match="--frames"):
-        parse_frames(text, 5)
+@pytest.mark.parametrize(
+    ("frames", "positions", "message"),
+    [
+        ("", None, "there is no ''"),
+        ("a", None, "there is no 'a'"),
+        ("011", None, "there is no '011'"),
+        ("2", None, r"there is no '2'\. Did you mean '002'\? .* 001 to 010"),
+        ("-1", None, "there is no '1'. Did you mean '001'"),
+        ("3:", None, "there is no '3:'"),
+        ("001-002,010-001", None, "001 comes before 010. Give 001-010"),
+        ("0-1,3", None, r"Earlier versions counted from 0; then this was --frames 001-002,a-2\."),
+        (None, "0-2", "there is no '0'. Positions count from 1, as in the page; there are 1 to 5"),
+        (None, "6", "there is no '6'"),
+        ("001", "1", "both given"),
+    ],
+)
+def test_frames_that_mean_nothing_are_refused(frames: str | None, positions: str | None, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        chosen_frames(frames, positions, IDS)

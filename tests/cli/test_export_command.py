@@ -43,7 +43,7 @@ def _coco(folder: Path) -> Any:  # its own type hints know no further keys of an
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_written(sequence: str, tmp_path: Path, name: FormatName) -> None:
     (tmp_path / "exports").mkdir()
-    main(["export", sequence, str(tmp_path / "exports" / "out"), "--format", name, "--frames", "1"])
+    main(["export", sequence, str(tmp_path / "exports" / "out"), "--format", name, "--frames", "002"])
     (written,) = (tmp_path / "exports").iterdir()
     assert written.name == "out" + FORMATS[name].suffix
     assert written.is_dir() == (not FORMATS[name].suffix)
@@ -54,7 +54,7 @@ def test_the_command_knows_every_format() -> None:
 
 
 def test_frames_cameras_and_domain_are_chosen(sequence: str, tmp_path: Path) -> None:
-    choice = ["--frames", "0,2", "--camera", "right", "--domain", "smoke", "--parts", "links"]
+    choice = ["--frames", "001,003", "--camera", "right", "--domain", "smoke", "--parts", "links"]
     main(["export", sequence, str(tmp_path / "out"), "--format", "coco", *choice])
     images = list(_coco(tmp_path / "out").imgs.values())
     assert [(image["frame"], image["camera"]) for image in images] == [("001", "right"), ("003", "right")]
@@ -88,7 +88,7 @@ def test_corrected_kinematics_decide_frames_and_masks(sequence: str, tmp_path: P
     ("options", "message"),
     [
         (["--domain", "all"], "an export holds one"),
-        (["--frames", "9"], "outside"),
+        (["--frames", "9"], "--frames 9: there is no '9'"),
         (["--frame-rate", "0"], "frame rate"),
         (["--kinematics", "missing.csv"], "missing.csv is not a readable kinematics table"),
     ],
@@ -107,11 +107,11 @@ def test_an_earlier_export_is_replaced_on_request_only(
     sequence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["export", sequence, str(tmp_path / "out"), "--format", "coco", "--frames"]
-    main([*command, "0"])
+    main([*command, "001"])
     with pytest.raises(SystemExit):
-        main([*command, "1"])
+        main([*command, "002"])
     assert "Add --overwrite" in " ".join(capsys.readouterr().err.split())
-    main([*command, "1", "--overwrite"])
+    main([*command, "002", "--overwrite"])
     assert {image["frame"] for image in _coco(tmp_path / "out").imgs.values()} == {"002"}
 
 

@@ -100,10 +100,10 @@ def test_painted_masks_are_fitted_and_frames_without_one_are_named(
     sequence: Path, theirs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paint(sequence, right_mask(theirs))
-    found = scores(sequence, "--observe", "masks", "--masks", "painted", "--frames", "0")
+    found = scores(sequence, "--observe", "masks", "--masks", "painted", "--frames", "001")
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
     text = refusal(capsys, "evaluate", str(sequence), "--observe", "masks", "--masks", "painted")
-    assert "1 of 2 frames have no painted mask of camera 'left'; the first is frame 002, position 1." in text
+    assert "1 of 2 frames have no painted mask of camera 'left'; the first is frame 002." in text
     assert "--observe both" in text
 
 

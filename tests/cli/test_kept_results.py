@@ -149,7 +149,7 @@ def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
     optimize()
     folder = tmp_path / "out" / "regular" / "left"
     before = (folder / "masks" / "003.png").read_bytes()
-    printed = optimize("--perturb-deg", "2", "--frames", "0-1")
+    printed = optimize("--perturb-deg", "2", "--frames", "001-002")
     assert "2 of 2 frames redone: the settings changed" in printed
     assert "1 frame not chosen now would have to be redone: the settings changed" in printed
     assert (folder / "masks" / "003.png").read_bytes() == before
@@ -184,7 +184,7 @@ def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     capsys.readouterr()
     main(command)
     assert "3 of 3 frames redone: the images changed" in re.sub(r"\s+", " ", capsys.readouterr().out)
-    main([*command, "--frames", "0-1"])
+    main([*command, "--frames", "001-002"])
     printed = re.sub(r"\s+", " ", capsys.readouterr().out)
     assert "2 of 2 frames redone: " in printed and "they were solved together with other frames" in printed
     assert "1 frame not chosen now would have to be redone: they were solved together with other frames" in printed
@@ -228,7 +228,7 @@ def test_a_row_that_was_altered_and_results_of_unknown_origin_are_redone(optimiz
 
 def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcome, tmp_path: Path) -> None:
     optimize()
-    printed = optimize("--overwrite", "--frames", "0")
+    printed = optimize("--overwrite", "--frames", "001")
     assert "--overwrite starts over: results of 2 other frames are removed" in printed
     folder = tmp_path / "out" / "regular" / "left"
     assert [path.name for path in (folder / "masks").iterdir()] == ["001.png"]
@@ -239,7 +239,7 @@ def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcom
 def test_frames_that_are_out_of_date_and_not_chosen_are_told(optimize: Outcome, tmp_path: Path) -> None:
     optimize()
     intrinsics_changed(tmp_path)
-    printed = optimize("--frames", "0")
+    printed = optimize("--frames", "001")
     assert "1 of 1 frame redone: the calibration changed" in printed
     assert "2 frames not chosen now would have to be redone: the calibration changed" in printed
 

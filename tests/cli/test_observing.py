@@ -45,7 +45,7 @@ def test_masks_are_fitted_without_a_network_and_evaluate_says_what_its_scores_me
 def test_a_network_is_loaded_where_it_is_asked_for(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["evaluate", str(sequence), "--frames", "0", "--json", str(tmp_path / "out.json")]
+    command = ["evaluate", str(sequence), "--frames", "001", "--json", str(tmp_path / "out.json")]
     main([*command, "--observe", "both"])
     assert CAUTION in " ".join(capsys.readouterr().out.split())
     assert json.loads((tmp_path / "out.json").read_text())["mean"]["dice_after"] > 0.97
@@ -82,7 +82,7 @@ def test_a_frame_without_a_mask_is_refused_before_any_is_solved(
     sequence.write_text(re.sub(r"(?m)^(masks = .*)$", r"\1\nsparse_masks = true", sequence.read_text()))
     output = ["--json", str(tmp_path / "out")] if command == "evaluate" else ["--output", str(tmp_path / "out")]
     with pytest.raises(SystemExit) as stop:
-        main([command, str(sequence), "--observe", "masks", "--frames", "0-1", *output])
+        main([command, str(sequence), "--observe", "masks", "--frames", "001-002", *output])
     said = " ".join(capsys.readouterr().err.split())
     assert stop.value.code == BAD_INPUT and "1 of 2 frames have no mask of camera 'left'" in said and "002" in said
     assert not (tmp_path / "out").exists()

@@ -18,7 +18,7 @@ from carts_core.settings import Architecture, ImageSettings, SynthesisConfig, Tr
 Command = Callable[[Path], None]
 """Does its work in a folder that holds `recording`, `source` (which has no sequence file) and `model`."""
 
-SPARE = ["--frames", "0", "--settings", "iterations=1"]
+SPARE = ["--frames", "001", "--settings", "iterations=1"]
 TRAINING = TrainingConfig(
     steps=1,
     batch_size=1,
@@ -94,14 +94,14 @@ def _bench(work: Path) -> None:
 
 
 WITH_SEQUENCE = {
-    "render": ["render", "--frames", "0"],
-    "render to a folder": ["render", "--frames", "0", "--output", "out", "--style", "mask"],
-    "optimize": ["optimize", "--solver", "none", "--frames", "0"],
+    "render": ["render", "--frames", "001"],
+    "render to a folder": ["render", "--frames", "001", "--output", "out", "--style", "mask"],
+    "optimize": ["optimize", "--solver", "none", "--frames", "001"],
     "optimize to a folder": ["optimize", "--solver", "none", "--overwrite", "--output", "out"],
     "export masks": ["export", "exports/out", "--format", "masks", "--overwrite"],
     "export csv": ["export", "exports/out.csv", "--format", "csv", "--overwrite"],
     "export video": ["export", "exports/out", "--format", "video"],
-    "evaluate": ["evaluate", "--solver", "none", "--frames", "0", "--json", "scores/out.json"],
+    "evaluate": ["evaluate", "--solver", "none", "--frames", "001", "--json", "scores/out.json"],
 }
 COMMANDS: dict[str, Command] = {
     **{name: _command(words[0], "recording/sequence.toml", *words[1:]) for name, words in WITH_SEQUENCE.items()},

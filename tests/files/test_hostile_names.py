@@ -12,12 +12,12 @@ from planted import contents, treasure
 from carts_core.cli.command_line import BAD_INPUT, main
 
 COMMANDS: dict[str, list[str]] = {
-    "render": ["render", "--frames", "0"],
-    "optimize": ["optimize", "--frames", "0", "--solver", "none"],
+    "render": ["render", "--positions", "1"],
+    "optimize": ["optimize", "--positions", "1", "--solver", "none"],
     "export masks": ["export", "out/masks", "--format", "masks"],
     "export csv": ["export", "out/table.csv", "--format", "csv"],
-    "evaluate": ["evaluate", "--frames", "0", "--solver", "none", "--json", "out/scores.json"],
-    "calibrate": ["calibrate", "--frames", "0", "--settings", "iterations=1"],
+    "evaluate": ["evaluate", "--positions", "1", "--solver", "none", "--json", "out/scores.json"],
+    "calibrate": ["calibrate", "--positions", "1", "--settings", "iterations=1"],
 }
 OUTPUTS = ("runs", "out")
 """Where commands write: the default, and what the command lines above name."""

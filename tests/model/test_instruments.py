@@ -108,7 +108,7 @@ def test_a_cache_that_cannot_be_written_to_is_no_error(tmp_path: Path, monkeypat
 def test_an_unknown_name_is_answered_with_the_nearest_one() -> None:
     with pytest.raises(RobotError, match=r"no robot 'builtin:scissors'.*`carts robots` lists"):
         Robot.load("builtin:scissors")
-    with pytest.raises(RobotError, match="Did you mean builtin:cautery_hook"):
+    with pytest.raises(RobotError, match="Did you mean 'builtin:cautery_hook"):
         Robot.load("builtin:cautery_hok")
 
 
@@ -120,7 +120,7 @@ def test_a_sequence_file_names_an_instrument(tmp_path: Path) -> None:
     (tmp_path / "sequence.toml").write_text(text)
     assert Sequence.open(tmp_path / "sequence.toml").scene.arms[0].robot.name == "curved_scissors"
     (tmp_path / "sequence.toml").write_text(text.replace("curved_scissors", "curved_scissor"))
-    with pytest.raises(SequenceError, match="Did you mean builtin:curved_scissors"):
+    with pytest.raises(SequenceError, match="Did you mean 'builtin:curved_scissors"):
         Sequence.open(tmp_path / "sequence.toml")
 
 

@@ -311,7 +311,12 @@ def test_a_keyframe_needs_every_arm(truths: Truths) -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "message"), [({}, "no frames to correct"), ({0: 1.0, 1: 1.0}, "Times must increase")]
+    ("times", "message"),
+    [
+        ({}, "no frames to correct"),
+        ({0: 1.0, 1: 1.0}, "Times must increase"),
+        ({0: 5.0, 1: None}, "1 of 2 frames have no time; the first is frame 1. Give all frames times, or none"),
+    ],
 )
 def test_frames_and_times_that_do_not_fit_are_refused(truths: Truths, times: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

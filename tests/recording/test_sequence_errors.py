@@ -48,7 +48,7 @@ def error_of(path: Path, kind: type[Exception] = SequenceError) -> str:
         (line("timestamp", "timestamp = 3"), ["timestamp is 3, but must be text"]),
         (line("frame_id", 'frame_id = "001"'), ["frame_id is '001'", "{frame:03d}"]),
         (line("frame_id", 'frame_id = "{frame:q}"'), ["'{frame:q}' cannot be filled in"]),
-        (line("robot", 'robot = "builtin:psm"'), ["no robot 'builtin:psm'", "Did you mean builtin:psm_lnd"]),
+        (line("robot", 'robot = "builtin:psm"'), ["no robot 'builtin:psm'", "Did you mean 'builtin:psm_lnd"]),
         (line("yaw", 'yaww = "yaw"'), ["[arms.joints]", "yaww is not a joint", "Did you mean 'yaw'", "insertion"]),
         (line("yaw", ""), ["[arms.joints]: yaw is missing", "yaw = 0.0", "[rad]"]),
         (line("insertion", ""), ["insertion is missing", "[m]"]),

@@ -34,7 +34,7 @@ def batch(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Path:
     sequence = tiny_sequence(frames=3, width=160, height=128)
     manifest = sequence.parent / "archive.toml"
     job = f'[[jobs]]\nrecordings = ["{sequence.name}"]\nsteps = ["optimize"]\n'
-    options = '[jobs.options]\noptimize = ["--settings", "iterations=4", "--frames", "0,1"]\n'
+    options = '[jobs.options]\noptimize = ["--settings", "iterations=4", "--frames", "001,002"]\n'
     manifest.write_text(f'format = "carts-batch/1"\n{job}{options}{job}domains = ["foggy"]\n')
     jobs, folder = read_manifest(manifest), output_path(tmp_path / "batch")
     write_jobs(folder, jobs)

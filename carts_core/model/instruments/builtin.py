@@ -4,7 +4,6 @@ The meshes are made when a robot is named, and lie in the cache; the shaft, and 
 Needle Driver, are those of the shipped robot.
 """
 
-import difflib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -18,7 +17,7 @@ from ...errors import OutputError, RobotError
 from ...files import output_path, write_bytes
 from ...files.reading import MESH, is_regular, read_bytes
 from ...resources import shipped_robot
-from ...wording import shown
+from ...wording import closest, shown
 from ..mesh_cache import cache_dir
 from ..psm_kinematics import CLASSIC, SI, PsmGeometry
 from ..psm_urdf import carrier, joint, quarter_turns
@@ -65,8 +64,7 @@ def builtin_urdf(name: str) -> Path:
     if name == SHIPPED:
         return shipped_robot()
     if name not in builtin_names():
-        near = difflib.get_close_matches(name, builtin_names(), 1)
-        meant = f" Did you mean {SCHEME}{near[0]}?" if near else ""
+        meant = closest(SCHEME + name, [SCHEME + known for known in builtin_names()])
         raise RobotError(
             f"there is no robot {shown(SCHEME + name)}.{meant} `carts robots` lists those that are built in."
         )
