@@ -40,7 +40,7 @@ def main(frames: int = 2, output: Path = Path("exported"), picture: Path = Path(
 
     coco = COCO(str(folder / "annotations" / "instances_default.json"))
     entry = coco.loadImgs(coco.getImgIds()[0])[0]
-    image = cv2.imread(str(folder / "images" / entry["file_name"]))
+    image = cv2.imread(str(dataset.image_folder / entry["file_name"]))
     assert image is not None
     for annotation, colour in zip(
         coco.loadAnns(coco.getAnnIds(entry["id"])), ((80, 200, 80), (220, 140, 60)), strict=False

@@ -8,7 +8,7 @@ import tyro
 
 from ..console import Bar, Terminal
 from ..errors import SettingsError
-from ..settings import FormatName, Parts
+from ..settings import FormatName, Images, Parts
 from ..stopping import when_stopped
 from ..wording import counted
 from .selection import FromProject, Selection, SequencePath
@@ -36,8 +36,9 @@ class Export:
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     parts: Parts = "arms"
     """Give every arm a category of its own, or every part of it (shaft, wrist, jaws), or every link."""
-    images: bool = True
-    """Write the images beside their labels."""
+    images: Images = "named"
+    """`named`: labels name the recording's own images, and formats that need images beside their labels (bop, voc,
+    yolo) get copies; `copied`: copies for every format; `none`: no images. Copies have the same bytes."""
     frame_rate: float | None = None
     """Of a video [1/s]; by default that of the recording, or 25 where it has no times."""
     overwrite: bool = False
@@ -46,7 +47,7 @@ class Export:
 
     def run(self) -> None:
         """Write the export; on Ctrl-C or an error nothing of it is left."""
-        from ..export import Dataset, Monitor, export
+        from ..export import FORMATS, Dataset, Monitor, export
         from ..recording import Sequence
 
         console = Terminal()
@@ -70,6 +71,10 @@ class Export:
             monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
             with when_stopped(f"nothing was written to {self.output}"):
                 path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
+        if FORMATS[self.format].images and self.images != "none" and dataset.remade_cameras:
+            cameras_named = ", ".join(dataset.remade_cameras)
+            reason = "they are undistorted, cropped, or of a video or a bag, so that labels fit no recorded file"
+            console.print(f"images of {cameras_named} are written as PNG: {reason}", soft_wrap=True)
         console.print(f"wrote {path}")
 
     def _frames(

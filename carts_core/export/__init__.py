@@ -1,6 +1,7 @@
 """What people take away: one module per format."""
 
 from ..settings import FormatName as FormatName
+from ..settings import Images as Images
 from ..settings import Parts as Parts
 from .dataset import Dataset as Dataset
 from .formats import FORMATS as FORMATS

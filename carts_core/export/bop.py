@@ -23,7 +23,7 @@ from ..rendering.geometry import link_transforms, vertices_in_camera
 from ..rendering.visibility_numba import rasterize
 from .dataset import Dataset, View
 from .monitor import Monitor
-from .png import image_png, mask_png
+from .png import mask_png
 from .rle import bounding_box
 
 _MM = 1000.0
@@ -57,8 +57,7 @@ def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
         scene = scenes[view.camera.name]
         scene["scene_camera"][image] = _camera(dataset, view)
         scene["scene_gt"][image], scene["scene_gt_info"][image] = _links(dataset, view, objects, place)
-        if dataset.images:
-            write_bytes(place / "rgb" / f"{view.frame.index:06d}.png", image_png(dataset.image(view)))
+        dataset.write_image_as(view, place / "rgb", f"{view.frame.index:06d}")
     for camera, tables in scenes.items():
         for name, table in tables.items():
             write_text(folders[camera] / f"{name}.json", json.dumps(table))

@@ -1,4 +1,4 @@
-"""COCO instance segmentation: `images/`, and `annotations/instances_default.json` with a run-length mask per object."""
+"""COCO instance segmentation: `annotations/instances_default.json` with a run-length mask per object."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -71,7 +71,7 @@ def write_annotations(
         for annotation in annotate(view):
             annotations.append({"id": len(annotations) + 1, **annotation})
     content = {
-        "info": {"description": dataset.sequence.name},
+        "info": {"description": dataset.sequence.name, "image_folder": str(dataset.image_folder)},
         "licenses": [],
         "images": images,
         "annotations": annotations,

@@ -1,21 +1,24 @@
 """The images of an export with the labels of their pixels, one at a time."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path, PurePath
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from ..errors import CartsError, SettingsError
-from ..files import OutputPath, unique_file_names, write_bytes
+from ..files import OutputPath, name_fault, unique_file_names, write_bytes
+from ..files.reading import IMAGE, read_bytes
 from ..model.camera import Camera
 from ..model.parts import link_classes, part_classes
 from ..model.scene import Scene, SceneState
 from ..recording import Sequence
 from ..rendering import Renderer
-from ..settings import Parts
+from ..settings import Images, Parts
 from ..wording import counted
 from .frames import ExportFrame
 from .monitor import Monitor
@@ -63,8 +66,8 @@ class Dataset:
     domain: str
     parts: Parts = "arms"
     """What gets a category of its own."""
-    images: bool = True
-    """Write the (undistorted) images beside their labels."""
+    images: Images = "named"
+    """Labels name the recording's own images, or copies of them, or no image is written, where the format allows it."""
     frame_rate: float | None = None
     """Of a video [1/s]; as recorded if None."""
 
@@ -177,12 +180,86 @@ class Dataset:
         """
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]
 
+    @cached_property
+    def files(self) -> list[Path | None]:
+        """The recording's image of every view; None where that is undistorted, cropped, or of a video or a bag."""
+        return [self._file(frame, camera) for _, frame, camera in self.steps]
+
+    @property
+    def remade_cameras(self) -> tuple[str, ...]:
+        """Cameras with images that are no files of the recording; see `files`."""
+        steps = zip(self.steps, self.files, strict=True)
+        return tuple(dict.fromkeys(camera.name for (_, _, camera), file in steps if file is None))
+
+    @cached_property
+    def image_folder(self) -> Path:
+        """The folder that names of the recording's images are relative to: that of the sequence file, else the
+        innermost one that holds all of them."""
+        beside = self.sequence.path.parent
+        cameras = self.sequence.scene.cameras
+        files = [self._file(frame, camera) for frame in self.frames for camera in cameras]
+        folders = {file.parent for file in files if file is not None}
+        if not folders or all(folder.is_relative_to(beside) for folder in folders):
+            return beside
+        return Path(os.path.commonpath(folders))
+
+    def image_name(self, view: View) -> str:
+        """The path by which labels name a view's image: the recording's own, from `image_folder`; `NAME.png` where the
+        image is no file of the recording."""
+        return self._image_names[view.id - 1]
+
     def write_image(self, view: View, folder: OutputPath) -> str:
-        """Write the view's image as PNG into `folder`, if images are asked for; the file's name."""
-        name = f"{view.name}.png"
-        if self.images:
-            write_bytes(folder / name, image_png(self.image(view)))
+        """Write the view's image into `folder` if copies are wanted or it is no recorded file; its `image_name`.
+
+        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG.
+        """
+        name = self.image_name(view)
+        if self.images == "none":
+            return name
+        file = self.files[view.id - 1]
+        if file is None or self.images == "copied":
+            *folders, last = name.split("/")
+            for part in folders:
+                folder = folder / part
+            self._write_image(view, file, folder / last)
         return name
+
+    def write_image_as(self, view: View, folder: OutputPath, stem: str) -> str:
+        """As `write_image` for a format that needs a copy of a given name; the file's name with its suffix."""
+        file = self.files[view.id - 1]
+        name = f"{stem}{'.png' if file is None else file.suffix.lower()}"
+        if self.images != "none":
+            self._write_image(view, file, folder / name)
+        return name
+
+    def _write_image(self, view: View, file: Path | None, path: OutputPath) -> None:
+        write_bytes(path, image_png(self.image(view)) if file is None else read_bytes(file, IMAGE))
+
+    def _file(self, frame: ExportFrame, camera: Camera) -> Path | None:
+        file = self.sequence.image_file(frame.index, camera.name, self.domain)
+        return None if file is None else Path(os.path.normpath(file))
+
+    @cached_property
+    def stems(self) -> list[str]:
+        """Stem of the files of every view where folders are flat: the recorded image's own if all differ, else the
+        view's name."""
+        own = [PurePath(name).stem for name in self._image_names]
+        unique = len({stem.casefold() for stem in own}) == len(own) and not any(map(name_fault, own))
+        return own if unique else [name for name, _, _ in self.steps]
+
+    @cached_property
+    def _image_names(self) -> list[str]:
+        """Of every view. Where two would have the same labels, or a name cannot be written, all are those of views."""
+        files = self.files
+        paths = [PurePath(f"{name}.png") for name, _, _ in self.steps]
+        paths = [
+            own if file is None else file.relative_to(self.image_folder) for own, file in zip(paths, files, strict=True)
+        ]
+        stems = {path.with_suffix("") for path in paths}
+        if len(stems) < len(paths) or any(name_fault(part) for path in paths for part in path.parts):
+            suffixes = [".png" if file is None else file.suffix for file in files]
+            return [f"{name}{suffix}" for (name, _, _), suffix in zip(self.steps, suffixes, strict=True)]
+        return [path.as_posix() for path in paths]
 
 
 def labelled(

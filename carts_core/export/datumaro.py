@@ -1,6 +1,7 @@
 """Datumaro's own format, version 1.0: `images/default/`, and `annotations/default.json` with run-length masks."""
 
 import json
+from pathlib import PurePosixPath
 
 from ..files import OutputPath, write_text
 from .dataset import Dataset
@@ -30,7 +31,7 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> No
         ]
         items.append(
             {
-                "id": view.name,
+                "id": str(PurePosixPath(file).with_suffix("")),
                 "annotations": annotations,
                 "attr": {"frame": view.frame.frame_id, "camera": view.camera.name, "source": view.frame.source},
                 "image": {"path": file, "size": [view.camera.height, view.camera.width]},

@@ -32,17 +32,19 @@ class ExportFormat:
     """Writes the file, or makes the folder."""
     suffix: str = ""
     """Of the file; empty for a format that is a folder."""
+    images: bool = False
+    """Whether labels name images, or these lie beside them."""
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
     "masks": ExportFormat("PNG masks", write_masks),
-    "coco": ExportFormat("COCO", write_coco),
-    "coco-keypoints": ExportFormat("COCO keypoints", write_coco_keypoints),
-    "bop": ExportFormat("BOP poses", write_bop),
-    "yolo": ExportFormat("YOLO segmentation", write_yolo),
-    "voc": ExportFormat("Pascal VOC", write_voc),
-    "cvat": ExportFormat("CVAT for images", write_cvat),
-    "datumaro": ExportFormat("Datumaro", write_datumaro),
+    "coco": ExportFormat("COCO", write_coco, images=True),
+    "coco-keypoints": ExportFormat("COCO keypoints", write_coco_keypoints, images=True),
+    "bop": ExportFormat("BOP poses", write_bop, images=True),
+    "yolo": ExportFormat("YOLO segmentation", write_yolo, images=True),
+    "voc": ExportFormat("Pascal VOC", write_voc, images=True),
+    "cvat": ExportFormat("CVAT for images", write_cvat, images=True),
+    "datumaro": ExportFormat("Datumaro", write_datumaro, images=True),
     "csv": ExportFormat("Kinematics, CSV", write_kinematics_csv, ".csv"),
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
@@ -98,12 +100,13 @@ def _summary(dataset: Dataset, name: FormatName) -> str:
             "frame": frame.frame_id,
             "index": frame.index,
             "camera": camera.name,
+            "image": None if file is None else str(file),
             "source": frame.source,
             "verdict": frame.verdict,
             "review": frame.review,
             "dice": frame.dice,
         }
-        for name, frame, camera in dataset.steps
+        for (name, frame, camera), file in zip(dataset.steps, dataset.files, strict=True)
     ]
     content = {"format": name, "sequence": dataset.sequence.name, "domain": dataset.domain, "views": views}
     return json.dumps(content, indent=1, ensure_ascii=False)

@@ -14,7 +14,8 @@ _KINDS: tuple[Parts, ...] = ("arms", "parts", "links")
 def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Folders `binary`, `arms`, `parts` and `links` with a PNG per view; `labels.json` says what the values mean."""
     for view in dataset.views(monitor):
-        dataset.write_image(view, folder / "images")
+        if dataset.images == "copied":
+            dataset.write_image_as(view, folder / "images", view.name)
         write_bytes(folder / "binary" / f"{view.name}.png", mask_png(view.link_ids >= 0))
         for kind in _KINDS:
             write_bytes(folder / kind / f"{view.name}.png", label_png(dataset.label_image(view, kind)))

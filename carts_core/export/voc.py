@@ -6,7 +6,6 @@ Class names stand in `labelmap.txt`, as Datumaro and CVAT look for them. Polygon
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
@@ -20,13 +19,12 @@ from .rle import bounding_box
 
 _LISTS = ("Main", "Segmentation")
 """Folders in `ImageSets` where lists of the images stand; there is no split, so each is one list of all."""
-_QUALITY = 95
 _MOST_CATEGORIES = 254
 """0 is the background and 255 is VOC's void."""
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Pascal VOC's format; label images lose nothing, images become JPEG.
+    """Write the dataset in Pascal VOC's format; label images lose nothing, and images are copies of any kind.
 
     Raises:
         CartsError: there are more categories than VOC's label images can tell apart.
@@ -34,32 +32,26 @@ def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
     for view in dataset.views(monitor):
-        _write_jpeg(dataset, view, folder / "JPEGImages")
+        stem = dataset.stems[view.id - 1]
+        file = dataset.write_image_as(view, folder / "JPEGImages", stem)
         labels, objects = dataset.label_image(view), np.zeros(view.link_ids.shape, np.uint8)
-        root = _annotation(view)
+        root = _annotation(view, file)
         for number, (category, mask) in enumerate(dataset.instances(view), start=1):
             objects[mask] = number
             _add_object(root, category, mask)
-        _write_palette(folder / "SegmentationClass" / f"{view.name}.png", labels)
-        _write_palette(folder / "SegmentationObject" / f"{view.name}.png", objects)
+        _write_palette(folder / "SegmentationClass" / f"{stem}.png", labels)
+        _write_palette(folder / "SegmentationObject" / f"{stem}.png", objects)
         ElementTree.indent(root, " ")
-        write_bytes(folder / "Annotations" / f"{view.name}.xml", ElementTree.tostring(root, encoding="utf-8"))
-    names = "".join(f"{name}\n" for name, _, _ in dataset.steps)
+        write_bytes(folder / "Annotations" / f"{stem}.xml", ElementTree.tostring(root, encoding="utf-8"))
+    names = "".join(f"{stem}\n" for stem in dataset.stems)
     for name in _LISTS:
         write_text(folder / "ImageSets" / name / "trainval.txt", names)
     _write_label_map(folder / "labelmap.txt", dataset)
 
 
-def _write_jpeg(dataset: Dataset, view: View, folder: OutputPath) -> None:
-    if dataset.images:
-        bgr = cv2.cvtColor(dataset.image(view), cv2.COLOR_RGB2BGR)
-        _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        write_bytes(folder / f"{view.name}.jpg", data.tobytes())
-
-
-def _annotation(view: View) -> ElementTree.Element:
+def _annotation(view: View, file: str) -> ElementTree.Element:
     root = ElementTree.Element("annotation")
-    _texts(root, {"folder": "JPEGImages", "filename": f"{view.name}.jpg"})
+    _texts(root, {"folder": "JPEGImages", "filename": file})
     size = {"width": view.camera.width, "height": view.camera.height, "depth": 3}
     _texts(ElementTree.SubElement(root, "size"), size)
     _texts(root, {"segmented": 1})

@@ -15,14 +15,15 @@ fraction (Ultralytics)."""
 def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in YOLO's format: a visible part of an arm that stands alone is an object of its own."""
     for view in dataset.views(monitor):
-        dataset.write_image(view, folder / "images")
+        stem = dataset.stems[view.id - 1]
+        dataset.write_image_as(view, folder / "images", stem)
         size = (view.camera.width, view.camera.height)
         lines = []
         for category, mask in dataset.instances(view):
             for polygon in polygons(mask):
                 numbers = " ".join(f"{value:.6f}" for value in ((polygon + _INTO_PIXEL) / size).ravel())
                 lines.append(f"{category.id - 1} {numbers}\n")
-        write_text(folder / "labels" / f"{view.name}.txt", "".join(lines))
+        write_text(folder / "labels" / f"{stem}.txt", "".join(lines))
     names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is YAML
     text = f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n"
     write_text(folder / "data.yaml", text)

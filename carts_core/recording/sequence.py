@@ -17,7 +17,7 @@ from .background import MeanBackground, background_of_recording, spread
 from .cache import ByteCache
 from .camera_input import CameraInput
 from .description import Description, read_description
-from .images import ImageSource, read_image, read_mask
+from .images import ImageFiles, ImageSource, read_image, read_mask
 from .matching import TimeMatching
 
 CACHE_BYTES = 192 * 2**20
@@ -213,6 +213,13 @@ class Sequence:
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
         """Where a camera's images come from, as recorded; nothing is kept. Errors as `has_masks`."""
         return self._camera(camera).images[self._domain(domain)]
+
+    def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
+        """The file whose pixels are those of a frame's image; None where the image is undistorted, cropped or decoded
+        from a video or a bag. Errors as `has_masks`."""
+        entry = self._camera(camera)
+        source = entry.images[self._domain(domain)]
+        return source.files[index] if isinstance(source, ImageFiles) and not any(entry.camera.distortion) else None
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
         """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position.

@@ -8,6 +8,7 @@ from .appearance import AppearanceRanges as AppearanceRanges
 from .calibration import CALIBRATION as CALIBRATION
 from .calibration import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
 from .export import FormatName as FormatName
+from .export import Images as Images
 from .export import Parts as Parts
 from .loss_weights import ObjectiveWeights as ObjectiveWeights
 from .loss_weights import SurfaceWeights as SurfaceWeights

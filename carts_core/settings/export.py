@@ -23,3 +23,6 @@ FormatName = Literal[
 
 Parts = Literal["arms", "parts", "links"]
 """What gets a category of its own: every arm, every part of it (shaft, wrist, jaws), or every link."""
+
+Images = Literal["named", "copied", "none"]
+"""Images of an export: labels name the recording's own files, or copies of them, byte for byte, or none are written."""

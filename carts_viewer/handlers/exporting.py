@@ -144,7 +144,7 @@ class ExportingHandler:
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
-        renderer, sequence, images = self._context.renderer, session.sequence, bool(intent.images)
+        renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
 
         def make(monitor: Monitor) -> Dataset:
             indices = Monitor(cancelled=monitor.cancelled).track(chosen)

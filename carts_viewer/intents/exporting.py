@@ -27,8 +27,8 @@ class Export(Exporting):
     """Which ones, one of `exporting.FRAME_CHOICES`."""
     parts: Parts = "arms"
     """What gets a category of its own."""
-    images: bool = True
-    """Write the images beside their labels."""
+    images: bool = False
+    """Copy the images beside their labels; otherwise labels name those of the recording, where the format allows it."""
     shown_camera: bool = False
     """Only the camera that is shown, not all."""
     range: tuple[int, int] | None = None

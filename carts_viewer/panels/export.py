@@ -15,8 +15,6 @@ from carts_viewer.transport.tab_page import TabPage
 
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
-_WITHOUT_IMAGES = ("masks", "csv", "npz", "json", *_DVRK, "video")
-"""Formats with no images beside their labels."""
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
 _WRITTEN = (
@@ -45,7 +43,7 @@ class ExportPanel:
             self._within = gui.add_checkbox("Only the range", True, visible=False)
             self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
             self._parts = gui.add_dropdown("Category per", list(_PARTS))
-            self._images = gui.add_checkbox("With images", True)
+            self._images = gui.add_checkbox("Copy images", False)
             self._count = gui.add_html("")
             self._export = gui.add_button("Export", icon=viser.Icon.FILE_EXPORT, color="teal")
             self._progress = gui.add_progress_bar(0.0, visible=False)
@@ -66,7 +64,7 @@ class ExportPanel:
         """Bring the widgets up to date."""
         name = self._formats.get(self._format.value)
         self._parts.visible = name not in _WITHOUT_PARTS
-        self._images.visible = name not in _WITHOUT_IMAGES
+        self._images.visible = name is not None and (FORMATS[name].images or name == "masks")
         self._within.visible = state.range is not None
         self._range = state.range if self._within.value else None
         self._show_count(state)

@@ -96,7 +96,7 @@ HINTS = {
     "Frames": "Which frames are written, by their review state",
     "Only the range": "Of these, only frames in the timeline's range",
     "Category per": "What gets a class of its own",
-    "With images": "Write the images beside their labels",
+    "Copy images": "Copy the images beside their labels; otherwise labels name those of the recording",
     "Export": "Write into a new folder beside the project, as a job",
     "Cancel export": "Stop; nothing of it is left",
     "Download it": "Send what was written last to this browser",

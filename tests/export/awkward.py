@@ -10,7 +10,7 @@ ARMS = ("PSM 1", 'PSM "2" & <ü>')
 SOURCES = ("measured", "rejected by Zoë", "hand, adam 4e-3")
 
 Masks = dict[tuple[str, str], np.ndarray]
-"""(View, category) -> mask."""
+"""(Stem of the image, category) -> mask."""
 
 
 def awkward(text: str) -> str:
@@ -40,7 +40,9 @@ def all_views(dataset: Dataset) -> list[View]:
 def expected_masks(dataset: Dataset) -> Masks:
     """What every format must give back."""
     return {
-        (view.name, category.name): mask for view in all_views(dataset) for category, mask in dataset.instances(view)
+        (dataset.stems[view.id - 1], category.name): mask
+        for view in all_views(dataset)
+        for category, mask in dataset.instances(view)
     }
 
 

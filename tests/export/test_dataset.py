@@ -42,7 +42,7 @@ def test_a_corrected_mask_decides_where_arms_are_and_the_rendering_whose_they_ar
 
 
 def test_an_empty_mask_has_no_objects(dataset: Dataset) -> None:
-    assert {name for name, _ in expected_masks(dataset)} == {dataset.steps[0][0], dataset.steps[2][0]}
+    assert {name for name, _ in expected_masks(dataset)} == {dataset.stems[0], dataset.stems[2]}
 
 
 def test_added_pixels_get_the_nearest_label() -> None:

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -13,7 +14,8 @@ from awkward import ARMS, CAMERA, SOURCES, Masks, all_views, assert_same_masks, 
 from PIL import Image
 from pycocotools.coco import COCO
 
-from carts_core.export import Dataset, export
+from carts_core.export import Dataset, FormatName, Images, export
+from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
 
 
@@ -43,11 +45,85 @@ def test_coco_comes_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path, parts
         )
 
 
-def test_images_lie_beside_their_labels_and_can_be_left_out(dataset: Dataset, tmp_path: Path) -> None:
-    folder = export(dataset, "coco", tmp_path / "with")
-    for view in all_views(dataset):
-        np.testing.assert_array_equal(read_image(folder / "images" / f"{view.name}.png"), dataset.image(view))
-    assert not (export(replace(dataset, images=False), "coco", tmp_path / "without") / "images").exists()
+NAMES = [f"regular/left/00{number}.png" for number in (1, 2, 3)]
+"""Of the images in the recording's folder."""
+
+
+def _jpeg(dataset: Dataset) -> Dataset:
+    """The dataset with JPEG images."""
+    path = dataset.sequence.path
+    for name in NAMES:
+        file = path.parent / name
+        cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
+        file.unlink()
+    path.write_text(path.read_text().replace("regular/left/*.png", "regular/left/*.jpg"))
+    return replace(dataset, sequence=Sequence.open(path))
+
+
+def test_labels_name_the_images_of_the_recording(dataset: Dataset, tmp_path: Path) -> None:
+    dataset = _jpeg(dataset)
+    names = [name.replace(".png", ".jpg") for name in NAMES]
+    coco, _ = _read_coco(export(dataset, "coco", tmp_path / "coco"))
+    assert [image["file_name"] for image in coco.imgs.values()] == names
+    assert (Path(coco.dataset["info"]["image_folder"]) / names[0]).is_file()
+    cvat = ElementTree.parse(export(dataset, "cvat", tmp_path / "cvat") / "annotations.xml").getroot()
+    assert [image.get("name") for image in cvat.iter("image")] == names
+    content = (export(dataset, "datumaro", tmp_path / "datumaro") / "annotations" / "default.json").read_text()
+    assert [item["image"]["path"] for item in json.loads(content)["items"]] == names
+    assert not [path for kind in ("coco", "cvat", "datumaro") for path in (tmp_path / kind).rglob("*.[jp][pn]g")]
+
+
+@pytest.mark.parametrize(
+    ("name", "images", "folder"),
+    [
+        ("coco", "copied", "images/regular/left"),
+        ("cvat", "copied", "images/regular/left"),
+        ("datumaro", "copied", "images/default/regular/left"),
+        ("masks", "copied", "images"),
+        ("yolo", "named", "images"),
+        ("voc", "named", "JPEGImages"),
+        ("bop", "named", "test/000001/rgb"),
+    ],
+)
+def test_copies_have_the_bytes_of_the_recording(
+    dataset: Dataset, tmp_path: Path, name: FormatName, images: Images, folder: str
+) -> None:
+    dataset = replace(_jpeg(dataset), images=images)
+    copies = sorted((export(dataset, name, tmp_path / "out") / folder).iterdir())
+    recorded = [dataset.sequence.path.parent / name.replace(".png", ".jpg") for name in NAMES]
+    assert {copy.suffix for copy in copies} == {".jpg"}
+    assert [copy.read_bytes() for copy in copies] == [file.read_bytes() for file in recorded]
+    without = export(replace(dataset, images="none"), name, tmp_path / "without")
+    assert not (without / folder).exists()
+
+
+def test_images_that_are_no_files_of_the_recording_are_written_as_the_labels_see_them(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    path = dataset.sequence.path
+    path.write_text(
+        path.read_text().replace('"regular/left/*.png"', '"regular/left/*.png"\ndistortion = [0.1, 0, 0, 0]')
+    )
+    dataset = replace(dataset, sequence=Sequence.open(path))
+    folder = export(dataset, "coco", tmp_path / "out")
+    assert dataset.remade_cameras == (CAMERA,)
+    coco, _ = _read_coco(folder)
+    for view, image in zip(all_views(dataset), coco.imgs.values(), strict=True):
+        assert image["file_name"] == f"{view.name}.png"
+        np.testing.assert_array_equal(read_image(folder / "images" / image["file_name"]), dataset.image(view))
+
+
+def test_images_outside_the_folder_of_the_sequence_are_named_from_the_folder_that_holds_all_of_them(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    path = dataset.sequence.path
+    (path.parent / "away").mkdir()
+    moved = path.rename(path.parent / "away" / path.name)
+    text = moved.read_text().replace('"regular/left/*.png"', '"../regular/left/*.png"')
+    moved.write_text(text.replace('"kinematics.csv"', '"../kinematics.csv"'))
+    dataset = replace(dataset, sequence=Sequence.open(moved))
+    assert dataset.image_folder == path.parent / "regular" / "left"
+    assert [dataset.image_name(view) for view in all_views(dataset)] == ["001.png", "002.png", "003.png"]
 
 
 def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
@@ -60,6 +136,7 @@ def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
         "frame": "Bild 3: ä",
         "index": 2,
         "camera": CAMERA,
+        "image": str(dataset.image_folder / NAMES[2]),
         "source": SOURCES[2],
         "verdict": "doubtful",
         "review": "accepted",
@@ -104,11 +181,11 @@ def test_yolo_is_the_same_for_readers_that_cut_fractions_off(dataset: Dataset, t
     folder = export(dataset, "yolo", tmp_path / "out")
     masks: Masks = {}
     for view in all_views(dataset):
-        for line in (folder / "labels" / f"{view.name}.txt").read_text().splitlines():
+        for line in (folder / "labels" / f"{dataset.stems[view.id - 1]}.txt").read_text().splitlines():
             category, *values = line.split()
             size = (view.camera.width, view.camera.height)
             points = (np.array(values, np.float32).reshape(-1, 2) * size).astype(np.int32)
-            mask = masks.setdefault((view.name, ARMS[int(category)]), np.zeros(size[::-1], bool))
+            mask = masks.setdefault((dataset.stems[view.id - 1], ARMS[int(category)]), np.zeros(size[::-1], bool))
             mask |= cv2.fillPoly(np.zeros(size[::-1], np.uint8), [points], 1).astype(bool)
     _assert_within_a_pixel(masks, expected_masks(dataset))
 
@@ -123,12 +200,12 @@ def test_voc_polygons_come_back_within_a_pixel(dataset: Dataset, tmp_path: Path)
 def test_voc_label_images_come_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -> None:
     folder = export(dataset, "voc", tmp_path / "out")
     names = (folder / "ImageSets" / "Segmentation" / "trainval.txt").read_text(encoding="utf-8").split()
-    assert names == [view.name for view in all_views(dataset)]
+    assert names == ["001", "002", "003"]
     for view in all_views(dataset):
-        image = Image.open(folder / "SegmentationClass" / f"{view.name}.png")
+        image = Image.open(folder / "SegmentationClass" / f"{dataset.stems[view.id - 1]}.png")
         assert image.mode == "P" and (image.getpalette() or [])[:9] == [0, 0, 0, 128, 0, 0, 0, 128, 0]
         np.testing.assert_array_equal(np.array(image), dataset.label_image(view))
-        objects = np.array(Image.open(folder / "SegmentationObject" / f"{view.name}.png"))
+        objects = np.array(Image.open(folder / "SegmentationObject" / f"{dataset.stems[view.id - 1]}.png"))
         np.testing.assert_array_equal(objects > 0, view.link_ids >= 0)
         assert objects.max() == len(list(dataset.instances(view)))
 
