@@ -4,6 +4,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from carts_core.model.scene import Scene
+from carts_core.optimization import undetermined_joints
 from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
 from carts_core.project.fit_verdict import VERDICTS
 from carts_core.project.state import Record
@@ -25,6 +27,7 @@ _REVIEWS = (
 _SOURCES = (Source.HAND, Source.OPTIMIZER, Source.PROPAGATED)
 _FULL = 0.2
 """1 - Dice, and probability of failure, that fill the height of a bar [1]."""
+_MOST_OPEN = 255
 _MOST_IDS = 5000
 """Of longer sequences, frames are named by their number."""
 
@@ -90,7 +93,7 @@ class TimelineData:
 
     def _drafted(self, state: ViewState) -> list[int]:
         """As `_changed`, of the shown frame alone, while somebody or the optimizer moves it."""
-        self._draft, number = state.index, code(state.project, state.index)
+        self._draft, number = state.index, code(state.project, state.index, self._session.scene)
         if self._codes.get(state.index, 0) == number:
             return []
         self._codes[state.index] = number
@@ -111,15 +114,16 @@ class TimelineData:
         self._traces.follow(project, indices)
         changed: list[int] = []
         for index in sorted(indices):
-            number = code(project, index)
+            number = code(project, index, self._session.scene)
             if self._codes.get(index, 0) != number:
                 self._codes[index] = number
                 changed += [index, number]
         return changed
 
 
-def code(project: ProjectState, frame: int) -> int:
-    """Review, verdict, source, whether it is kept, and how badly it fits (1 to 255, 0 unknown), in bits."""
+def code(project: ProjectState, frame: int, scene: Scene) -> int:
+    """Review, verdict, source, whether it is kept, how badly it fits (1 to 255, 0 unknown), and how many joints are not
+    determined (one more than there are, 0 unknown), in bits."""
     record = project.records.get(frame)
     if record is None:
         return 0
@@ -128,7 +132,20 @@ def code(project: ProjectState, frame: int) -> int:
     source = next((number for number, source in enumerate(_SOURCES, start=1) if source in record.sources), 0)
     dice = None if figures is None else figures.dice
     badness = 1.0 - dice if dice is not None else None if verdict is None else verdict.failure
-    return review + 8 * _fit(verdict) + 32 * source + 128 * int(record.is_kept) + 256 * _height(badness)
+    return (
+        review
+        + 8 * _fit(verdict)
+        + 32 * source
+        + 128 * int(record.is_kept)
+        + 256 * _height(badness)
+        + 65536 * _open(project, frame, scene)
+    )
+
+
+def _open(project: ProjectState, frame: int, scene: Scene) -> int:
+    known = {name: found.standard_deviations or () for name, found in project.joints(frame).items()}
+    joints = undetermined_joints(scene, known)
+    return 0 if joints is None else min(1 + len(joints), _MOST_OPEN)
 
 
 def _fit(verdict: FitVerdict | None) -> int:

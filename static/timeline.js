@@ -23,6 +23,7 @@
   let frames = 0;
   let ids = null;
   let codes = new Uint32Array(0); // per frame: review + 8 fit + 32 source + 128 kept + 256 badness
+  // + 65536 (1 + joints that are not determined, 0 where that is not known)
   let here = 0;
   let solving = null;
   let fps = 0;
@@ -216,9 +217,9 @@
 
   function bar(context, x, wide, code, top, height) {
     if (!code) return;
-    const bad = (code >> 8) / 255;
+    const bad = ((code >> 8) & 255) / 255;
     const tallness = Math.max(3, bad * height);
-    context.globalAlpha = code >> 8 ? 1 : 0.4; // what is not known looks unlike what fits well
+    context.globalAlpha = bad ? 1 : 0.4; // what is not known looks unlike what fits well
     context.fillStyle = REVIEW[code & 7];
     context.fillRect(x, top + height - tallness, wide, tallness);
     context.globalAlpha = 1;
@@ -292,17 +293,20 @@
     context.globalAlpha = 1;
   }
 
-  /** What is known of a frame, in words. */
-  function described(frame) {
+  /** What is known of a frame, in words; with its joints, which the status has no room for. */
+  function described(frame, whole = true) {
     const code = codes[frame] ?? 0;
     const said = NAMES[code & 7];
-    const fit = VERDICTS[(code >> 3) & 3] && ` · ${VERDICTS[(code >> 3) & 3]}`;
+    const open = (code >> 16) - 1;
+    const joints = open < 0 ? "" : open ? `, ${open} joint${open === 1 ? "" : "s"} not determined` : ", all joints determined";
+    const fit = VERDICTS[(code >> 3) & 3] && ` · mask ${VERDICTS[(code >> 3) & 3]}${whole ? joints : ""}`;
     const value = curveHigh() ? window.carts.lanes.valueAt(frame) : "";
     return `${name(frame)} of ${frames} · ${said}${fit}${code & 128 ? " · kept" : ""}${value}`;
   }
 
   function say() {
-    readout.textContent = readout.title = described(here);
+    readout.textContent = described(here, false);
+    readout.title = described(here);
     tip.hidden = hover === null;
     if (hover !== null) {
       tip.textContent = described(hover);

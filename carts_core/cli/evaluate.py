@@ -56,7 +56,7 @@ class Evaluate:
         from ..files import write_text
         from ..optimization import Backgrounds
         from ..recording import Sequence
-        from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_counts
+        from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_line
         from .score_table import score_table
 
         console = Terminal()
@@ -94,8 +94,10 @@ class Evaluate:
                 console,
                 kept_start_hint(where, [score.stopped for score in seen]),
                 base_frame_hint(where, [score.base_frame_gain for score in seen]),
-                verdict_counts(where, [score.verdict for score in seen]),
+                verdict_line(where, [score.verdict for score in seen], [score.not_determined for score in seen]),
             )
+        if any(score.verdict not in (None, "good") for score in scores):
+            print_hints(console, "The reasons of verdicts are in --json.")
         required = self.solving.chosen.needs_background
         for group in [] if observer.masked else camera_groups(cameras, self.together):
             for domain in domains:

@@ -140,7 +140,12 @@ class FrameFolder:
                     fingerprints[camera] = fingerprint(png)
                 row = row_fingerprint(self._scene, result.row)
                 self._records[frame_id] = Record(
-                    result.origin, fingerprints, row, torch.get_num_threads(), **judged(result.assessment)
+                    result.origin,
+                    fingerprints,
+                    row,
+                    torch.get_num_threads(),
+                    **judged(result.assessment),
+                    not_determined=result.row.undetermined(self._scene),
                 )
             new = {result.row.frame_id: result.row for result in found}
             rows = {row.frame_id: row for row in self.rows} | new

@@ -1,11 +1,12 @@
 """What a command suggests after its results."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
 
-from ..optimization import BASE_FRAME_GAIN, Assessment, SequenceAssessment, StopReason, Verdict
+from ..optimization import BASE_FRAME_GAIN, Assessment, SequenceAssessment, StopReason, Verdict, fit_words
 from ..wording import counted
 
 _NAMED = 5
@@ -35,13 +36,22 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     )
 
 
-def verdict_counts(where: str, verdicts: Sequence[str | None]) -> str | None:
-    """How many runs are good, doubtful and failed, or None if all are good or were not assessed."""
-    known = [verdict for verdict in verdicts if verdict is not None]
-    if set(known) <= {Verdict.GOOD.value}:
-        return None
-    counts = ", ".join(f"{known.count(verdict.value)} {verdict.value}" for verdict in Verdict)
-    return f"{where}: the images say of {counted(len(known), 'run')}: {counts}. The reasons are in --json."
+def verdict_line(
+    where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
+) -> str | None:
+    """Verdicts on masks, and how many joints the images leave open; None where nothing was assessed.
+
+    Args:
+        where: as below.
+        verdicts: of each run, None where it was not assessed.
+        undetermined: `ARM.JOINT` of the joints that each run leaves open, None where that is not known.
+    """
+    runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]
+    counts = Counter(
+        fit_words(verdict, joints) for value in Verdict for verdict, joints in runs if verdict == value.value
+    )
+    said = "; ".join(f"{words} in {count} of {counted(len(runs), 'run')}" for words, count in counts.items())
+    return f"{where}: {said}." if runs else None
 
 
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:

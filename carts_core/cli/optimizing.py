@@ -24,7 +24,7 @@ from ..stopping import when_stopped
 from ..wording import counted
 from .constant_corrections import constant_correction_hint
 from .frame_folder import FrameFolder, FrameResult
-from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints
+from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints, verdict_line
 from .observing import RECORDING
 from .optimize_options import OptimizeOptions
 from .origins import Origin as MadeFrom
@@ -201,6 +201,7 @@ class Optimizing:
             part.output.write([FrameResult(row, best.state, origins[index], found)])
             stopped.append(optimizer.stop_reason)
             gains.append(optimizer.base_frame_gain())
+        self._print_verdicts(part, list(assessed))
         print_hints(
             self._console,
             kept_start_hint(part.name, stopped),
@@ -248,12 +249,20 @@ class Optimizing:
         else:
             self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
         assessed = {estimate.frame_id: estimate.assessment for estimate in optimizer.estimates.values()}
+        self._print_verdicts(part, list(assessed))
         print_hints(
             self._console,
             sequence_hint(part.name, optimizer.assessment),
             base_frame_hint(part.name, [optimizer.base_frame_gain()]),
             *verdict_hints(part.name, assessed),
         )
+
+    def _print_verdicts(self, part: _Part, frame_ids: list[str]) -> None:
+        """What was found for these frames: verdicts on masks, and how many joints are not determined."""
+        rows = [row for row in part.output.rows if row.frame_id in set(frame_ids)]
+        joints = [row.undetermined(self._sequence.scene) for row in rows]
+        if line := verdict_line(part.name, [row.verdict for row in rows], joints):
+            self._console.print(line, soft_wrap=True)
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
         """Position -> joint positions of the chosen frames that a person set."""

@@ -1,7 +1,7 @@
 """What stands in `results.json` beside the results of `carts optimize`: of each frame, what it was made from and is."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -36,6 +36,8 @@ class Record:
     """For the verdict, one sentence."""
     probability: float | None = None
     """That the mask is wrong [1]."""
+    not_determined: Sequence[str] | None = None
+    """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
 
 
 def judged(found: Assessment | None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ..optimization import (
     GivenMasks,
     SolverSettings,
     SurfacePredictor,
+    undetermined_joints,
 )
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
@@ -43,9 +44,11 @@ class FrameScore:
     joint_std_deg: float | None = None
     """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
     verdict: str | None = None
-    """good, doubtful or failed, as far as the image tells; None where it is not assessed."""
+    """good, doubtful or failed, of the mask and as far as the image tells; None where it is not assessed."""
     reason: str | None = None
     """Of the verdict, one sentence."""
+    not_determined: list[str] | None = None
+    """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
     base_frame_gain: float | None = None
     """What free base frames would explain of the remaining difference [1]; None where it is not known."""
 
@@ -201,6 +204,7 @@ def frame_score(
         joint_std_deg=joint_std_deg(sequence.scene, joint_std, sequence.measured_joints),
         base_frame_gain=base_frame_gain,
         verdict=None if assessment is None else assessment.verdict.value,
+        not_determined=undetermined_joints(sequence.scene, joint_std),
         reason=None if assessment is None else assessment.reason,
     )
 

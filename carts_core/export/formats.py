@@ -103,6 +103,7 @@ def _summary(dataset: Dataset, name: FormatName) -> str:
             "image": None if file is None else str(file),
             "source": frame.source,
             "verdict": frame.verdict,
+            "not_determined": frame.undetermined(dataset.scene),
             "review": frame.review,
             "dice": frame.dice,
         }

@@ -1,7 +1,7 @@
 """Corrected kinematics as CSV: a row per frame, a column `source`, and `ARM.JOINT` for every joint [rad, m].
 
 Where standard deviations are known, a column `ARM.JOINT.std` [rad, m] follows for every joint. Where a frame has a
-verdict, the last column is `verdict`.
+verdict, `verdict` (of the mask) and `not_determined` (the joints that the image leaves open) follow.
 """
 
 import csv
@@ -17,7 +17,13 @@ from ..errors import SequenceError
 from ..files import csv_cell, text_of_cell
 from ..files.reading import TABLE, open_regular
 from ..model.scene import Scene
+from ..optimization.observability import undetermined_joints
 from ..wording import shortened
+
+_SAID = ["verdict", "not_determined"]
+"""Columns of text behind the numbers."""
+JOINED = "; "
+"""Between names of joints in a text."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,11 @@ class KinematicsRow:
     joint_std: Mapping[str, np.ndarray] | None = None
     """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, where not known."""
     verdict: str | None = None
-    """How far the values can be relied on: good, doubtful or failed; None where nobody said."""
+    """Verdict on the mask: good, doubtful or failed; None where it was not assessed."""
+
+    def undetermined(self, scene: Scene) -> list[str] | None:
+        """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
+        return undetermined_joints(scene, self.joint_std or {})
 
 
 def joint_columns(scene: Scene) -> list[str]:
@@ -66,7 +76,8 @@ def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
     table.writerow(_header(scene, with_std, with_verdict))
     for row in rows:
         values = [position_values(scene, row), *([std_values(scene, row)] if with_std else [])]
-        numbers, verdict = np.concatenate(values), [csv_cell(row.verdict or "")] if with_verdict else []
+        said = [row.verdict or "", JOINED.join(row.undetermined(scene) or ())]
+        numbers, verdict = np.concatenate(values), list(map(csv_cell, said)) if with_verdict else []
         table.writerow([csv_cell(row.frame_id), csv_cell(row.source), *(f"{value:.9g}" for value in numbers), *verdict])
     return text.getvalue()
 
@@ -86,27 +97,28 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
 def _header(scene: Scene, with_std: bool, with_verdict: bool = False) -> list[str]:
     columns = joint_columns(scene)
     further = [f"{column}.std" for column in columns] if with_std else []
-    return ["frame", "source", *map(csv_cell, [*columns, *further]), *(["verdict"] if with_verdict else [])]
+    return ["frame", "source", *map(csv_cell, [*columns, *further]), *(_SAID if with_verdict else [])]
 
 
 def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
     with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8", newline="") as file:
         table = csv.reader(file)
         header = next(table, [])
-        with_verdict = header[-1:] == ["verdict"]
-        with_std = header == _header(scene, True, with_verdict)
-        if not with_std and header != _header(scene, False, with_verdict):
+        # Tables of earlier versions end with the verdict.
+        said = [name for name in header[-len(_SAID) :] if name in _SAID]
+        numbers = header[: len(header) - len(said)]
+        with_std = numbers == _header(scene, True)
+        if not with_std and numbers != _header(scene, False):
             found, wanted = ", ".join(header), ", ".join(_header(scene, False))
             raise SequenceError(f"{path} has columns {shortened(found, 1000)}; expected are {wanted}. Remove it.")
         rows = []
         for line, cells in enumerate(table, start=2):
             try:
-                values = np.array([float(cell) for cell in cells[2 : len(header) - with_verdict]])
+                values = np.array([float(cell) for cell in cells[2 : len(numbers)]])
             except ValueError:
                 values = np.empty(0)
-            if len(cells) != len(header) or len(values) != len(header) - 2 - with_verdict:
-                wanted = len(header) - 2 - with_verdict
-                raise SequenceError(f"{path}, line {line}: not {wanted} numbers. Remove the line.")
+            if len(cells) != len(header) or len(values) != len(numbers) - 2:
+                raise SequenceError(f"{path}, line {line}: not {len(numbers) - 2} numbers. Remove the line.")
             if not np.isfinite(values[: len(joint_columns(scene))]).all():
                 raise SequenceError(f"{path}, line {line}: a joint position is not finite. Remove the line.")
             positions, std = np.split(values, [len(joint_columns(scene))])
@@ -116,7 +128,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
                     text_of_cell(cells[1]),
                     _by_arm(scene, positions),
                     _by_arm(scene, std) if with_std else None,
-                    (text_of_cell(cells[-1]) or None) if with_verdict else None,
+                    (text_of_cell(cells[len(numbers)]) or None) if said else None,
                 )
             )
     return rows

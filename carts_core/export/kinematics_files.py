@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..files import OutputPath, output_stream, write_text
 from .dataset import Dataset
 from .frames import ExportFrame
-from .kinematics import joint_columns, joint_units, kinematics_csv, position_values, std_values
+from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .monitor import Monitor
 
 
@@ -32,7 +32,8 @@ def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -
 def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
     """NumPy's archive without pickles.
 
-    Arrays: `frame_id`, `source`, `verdict` (text, empty where nobody said) and `index` [frames]; `column` (`ARM.JOINT`)
+    Arrays: `frame_id`, `source`, `verdict` (of the mask, empty where it was not assessed), `not_determined` (joints
+    that the images leave open, with `; ` between them) and `index` [frames]; `column` (`ARM.JOINT`)
     and `unit` [columns]; `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a
     `joint_std` that is not known is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] and `camera`
     (text) say where they were.
@@ -48,6 +49,7 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
             index=np.array([frame.index for frame in frames]),
             source=np.array([frame.source for frame in frames]),
             verdict=np.array([frame.verdict or "" for frame in frames]),
+            not_determined=np.array([JOINED.join(frame.undetermined(dataset.scene) or ()) for frame in frames]),
             column=np.array(joint_columns(dataset.scene)),
             unit=np.array(joint_units(dataset.scene)),
             joint_positions=np.array([position_values(dataset.scene, frame) for frame in frames]),
@@ -65,6 +67,7 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
             "index": frame.index,
             "source": frame.source,
             "verdict": frame.verdict,
+            "not_determined": frame.undetermined(dataset.scene),
             "joint_positions": dict(zip(columns, position_values(dataset.scene, frame).tolist(), strict=True)),
             "joint_std": {
                 column: None if math.isnan(value) else value

@@ -25,6 +25,8 @@ from .frame import Progress as Progress
 from .ignore import propose_ignore as propose_ignore
 from .masks import GivenMasks as GivenMasks
 from .masks import MaskPredictor as MaskPredictor
+from .observability import fit_words as fit_words
+from .observability import undetermined_joints as undetermined_joints
 from .predictor import FramePredictor as FramePredictor
 from .predictor import ImagePredictor as ImagePredictor
 from .predictor import NetworkPredictor as NetworkPredictor
@@ -72,5 +74,7 @@ __all__ = [
     "UnknownChange",
     "Verdict",
     "familiarity",
+    "fit_words",
     "propose_ignore",
+    "undetermined_joints",
 ]

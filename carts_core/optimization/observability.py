@@ -4,21 +4,30 @@ Gauss-Newton's curvature is the inverse covariance of the unknowns, given what w
 adds. Where the image adds nothing the deviation stays the expected one, and so does the value.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..settings import SurfaceSolver
+from ..wording import counted
 from .factors import Prior
 from .variables import Variables
+
+if TYPE_CHECKING:
+    from ..model.scene import Scene
 
 Observability = Literal["determined", "weak", "not visible"]
 
 _DETERMINED, _VISIBLE = 1 / 3, 0.9
+_OPEN_ANGLE = _DETERMINED * math.radians(SurfaceSolver.prior_deg)
+_OPEN_LENGTH = _OPEN_ANGLE * SurfaceSolver.length_scale
+"""Standard deviations above which a joint is not determined [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,43 @@ class Uncertainty:
     def scaled(self, later: "Uncertainty") -> "Uncertainty":
         """Deviations for errors of another size; what counts as visible stays what it was for errors as expected."""
         return replace(later, left=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
+
+
+def undetermined_joints(
+    scene: "Scene", joint_std: Mapping[str, Sequence[float | None] | np.ndarray]
+) -> list[str] | None:
+    """`ARM.JOINT` of every joint that a fit leaves open: its deviation is above a third of what is expected of a start.
+
+    Args:
+        scene: whose arms these are.
+        joint_std: arm -> standard deviations [rad, m]; None and NaN (joints that were held) do not count.
+
+    Returns:
+        None where no deviation is known.
+    """
+    known, undetermined = False, []
+    for arm in scene.arms:
+        named = zip(arm.robot.joint_names, arm.robot.joint_types, joint_std.get(arm.name, ()), strict=False)
+        for joint, kind, std in named:
+            if std is None or math.isnan(std):
+                continue
+            known = True
+            if std > (_OPEN_LENGTH if kind == "prismatic" else _OPEN_ANGLE):
+                undetermined.append(f"{arm.name}.{joint}")
+    return undetermined if known else None
+
+
+def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
+    """A verdict, which is about the mask, with what is known of the joints: `mask good, 4 joints not determined`.
+
+    Args:
+        verdict: good, doubtful or failed.
+        undetermined: as from `undetermined_joints`; None where no deviation is known.
+    """
+    if undetermined is None:
+        return f"mask {verdict}"
+    joints = f"{counted(len(undetermined), 'joint')} not determined" if undetermined else "all joints determined"
+    return f"mask {verdict}, {joints}"
 
 
 def uncertainty(

@@ -2,7 +2,7 @@
 
 import viser
 
-from carts_core.export import FORMATS
+from carts_core.export import FORMATS, FormatName
 from carts_core.project import ProjectState, ReviewState
 from carts_viewer import intents
 from carts_viewer.export_warnings import export_warnings
@@ -32,7 +32,7 @@ class ExportPanel:
         cameras = len(session.scene.cameras)
         self._camera_names = [camera.name for camera in session.scene.cameras]
         self._kept = storage.scratch is None
-        self._formats = {known.label: name for name, known in FORMATS.items()}
+        self._formats: dict[str, FormatName] = {known.label: name for name, known in FORMATS.items()}
         self._counted: ProjectState | None = None
         self._chosen = ""
         self._range: tuple[int, int] | None = None

@@ -2,6 +2,7 @@
 
 import viser
 
+from carts_core.optimization import fit_words, undetermined_joints
 from carts_core.project import FitVerdict
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
@@ -12,7 +13,10 @@ from carts_viewer.transport.tab_page import TabPage
 
 _POSSIBLE, _LIKELY = 0.1, 0.5
 """Probabilities of a failure from which a single camera's fit is doubtful and has failed; as the verdict's own [1]."""
-_MEANING = "What the images say of the fit. Good: rely on the mask. Doubtful: look at it. Failed: do not use it."
+_MEANING = (
+    "What the images say of the fit. Good: rely on the mask. Doubtful: look at it. Failed: do not use it. Joints "
+    "that the images leave open stay near their measured values; their deviations are under Values."
+)
 
 
 class FitPanel:
@@ -20,6 +24,7 @@ class FitPanel:
 
     def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
         gui = page.gui
+        self._scene = session.scene
         self._cameras = [camera.name for camera in session.scene.cameras]
         self._text = gui.add_html("")
         self._check = gui.add_button(
@@ -41,18 +46,31 @@ class FitPanel:
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
         self._check.label = "Check the fit" if state.verdict is None else "The fit is checked"
+        known = {name: found.standard_deviations or () for name, found in state.project.joints(state.index).items()}
         self._text.content = fit_text(
-            state.verdict, running=running, scores=_scores(state, self._cameras), busy=state.busy
+            state.verdict,
+            running=running,
+            scores=_scores(state, self._cameras),
+            undetermined=undetermined_joints(self._scene, known),
+            busy=state.busy,
         )
 
 
-def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, float], busy: str | None = None) -> str:
+def fit_text(
+    verdict: FitVerdict | None,
+    *,
+    running: bool,
+    scores: dict[str, float],
+    undetermined: list[str] | None = None,
+    busy: str | None = None,
+) -> str:
     """A verdict with its reason, remedy and cameras, as HTML.
 
     Args:
         verdict: of the shown pose; None where it was not assessed.
         running: whether the pose is still moving.
         scores: Dice of the cameras with a true mask.
+        undetermined: joints that the images leave open; None where no deviation is known.
         busy: what is being prepared, for people.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
@@ -73,11 +91,12 @@ def fit_text(verdict: FitVerdict | None, *, running: bool, scores: dict[str, flo
             name += f' <span class="carts-spinner"></span>{escaped(busy)} …'
         return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
     remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
-    about = "<br><small>About the mask. Each joint's deviation: Values.</small>" if verdict.verdict == "good" else ""
-    name = verdict.verdict
+    name, (mask, _, joints) = verdict.verdict, fit_words(verdict.verdict, undetermined).partition(", ")
+    listed = ", ".join(undetermined or ()).replace("_", " ")
+    known = f', <b title="{escaped(listed)}">{joints}</b>' if joints else ""
     return (
-        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>{name.capitalize()}</b> '
-        f"{escaped(verdict.reason)}{about}{remedy}{line}</div>"
+        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>{mask.capitalize()}</b>{known}<br>'
+        f"{escaped(verdict.reason)}{remedy}{line}</div>"
     )
 
 

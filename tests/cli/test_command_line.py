@@ -17,7 +17,7 @@ from carts_core.errors import SettingsError
 
 SCORE_KEYS = {
     *("frame", "camera", "domain", "dice_before", "dice_after", "joint_mae_deg_before", "joint_mae_deg_after"),
-    *("iterations", "seconds", "stopped", "joint_std_deg", "base_frame_gain", "verdict", "reason"),
+    *("iterations", "seconds", "stopped", "joint_std_deg", "base_frame_gain", "verdict", "reason", "not_determined"),
 }
 
 
@@ -164,7 +164,7 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert all(0 < float(row["PSM1.yaw.std"]) < 0.1 for row in rows)
 
     given = tmp_path / "keyframes.csv"
-    columns = [name for name in rows[0] if not name.endswith(".std") and name != "verdict"]
+    columns = [name for name in rows[0] if not name.endswith(".std") and name not in ("verdict", "not_determined")]
     values = ["0.01", "-0.02", "0.151", "0.03", "0.02", "0.01", "0.1"]
     given.write_text(",".join(columns) + "\n" + ",".join(["002", "edited", *values]) + "\n")
     main([*command, "--keyframes", str(given), "--overwrite"])

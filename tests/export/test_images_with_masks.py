@@ -54,7 +54,7 @@ def _jpeg(dataset: Dataset) -> Dataset:
     path = dataset.sequence.path
     for name in NAMES:
         file = path.parent / name
-        cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
+        cv2.imwrite(str(file.with_suffix(".jpg")), read_image(file)[..., ::-1])
         file.unlink()
     path.write_text(path.read_text().replace("regular/left/*.png", "regular/left/*.jpg"))
     return replace(dataset, sequence=Sequence.open(path))
@@ -139,6 +139,7 @@ def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
         "image": str(dataset.image_folder / NAMES[2]),
         "source": SOURCES[2],
         "verdict": "doubtful",
+        "not_determined": [],
         "review": "accepted",
         "dice": 0.93,
     }

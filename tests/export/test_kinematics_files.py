@@ -60,6 +60,35 @@ def test_verdicts_come_back_with_the_kinematics(dataset: Dataset, tmp_path: Path
     assert kinematics_csv(dataset.scene, found) == kinematics_csv(dataset.scene, rows)
 
 
+def _open_joints(dataset: Dataset) -> Dataset:
+    """Of the last frame, the image leaves two joints open; of the first two, no deviation is known."""
+    std = {ARMS[0]: np.array([1e-3, 1e-3, 1e-3, 0.1, 1e-3, np.nan, 0.02])}
+    last = replace(dataset.frames[2], verdict="good", joint_std=std)
+    return replace(dataset, frames=(*dataset.frames[:2], last))
+
+
+def test_joints_that_the_images_leave_open_stand_beside_the_verdict(dataset: Dataset, tmp_path: Path) -> None:
+    dataset = _open_joints(dataset)
+    names = ["PSM 1.roll", "PSM 1.jaw"]
+    path = export(dataset, "csv", tmp_path / "out.csv")
+    said = [(row["verdict"], row["not_determined"]) for row in csv.DictReader(path.open(encoding="utf-8"))]
+    assert said == [("", ""), ("", ""), ("good", "; ".join(names))]
+    with np.load(export(dataset, "npz", tmp_path / "out.npz"), allow_pickle=False) as archive:
+        assert archive["not_determined"].tolist() == ["", "", "; ".join(names)]
+    content = json.loads(export(dataset, "json", tmp_path / "out.json").read_text(encoding="utf-8"))
+    assert [frame["not_determined"] for frame in content["frames"]] == [None, None, names]
+    summary = json.loads((export(dataset, "masks", tmp_path / "png") / "export.json").read_text(encoding="utf-8"))
+    assert [view["not_determined"] for view in summary["views"]] == [None, None, names]
+
+
+def test_tables_of_earlier_versions_end_with_the_verdict(dataset: Dataset, tmp_path: Path) -> None:
+    path = export(_open_joints(dataset), "csv", tmp_path / "out.csv")
+    rows = list(csv.reader(path.open(encoding="utf-8")))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows(row[:-1] for row in rows)
+    assert [row.verdict for row in read_kinematics_csv(path, dataset.scene)] == [None, None, "good"]
+
+
 @pytest.mark.parametrize("text", ["frame,a\n1,2\n", "", "\udcff"])
 def test_a_table_of_something_else_is_refused(dataset: Dataset, tmp_path: Path, text: str) -> None:
     path = tmp_path / "table.csv"

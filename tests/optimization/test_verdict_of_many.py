@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from evidence import CONVINCING
 
-from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_counts
+from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_line
 from carts_core.optimization import Assessment, StopReason, Verdict
 from carts_core.optimization.familiarity import Familiarity
 from carts_core.optimization.verdict import assess
@@ -84,7 +84,11 @@ def test_where_masks_are_fitted_the_overlap_with_them_decides(agreement: float, 
     assert assess(replace(RIGHT, masked=True, agreement=agreement)).verdict is wanted
 
 
-def test_an_evaluation_counts_its_verdicts_where_not_all_are_good() -> None:
-    assert verdict_counts("left", ["good", None]) is None
-    said = verdict_counts("left", ["good", "failed", "good"])
-    assert said is not None and "2 good, 0 doubtful, 1 failed" in said
+def test_verdicts_on_masks_are_counted_with_the_joints_that_are_not_determined() -> None:
+    assert verdict_line("left", [None], [None]) is None
+    joints = [["PSM1.roll", "PSM1.jaw"], None, ["PSM1.roll", "PSM1.jaw"], [], None]
+    said = verdict_line("left", ["good", "failed", "good", "good", None], joints)
+    assert said == (
+        "left: mask good, 2 joints not determined in 2 of 4 runs; mask good, all joints determined in 1 of 4 runs; "
+        "mask failed in 1 of 4 runs."
+    )

@@ -36,12 +36,16 @@ def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
     verdict = FitVerdict("failed", "Camera right: <no>", "Run again.", 0.8, (("left", 0.01), ("right", 0.8)))
     text = fit_text(verdict, running=False, scores={"left": 0.98, "right": 0.663})
     for part in (
-        "<b>Failed</b> Camera right: &lt;no&gt;",
+        "<b>Mask failed</b><br>Camera right: &lt;no&gt;",
         "Run again.",
         "left good Dice 0.980",
         "right failed Dice 0.663",
     ):
         assert part in text
+    good = FitVerdict("good", "The image supports the fit.")
+    text = fit_text(good, running=False, scores={}, undetermined=["PSM1.roll", "PSM1.wrist_yaw"])
+    assert '<b>Mask good</b>, <b title="PSM1.roll, PSM1.wrist yaw">2 joints not determined</b>' in text
+    assert "all joints determined" in fit_text(good, running=False, scores={}, undetermined=[])
     assert "not checked" in fit_text(None, running=False, scores={})
 
 

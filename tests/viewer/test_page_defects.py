@@ -75,7 +75,8 @@ def test_the_page_says_what_is_so(open_viewer: Callable[..., ViewerApp], open_ta
     said = eventually(lambda: app.state.verdict, lambda found: found is not None)
     assert said is not None
     app.wait_until_shown()
-    expect(verdict).to_contain_text(said.verdict.capitalize())
+    expect(verdict).to_contain_text(f"Mask {said.verdict}")
+    expect(verdict).to_contain_text("joints not determined")
     expect(tab.page.get_by_text("Converged")).to_have_count(0)
     # The curve compares every iterate with the same image, is named, and says so when it is out of date.
     assert app.state.run.curves.comparable

@@ -128,9 +128,11 @@ def test_nothing_in_the_window_covers_or_cuts_off_what_stands_beside_it(
     tab.place_in_viewer.put(intents.SetRange((4, 7)))
     expect(tab.page.locator(".carts-range")).to_have_text("005 – 008")
     # The longest status that solving leaves: solved together, good.
-    tab.page.evaluate("carts.setTimeline({ whole: false, codes: [0, 6 + 8 + 96], solving: null, traced: false })")
+    codes = "[0, 6 + 8 + 96 + 5 * 65536]"
+    tab.page.evaluate(f"carts.setTimeline({{ whole: false, codes: {codes}, solving: null, traced: false }})")
     status = tab.page.locator(".carts-strip output")
-    expect(status).to_have_text("001 of 12 · solved together · good")
+    expect(status).to_have_text("001 of 12 · solved together · mask good")
+    expect(status).to_have_attribute("title", "001 of 12 · solved together · mask good, 4 joints not determined")
     assert not status.evaluate(_CUT_OFF)
     # The panel's scrollbar lies beside its fields.
     bar = tab.page.locator(".mantine-ScrollArea-scrollbar[data-orientation=vertical]").first.bounding_box()
