@@ -73,7 +73,7 @@ class Export:
                 path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         if FORMATS[self.format].images and self.images != "none" and dataset.remade_cameras:
             cameras_named = ", ".join(dataset.remade_cameras)
-            reason = "they are undistorted, cropped, or of a video or a bag, so that labels fit no recorded file"
+            reason = "they are undistorted, cropped, turned, or of a video or a bag, and labels fit no recorded file"
             console.print(f"images of {cameras_named} are written as PNG: {reason}", soft_wrap=True)
         console.print(f"wrote {path}")
 

@@ -182,7 +182,8 @@ class Dataset:
 
     @cached_property
     def files(self) -> list[Path | None]:
-        """The recording's image of every view; None where that is undistorted, cropped, or of a video or a bag."""
+        """The recording's image of every view; None where that is undistorted, cropped, turned, or of a video
+        or a bag."""
         return [self._file(frame, camera) for _, frame, camera in self.steps]
 
     @property

@@ -79,6 +79,14 @@ class ImageFiles:
             self._counted = bits_of_files(self.files)
         return self._counted
 
+    def upright(self, index: int) -> bool:
+        """Whether a file has its pixels as they are used, not turned by EXIF; also where it is missing."""
+        try:
+            with open_regular(self.files[index], IMAGE) as stream:
+                return image_traits(stream.read(_HEADER)).orientation == 1
+        except OSError:
+            return True
+
     def remarks(self) -> tuple[str, ...]:
         """What is changed about some of the images."""
         bits = () if self._given is not None else bits_remark(self.files)

@@ -215,11 +215,13 @@ class Sequence:
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
-        """The file whose pixels are those of a frame's image; None where the image is undistorted, cropped or decoded
-        from a video or a bag. Errors as `has_masks`."""
+        """The file whose pixels are those of a frame's image; None where the image is undistorted, cropped, turned or
+        decoded from a video or a bag. Errors as `has_masks`."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
-        return source.files[index] if isinstance(source, ImageFiles) and not any(entry.camera.distortion) else None
+        if not isinstance(source, ImageFiles) or any(entry.camera.distortion) or not source.upright(index):
+            return None
+        return source.files[index]
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
         """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position.
