@@ -1,17 +1,21 @@
 """Images that lie in a part of a picture, or inside a ROS bag."""
 
 import threading
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from ..decoders import bags
 from ..errors import SequenceError
 from ..extras import needs_extra
-from .bag_limits import check_bag, limit_expansion
+from ..files.decoding import Decoder, Limits
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -60,6 +64,58 @@ class Cropped:
         return self.source.remarks()
 
 
+class Bag:
+    """An opened ROS bag, read in a child process; use as a context, from one thread at a time.
+
+    Args:
+        path: ROS 1 bag, MCAP file or ROS 2 bag folder.
+
+    Attributes:
+        topics: name and message type of each topic.
+
+    Raises:
+        SequenceError: the bag is missing, damaged or of an unknown kind.
+    """
+
+    def __init__(self, path: Path) -> None:
+        needs_extra("rosbags", "import")
+        if not path.exists():
+            raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
+        self.path = path
+        self._decoder, self._limits = Decoder(), Limits.of(path)
+        self.close = weakref.finalize(self, self._decoder.close)
+        self.topics: list[tuple[str, str]] = [(name, kind) for name, kind in self._call(bags.topics)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def rows(self, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
+        """Logs of topics, as `decoders.bags.rows`; errors as when it is opened."""
+        return self._call(bags.rows, wanted)
+
+    def image_times(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
+        """Record times [ns] and header times [s] of a topic's images; errors as when it is opened."""
+        record, stamps = self._call(bags.image_times, topic)
+        return record, stamps
+
+    def message(self, topic: str, time: int | None = None) -> Any:
+        """The message that was recorded at a time [ns], or the first one; None without one. Errors as when opened."""
+        fields = self._call(bags.message, topic, time)
+        return None if fields is None else SimpleNamespace(**fields)
+
+    def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return self._decoder.call(function, self.path, *arguments, limits=self._limits)
+        except (OSError, ValueError) as error:
+            raise SequenceError(
+                f"bag {self.path} cannot be read ({error}). It is damaged, was cut off, or is no ROS bag: copy it "
+                "again, or have ROS index it anew (rosbag reindex, ros2 bag reindex)."
+            ) from error
+
+
 class BagImages:
     """Images of one topic of a ROS bag, each found by the time at which it was recorded; safe to use from threads.
 
@@ -73,16 +129,14 @@ class BagImages:
     """
 
     def __init__(self, path: Path, topic: str, times: tuple[int, ...]) -> None:
-        needs_extra("rosbags", "import")
         self.path = path
         self.topic = topic
         self._times = times
         self._lock = threading.Lock()
-        self._reader = open_bag(path)
-        self._connections = [entry for entry in self._reader.connections if entry.topic == topic]
-        if not self._connections:
-            known = ", ".join(sorted(entry.topic for entry in self._reader.connections))
-            raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {known}.")
+        self._bag = Bag(path)
+        names = {name for name, _ in self._bag.topics}
+        if topic not in names:
+            raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {', '.join(sorted(names))}.")
 
     def name(self, index: int) -> str:
         """What errors call the image of frame `index`."""
@@ -94,13 +148,8 @@ class BagImages:
         Raises:
             SequenceError: there is none at that time, or it is damaged.
         """
-        time = self._times[index]
         with self._lock:
-            try:
-                found = next(iter(self._reader.messages(self._connections, start=time, stop=time + 1)), None)
-                message: Any = None if found is None else self._reader.deserialize(found[2], found[0].msgtype)
-            except Exception as error:  # rosbags raises whatever its storage formats raise
-                raise SequenceError(f"{self.name(index)} cannot be read ({error}). Copy the bag again.") from error
+            message = self._bag.message(self.topic, self._times[index])
         if message is None:
             raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
         return decode_message(message, self.name(index))
@@ -108,31 +157,6 @@ class BagImages:
     def remarks(self) -> tuple[str, ...]:
         """None: messages are used as they are."""
         return ()
-
-
-def open_bag(path: Path) -> Any:
-    """An opened `rosbags` reader.
-
-    Raises:
-        SequenceError: the bag is missing, damaged or of an unknown kind.
-    """
-    needs_extra("rosbags", "import")
-    from rosbags.highlevel import AnyReader  # noqa: PLC0415
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-
-    if not path.exists():
-        raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
-    check_bag(path)
-    limit_expansion()
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    try:
-        reader.open()
-    except Exception as error:  # rosbags raises whatever its storage formats raise
-        raise SequenceError(
-            f"bag {path} cannot be opened ({error}). It is damaged, was cut off, or is no ROS bag: copy it again, "
-            "or have ROS index it anew (rosbag reindex, ros2 bag reindex)."
-        ) from error
-    return reader
 
 
 def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:

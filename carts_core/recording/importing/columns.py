@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.instruments import robot_file
@@ -170,6 +171,29 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
             "their order. Correct the names, or import the positions from a table: --kinematics."
         )
     return None
+
+
+def rows_of(
+    groups: list[tuple[list[str], np.ndarray]], role: str, joints: tuple[str, ...] = JOINT_NAMES
+) -> Float[np.ndarray, "rows 1+values"] | None:
+    """Logged times [s] and values of a topic, with joint positions in the order of `joints`; None without any.
+
+    Args:
+        groups: of `decoders.bags.rows`: names in the messages, times and values.
+        role: "joints", "jaw" or a pose.
+        joints: that are wanted.
+
+    Raises:
+        SequenceError: as `order_of_names`.
+    """
+    chosen = []
+    for names, rows in groups:
+        order = range(rows.shape[1] - 1)
+        if role == "joints":
+            order = order_of_names(tuple(names), joints) or range(len(joints))
+        if max(order) < rows.shape[1] - 1:
+            chosen.append(rows[:, [0, *(1 + index for index in order)]])
+    return np.concatenate(chosen) if chosen else None
 
 
 def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
@@ -59,7 +60,7 @@ class ArmLog:
     """Whether units and signs that were given are applied already."""
 
 
-def track(rows: list[tuple[float, ...]]) -> Track | None:
+def track(rows: ArrayLike | None) -> Track | None:
     """Rows of (time, values ...) in order of time; rows that are not finite or repeat a time are left out."""
     table = np.array(rows, np.float64)
     if table.ndim != 2 or not len(table):

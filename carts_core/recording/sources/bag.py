@@ -1,7 +1,6 @@
 """ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that speak CRTK."""
 
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,12 @@ import numpy as np
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
-from ..image_sources import BAG_SUFFIXES, decode_message, open_bag
+from ..image_sources import BAG_SUFFIXES, Bag, decode_message
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, camera_from_info, side_of
-from ..importing.columns import order_of_names, strange_names
+from ..importing.columns import order_of_names, rows_of, strange_names
 from ..importing.found import FoundCamera, FoundRecording, Note, recording_name
 from ..importing.logs import ArmLog, arm_from_log, track
-from .bag_messages import header_time, messages, raw_messages, stamp_of, values_of
 from .ecm import read_endoscope
 from .protocol import Source
 from .separate_images import separate_images
@@ -33,11 +31,9 @@ _ROLES = {
     "position_cartesian_local_current": "local_poses",
     "tool_type": "tool",
 }
+_KINDS = {"joints": "joints", "jaw": "jaw", "tool": "text"}
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-_EXACT_BYTES = 2**30
-"""In bags up to this size every image message is read for the time in its header."""
-_SAMPLED = 20
 _PREFERRED = ("rect", "compressed", "")
 
 
@@ -45,31 +41,18 @@ def _detect(path: Path) -> bool:
     return (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
-@dataclass
-class _Rows:
-    """Rows of one arm, as they come out of the bag."""
-
-    joints: list[tuple[float, ...]] = field(default_factory=list)
-    jaw: list[tuple[float, ...]] = field(default_factory=list)
-    poses: list[tuple[float, ...]] = field(default_factory=list)
-    local_poses: list[tuple[float, ...]] = field(default_factory=list)
-    setup: list[tuple[float, ...]] = field(default_factory=list)
-    tool: str = ""
-    names: set[tuple[str, ...]] = field(default_factory=set)
-    """Of the joints, as messages have them."""
-
-
-def read_arm_logs(reader: Any, path: Path, options: ImportOptions, notes: list[Note]) -> list[ArmLog]:
+def read_arm_logs(bag: Bag, options: ImportOptions, notes: list[Note]) -> list[ArmLog]:
     """What a bag has logged of its arms, by the arms' names; notes say of joints in another order.
 
     Raises:
         SequenceError: a message is damaged, or an arm that was asked for is not there.
     """
-    wanted: dict[int, tuple[str, str]] = {}
+    wanted: dict[str, tuple[str, str]] = {}
     names = {recorded.casefold(): name for name, recorded in options.arms.items()}
     seen: set[str] = set()
-    for connection in reader.connections:
-        match = _ARM_TOPIC.match(connection.topic)
+    arms: set[str] = set()
+    for topic, _ in bag.topics:
+        match = _ARM_TOPIC.match(topic)
         role = _role(match) if match else None
         if match is None or role is None:
             continue
@@ -77,36 +60,24 @@ def read_arm_logs(reader: Any, path: Path, options: ImportOptions, notes: list[N
         seen.add(recorded)
         if options.arms and recorded.casefold() not in names:
             continue
-        wanted[connection.id] = (names.get(recorded.casefold(), recorded.upper()), role)
+        arm = names.get(recorded.casefold(), recorded.upper())
+        arms.add(arm)
+        wanted[topic] = (f"{arm} {role}", _KINDS.get(role, "pose"))
     if missing := [
         recorded for recorded in options.arms.values() if recorded.casefold() not in map(str.casefold, seen)
     ]:
-        raise SequenceError(f"{path} has no arm {missing[0]!r}. It has: {', '.join(sorted(seen)) or 'none'}.")
-    rows: dict[str, _Rows] = {}
-    connections = [connection for connection in reader.connections if connection.id in wanted]
-    for connection, bag_time, message in messages(reader, connections, path) if connections else ():
-        arm, role = wanted[connection.id]
-        entry = rows.setdefault(arm, _Rows())
-        if role == "tool":
-            entry.tool = str(message.data)
-        elif (values := values_of(message, role)) is not None:
-            if role == "joints":
-                entry.names.add(tuple(message.name))
-            getattr(entry, role).append((stamp_of(message, bag_time), *values))
-    for arm, entry in sorted(rows.items()):
-        notes += [note for names in sorted(entry.names) if (note := _note_on_names(arm, names)) is not None]
-    return [
-        ArmLog(
-            arm,
-            track(entry.joints),
-            track(entry.jaw),
-            track(entry.poses),
-            track(entry.local_poses),
-            track(entry.setup),
-            entry.tool,
-        )
-        for arm, entry in sorted(rows.items())
-    ]
+        raise SequenceError(f"{bag.path} has no arm {missing[0]!r}. It has: {', '.join(sorted(seen)) or 'none'}.")
+    found = bag.rows(wanted)
+    logs = []
+    for arm in sorted(arms):
+        logged = {role: found[f"{arm} {role}"] for role in {*_ROLES.values(), "setup"} if f"{arm} {role}" in found}
+        names = sorted({tuple(names) for names, _ in logged.get("joints", ())})
+        notes += [note for each in names if (note := _note_on_names(arm, each)) is not None]
+        tracks = {role: track(rows_of(rows, role, JOINT_NAMES)) for role, rows in logged.items() if role != "tool"}
+        given = [tracks.get(role) for role in ("joints", "jaw", "poses", "local_poses", "setup")]
+        if logged:
+            logs.append(ArmLog(arm, *given, tool=logged.get("tool", "")))
+    return logs
 
 
 def _note_on_names(arm: str, names: tuple[str, ...]) -> Note | None:
@@ -125,10 +96,13 @@ def _role(match: re.Match[str]) -> str | None:
     return _ROLES.get(match["rest"])
 
 
-def _image_topics(reader: Any, path: Path, options: ImportOptions) -> dict[str, str]:
+def _image_topics(bag: Bag) -> list[str]:
+    return list(dict.fromkeys(topic for topic, kind in bag.topics if kind in _IMAGE_TYPES))
+
+
+def _chosen_topics(bag: Bag, options: ImportOptions) -> dict[str, str]:
     """Camera -> topic."""
-    topics = [connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES]
-    topics = list(dict.fromkeys(topics))
+    path, topics = bag.path, _image_topics(bag)
     if options.images:
         for topic in options.images.values():
             if topic not in topics:
@@ -152,33 +126,9 @@ def _preference(topic: str) -> int:
     return next(rank for rank, word in enumerate(_PREFERRED) if word in topic)
 
 
-def _image_times(reader: Any, path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Record times [ns] and times [s] of a topic's images; without reading them where the bag has an index."""
-    connections = [connection for connection in reader.connections if connection.topic == topic]
-    indexes = [getattr(one, "indexes", None) for one in reader.readers]
-    size = sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
-    record: list[int] = []
-    stamps: list[int] = []
-    if size > _EXACT_BYTES and all(indexes):
-        record = sorted(
-            entry.time for index in indexes if index for connection in connections for entry in index[connection.id]
-        )
-    for count, (connection, time, raw) in enumerate(raw_messages(reader, connections, path)):
-        if record and count == _SAMPLED:
-            break
-        stamps.append(header_time(raw, connection, reader, time) - time)
-        if not record or count >= len(record):
-            record.append(time)
-    times = np.array(record, np.int64)
-    late = np.array(stamps, np.int64) if len(stamps) == len(times) else np.int64(np.median(stamps)) if stamps else 0
-    return times, (times + late) * 1e-9
-
-
-def _cameras(
-    reader: Any, path: Path, options: ImportOptions, notes: list[Note]
-) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
-    topics = _image_topics(reader, path, options)
-    times = {name: _image_times(reader, path, topic) for name, topic in topics.items()}
+def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
+    path, topics = bag.path, _chosen_topics(bag, options)
+    times = {name: bag.image_times(topic) for name, topic in topics.items()}
     for name, topic in topics.items():
         if not len(times[name][0]):
             raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one: --images {name} TOPIC.")
@@ -194,8 +144,9 @@ def _cameras(
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
             notes.append(Note("warning", f"images of {name} are up to {late:.3f} s from those of {leader}."))
-        info = _camera_info(reader, path, topics[name])
-        size = _size(reader, path, topics[name])
+        info = _camera_info(bag, topics[name])
+        first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
+        size = (first.shape[1], first.shape[0])
         numbers = record[chosen]
         found = camera_from_info(name, size, path, info, rectified="rect" in topics[name])
         cameras.append(calibration_of(found, options, notes, topic=topics[name], numbers=numbers))
@@ -203,44 +154,32 @@ def _cameras(
     return tuple(cameras), frame_times
 
 
-def _size(reader: Any, path: Path, topic: str) -> tuple[int, int]:
-    connections = [connection for connection in reader.connections if connection.topic == topic]
-    for _, _, message in messages(reader, connections, path):
-        image = decode_message(message, f"{path}, {topic}")
-        return image.shape[1], image.shape[0]
-    raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one with --images.")
-
-
-def _camera_info(reader: Any, path: Path, topic: str) -> Any:
+def _camera_info(bag: Bag, topic: str) -> Any:
     """The camera_info that belongs to an image topic: beside it, or of the same side; None without one."""
-    infos = [connection for connection in reader.connections if connection.msgtype == _INFO_TYPE]
+    infos = [info for info, kind in bag.topics if kind == _INFO_TYPE]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3)]
-    chosen = [info for parent in parents for info in infos if info.topic.rsplit("/", 1)[0] == parent]
+    chosen = [info for parent in parents for info in infos if info.rsplit("/", 1)[0] == parent]
     side = side_of(topic)
-    chosen += [info for info in infos if side is not None and side_of(info.topic) == side]
-    for _, _, message in messages(reader, chosen[:1], path) if chosen else ():
-        return message
-    return None
+    chosen += [info for info in infos if side is not None and side_of(info) == side]
+    return bag.message(chosen[0]) if chosen else None
 
 
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    reader = open_bag(path)
-    try:
-        if not reader.connections:
+    with Bag(path) as bag:
+        if not bag.topics:
             raise SequenceError(f"bag {path} has no messages. Record again, or copy it again.")
         notes: list[Note] = []
-        topics = [connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES]
-        beside = separate_images(path, topics, options, notes)
+        beside = separate_images(path, _image_topics(bag), options, notes)
         if beside is None:
             if options.frame_rate is not None:
                 raise SequenceError("--frame-rate is not used: the images of the bag have times. Leave it out.")
-            cameras, frame_times = _cameras(reader, path, options, notes)
+            cameras, frame_times = _cameras(bag, options, notes)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:
             cameras, frame_times, ids = beside.cameras, beside.times, beside.ids
-        logs = read_arm_logs(reader, path, options, notes)
+        logs = read_arm_logs(bag, options, notes)
         if not logs:
-            known = ", ".join(sorted(connection.topic for connection in reader.connections))
+            known = ", ".join(sorted(topic for topic, _ in bag.topics))
             raise SequenceError(
                 f"bag {path} has no kinematics of an arm (looked for /PSM1/measured_js, /PSM1/measured_cp and the "
                 f"names of dVRK 1.x). Its topics are: {known}."
@@ -250,9 +189,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         if offset is None:
             offset = 0.0 if beside is None else beside.offset(arms, notes)
         first = float(frame_times[0]) + offset if len(frame_times) else 0.0
-        motion = read_endoscope(reader, path, first, notes.append) if len(frame_times) else None
-    finally:
-        reader.close()
+        motion = read_endoscope(bag, first, notes.append) if len(frame_times) else None
     name = recording_name(path)
     return FoundRecording("a ROS bag", name, cameras, arms, ids, frame_times, tuple(notes), offset, motion)
 

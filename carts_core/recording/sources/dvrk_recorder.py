@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
-from ..image_sources import open_bag
+from ..image_sources import Bag
 from ..importing.alignment import nearest
 from ..importing.cameras import calibration_of, side_of
 from ..importing.columns import order_of_names
@@ -206,12 +206,9 @@ def _logs(
     bags = [each for each in sorted(path.iterdir()) if (each / "metadata.yaml").is_file()]
     bags += sorted(path.glob("*.mcap"))
     if bags:
-        reader = open_bag(bags[0])
-        try:
-            motion = read_endoscope(reader, bags[0], start, notes.append)
-            return read_arm_logs(reader, bags[0], options, notes), motion
-        finally:
-            reader.close()
+        with Bag(bags[0]) as bag:
+            motion = read_endoscope(bag, start, notes.append)
+            return read_arm_logs(bag, options, notes), motion
     return _extracted(path, options), None
 
 
