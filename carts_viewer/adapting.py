@@ -16,8 +16,6 @@ from carts_viewer.job_work import Progress
 
 OPTIONS: tuple[str, ...] = ()
 """Options of `carts train` besides the recording and the time."""
-LONGEST = 240
-"""Most time for a run [min]."""
 _POLL = 0.25
 """How often it is seen how training goes [s]."""
 _LONGEST_END = 30.0

@@ -6,11 +6,10 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_viewer import intents
-from carts_viewer.asker import Asker
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context
 from carts_viewer.handlers.exporting import Deliver, ExportingHandler
-from carts_viewer.handlers.jobs import JobsHandler
+from carts_viewer.handlers.jobs import Asker, JobsHandler
 from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.people import Person

@@ -39,7 +39,7 @@ _BEGINNING = (
     intents.RepeatJob,
 )
 """What ends a run here before it begins."""
-_COMMON = ("jobs", "solve", "export", "networks", "network")
+_COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
 """What of the background's state is for everybody."""
 WATCH_EVERY = 1.0
 """How often the project's file is checked while nothing is edited [s]."""

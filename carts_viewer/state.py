@@ -210,6 +210,10 @@ class ViewState:
     """Networks that can be chosen: that of the beginning, and those that were adapted to the recording."""
     network: str = ""
     """The one that runs."""
+    asked_network: str = ""
+    """The one that was chosen, and is not used before its weights are accepted; empty if there is none."""
+    problems: tuple[str, ...] = ()
+    """Damage of files beside the project, and what follows, for people."""
     unfamiliar: tuple[str, ...] = ()
     """What speaks against the network for these arms and images, for people."""
     jobs: tuple[Job, ...] = ()

@@ -4,20 +4,21 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
+import msgspec
 import numpy as np
 
 from ..export import KinematicsRow, outlined, read_kinematics_csv
 from ..export.kinematics import joint_columns, joint_units, position_values, std_values
 from ..files import OutputPath, holds_file, write_bytes, write_text
-from ..files.reading import IMAGE, VALUES, parse_json, read_bytes
+from ..files.reading import IMAGE, VALUES, parse_json, read_bytes, typed
 from ..recording import Sequence
 from .manifest import Job
 
 FILE = "findings.json"
-_FORMAT = "carts-findings/1"
+_FORMAT: Literal["carts-findings/1"] = "carts-findings/1"
 _WORST = 3
 """Frames of a job that are shown."""
 _WIDTH = 480
@@ -31,8 +32,9 @@ class FrameFinding:
     camera: str
     frame: str
     verdict: str
+    """`good`, `doubtful` or `failed`."""
     reason: str
-    probability: float
+    probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
     """That its mask is wrong [1]."""
     picture: str = ""
     """File in the job's folder; empty for frames that are not among the worst."""
@@ -52,17 +54,26 @@ class Findings:
     """`ARM in CAMERA` -> T_camera_base, calibrated where that was asked for [4 x 4, m]."""
 
 
+@dataclass(frozen=True)
+class _Written(Findings):
+    """Content of the file."""
+
+    format: Literal["carts-findings/1"] = _FORMAT
+
+
 def read_findings(folder: OutputPath) -> Findings | None:
-    """What the job of a folder found; None where that is missing or damaged."""
+    """What the job of a folder found; None before it has ended.
+
+    Raises:
+        OSError, ValueError: the file is damaged.
+    """
     path = folder / FILE
     if not holds_file(path):
         return None
-    try:
-        content = parse_json(read_bytes(path.path, VALUES))
-        frames = [FrameFinding(**frame) for frame in content.pop("frames")]
-        return Findings(frames=frames, **content) if content.pop("format") == _FORMAT else None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return None
+    found = typed(parse_json(read_bytes(path.path, VALUES)), _Written)
+    if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
+        raise ValueError("a base frame is no 4 x 4 matrix")
+    return found
 
 
 def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:

@@ -2,18 +2,21 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePath
+from typing import Literal
 
 from ..errors import SettingsError
 from ..files import OutputPath, check_name, write_text
-from ..files.reading import VALUES, parse_json, read_bytes
+from ..files.reading import VALUES, parse_json, read_bytes, typed
+from .findings import FILE as FINDINGS
 from .findings import Findings, read_findings
-from .manifest import STEPS, Job
+from .manifest import STEPS, Job, Step
 from .state import JobState, present_status
 
 FILE = "batch.json"
-_FORMAT = "carts-batch-jobs/1"
+_LONGEST_ERROR = 1000
+"""Characters."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, those that need somebody first."""
 
@@ -27,23 +30,30 @@ class KnownJob:
     """One of `ORDER`."""
     state: JobState
     findings: Findings | None
+    damage: str = ""
+    """Why its findings cannot be read, for people."""
 
     @property
     def error(self) -> str:
-        """The last line of why it failed; empty if it has not."""
+        """The last line of why it failed, or why its findings cannot be read; empty otherwise."""
         lines = self.state.error.strip().splitlines()
-        return lines[-1] if lines else ""
+        return lines[-1][:_LONGEST_ERROR] if lines else self.damage
 
 
 def known_jobs(batch: OutputPath, jobs: Sequence[Job]) -> list[KnownJob]:
     """What is known of jobs, in their order."""
-    known = []
-    for job in jobs:
-        place = batch / "jobs" / job.name
-        there = place.path.is_dir()
-        status, state = present_status(place) if there else ("waiting", JobState())
-        known.append(KnownJob(job, status, state, read_findings(place) if there else None))
-    return known
+    return [_known(batch / "jobs" / job.name, job) for job in jobs]
+
+
+def _known(folder: OutputPath, job: Job) -> KnownJob:
+    if not folder.path.is_dir():
+        return KnownJob(job, "waiting", JobState(), None)
+    status, state = present_status(folder)
+    try:
+        return KnownJob(job, status, state, read_findings(folder))
+    except (OSError, ValueError) as error:
+        damage = f"{FINDINGS} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to make it anew."
+        return KnownJob(job, status, state, None, damage)
 
 
 def most_urgent_first(known: Sequence[KnownJob]) -> list[KnownJob]:
@@ -51,19 +61,29 @@ def most_urgent_first(known: Sequence[KnownJob]) -> list[KnownJob]:
     return sorted(known, key=lambda entry: ORDER.index(entry.status))
 
 
+@dataclass(frozen=True)
+class _Row:
+    """A job in the file."""
+
+    name: str
+    recording: str
+    camera: str
+    domain: str
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Content of the file."""
+
+    format: Literal["carts-batch-jobs/1"]
+    jobs: list[_Row]
+
+
 def write_jobs(batch: OutputPath, jobs: Sequence[Job]) -> None:
     """Write which jobs a batch has, so that it can be looked at without its manifest."""
-    rows = [
-        {
-            "name": job.name,
-            "recording": str(job.recording.resolve()),
-            "camera": job.camera,
-            "domain": job.domain,
-            "steps": list(job.steps),
-        }
-        for job in jobs
-    ]
-    write_text(batch / FILE, json.dumps({"format": _FORMAT, "jobs": rows}, indent=1))
+    rows = [_Row(job.name, str(job.recording.resolve()), job.camera, job.domain, job.steps) for job in jobs]
+    write_text(batch / FILE, json.dumps(asdict(_Batch("carts-batch-jobs/1", rows)), indent=1))
 
 
 def is_batch(folder: Path) -> bool:
@@ -78,21 +98,19 @@ def read_jobs(folder: Path) -> list[Job]:
         SettingsError: it is no batch, or its list of jobs is damaged.
     """
     try:
-        content = parse_json(read_bytes(folder / FILE, VALUES))
-        if content["format"] != _FORMAT:
-            raise ValueError(f"its format is {content['format']!r}")
-        jobs = [_job(row) for row in content["jobs"]]
+        content = typed(parse_json(read_bytes(folder / FILE, VALUES)), _Batch)
+        jobs = [_job(row) for row in content.jobs]
         for job in jobs:
             check_name(job.name, f"a job of {folder}")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError) as error:
         raise SettingsError(
             f"{folder} is no batch that can be read: {error}. Name the folder that carts batch has written to."
         ) from error
     return jobs
 
 
-def _job(row: dict) -> Job:
-    name, recording, camera, domain = (str(row[key]) for key in ("name", "recording", "camera", "domain"))
-    if not PurePath(recording).is_absolute():
-        raise ValueError(f"the recording {recording!r} is no absolute path")
-    return Job(name, Path(recording), camera, domain, tuple(step for step in STEPS if step in row["steps"]), {})
+def _job(row: _Row) -> Job:
+    if not PurePath(row.recording).is_absolute():
+        raise ValueError(f"the recording {row.recording!r} is no absolute path")
+    steps: tuple[Step, ...] = tuple(step for step in STEPS if step in row.steps)
+    return Job(row.name, Path(row.recording), row.camera, row.domain, steps, {})

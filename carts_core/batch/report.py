@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..errors import CartsError
 from ..evaluation.calibration import pose_distance
 from ..files import OutputPath, output_stream, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
@@ -122,7 +123,7 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
     for number, (job, frame) in enumerate(frames[:_SHOWN], 1):
         try:
             picture = read_bytes((batch / "jobs" / job.name / frame.picture).path, IMAGE)
-        except OSError:
+        except (OSError, CartsError):
             continue
         name = f"worst-{number:02d}.jpg"
         write_bytes(folder / name, picture)

@@ -8,13 +8,15 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-from ..files import BusyError, OutputPath, holds_file, locked_folder, write_text
-from ..files.reading import VALUES, parse_json, read_bytes
+import msgspec
+
+from ..files import BusyError, OutputPath, holds_file, locked_folder, set_aside, write_text
+from ..files.reading import VALUES, parse_json, read_bytes, typed
 
 FILE = "job.json"
-_FORMAT = "carts-job/1"
+_FORMAT: Literal["carts-job/1"] = "carts-job/1"
 HEARTBEAT_SECONDS = 10.0
 """A running job says so this often."""
 
@@ -38,7 +40,7 @@ class JobState:
     status: Status = "waiting"
     steps: Mapping[str, StepState] = field(default_factory=dict)
     """Those that are done."""
-    attempts: int = 0
+    attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
     """How often it was begun since it was last done or failed; more than once where a worker was lost."""
     error: str = ""
     """Why it failed."""
@@ -48,19 +50,33 @@ class JobState:
     """When it was last known to run [s since 1970]."""
 
 
+@dataclass(frozen=True)
+class _Written(JobState):
+    """Content of the file."""
+
+    format: Literal["carts-job/1"] = _FORMAT
+
+
 def read_state(folder: OutputPath) -> JobState:
-    """What is known of the job of a folder; nothing where its file is missing or damaged."""
+    """What is known of the job of a folder; where its file is damaged, that it has failed by that."""
+    try:
+        return _read(folder)
+    except (OSError, ValueError) as error:
+        remedy = "Run the batch again: the job begins anew, and the damaged file is kept."
+        return JobState("failed", error=f"{FILE} cannot be read: {error}. {remedy}")
+
+
+def _read(folder: OutputPath) -> JobState:
+    """What is known of a job.
+
+    Raises:
+        OSError, ValueError: the file is damaged.
+    """
     path = folder / FILE
     if not holds_file(path):
         return JobState()
-    try:
-        content = parse_json(read_bytes(path.path, VALUES))
-        if content.pop("format") != _FORMAT:
-            return JobState()
-        steps = {name: StepState(**step) for name, step in content.pop("steps").items()}
-        return JobState(steps=steps, **content)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return JobState()
+    values = vars(typed(parse_json(read_bytes(path.path, VALUES)), _Written))
+    return JobState(**{name: value for name, value in values.items() if name != "format"})
 
 
 def write_state(folder: OutputPath, state: JobState) -> None:
@@ -86,7 +102,11 @@ class RunningJob:
 
     def __init__(self, folder: OutputPath) -> None:
         self._folder, self._changing = folder, threading.Lock()
-        self.state = read_state(folder)
+        try:
+            self.state = _read(folder)
+        except (OSError, ValueError):
+            set_aside(folder / FILE)
+            self.state = JobState()
 
     def change(self, **values: object) -> None:
         """Change what is known."""

@@ -13,13 +13,12 @@ import tyro
 
 from ..batch.engine import Outcome
 from ..batch.findings import FILE as FINDINGS
-from ..batch.findings import write_findings
+from ..batch.findings import read_findings, write_findings
 from ..batch.manifest import Job, Step
 from ..batch.state import RunningJob, StepState, running
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
-from ..files import OutputPath, remove_file, write_text
-from ..files.reading import is_regular
+from ..files import OutputPath, remove_file, set_aside, write_text
 from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
 from ..settings.inference import Inference
@@ -150,9 +149,18 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
             done += 1
         if step in ("import", "calibrate"):
             sequence = (folder / _FOLDERS[step] / "sequence.toml").path
-    if not is_regular((folder / FINDINGS).path):
+    if not _has_findings(folder):
         write_findings(job, folder, sequence)
     return done
+
+
+def _has_findings(folder: OutputPath) -> bool:
+    """Whether there are findings; damaged ones are set aside."""
+    try:
+        return read_findings(folder) is not None
+    except (OSError, ValueError):
+        set_aside(folder / FINDINGS)
+        return False
 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:

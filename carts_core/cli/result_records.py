@@ -11,6 +11,7 @@ from ..errors import SettingsError
 from ..export import KinematicsRow
 from ..export.kinematics import position_values, std_values
 from ..files import OutputPath, holds_file
+from ..files.reading import TABLE, parse_json, read_bytes, typed
 from ..fingerprints import fingerprint
 from ..model.scene import Scene
 from ..optimization import Assessment
@@ -69,12 +70,12 @@ def read_records(path: OutputPath) -> dict[str, Record]:
     if not holds_file(path):
         return {}
     try:
-        content = json.loads(path.path.read_bytes())
+        content = parse_json(read_bytes(path.path, TABLE), finite=False)
         if content["format"] != _FORMAT:
             raise SettingsError(
                 f"{path} has the format {content['format']!r}; this version knows {_FORMAT}. Use the version that "
                 "wrote it, or name another folder with --output."
             )
-        return {str(frame_id): Record(**record) for frame_id, record in content["frames"].items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return typed(content["frames"], dict[str, Record])
+    except (OSError, ValueError, TypeError, KeyError):
         return {}

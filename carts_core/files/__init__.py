@@ -25,6 +25,7 @@ from .writing import append_line as append_line
 from .writing import holds_file as holds_file
 from .writing import output_stream as output_stream
 from .writing import remove_file as remove_file
+from .writing import set_aside as set_aside
 from .writing import write_bytes as write_bytes
 from .writing import write_new as write_new
 from .writing import write_text as write_text

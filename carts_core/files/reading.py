@@ -14,11 +14,15 @@ import tomllib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
+
+import msgspec
 
 from ..errors import CartsError
 from ..extras import needs_extra
 from ..wording import shortened
+
+T = TypeVar("T")
 
 MIB = 2**20
 GIB = 2**30
@@ -235,6 +239,24 @@ def parse_ini(text: str) -> configparser.ConfigParser:
     return parser
 
 
+def typed(value: Any, kind: type[T]) -> T:
+    """Value from `parse_json` or `parse_toml` as a dataclass, or another type, with all of its fields checked.
+
+    Raises:
+        ValueError: a field is missing or of another type; the message names it.
+    """
+    try:
+        return msgspec.convert(value, kind, dec_hook=_path)
+    except (msgspec.ValidationError, OverflowError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _path(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"Expected `{kind.__name__}`, got `{type(value).__name__}`")
+
+
 def all_finite(root: Any) -> bool:
     """Whether every number in what `parse_toml` or `parse_json` gave is finite."""
     if isinstance(root, dict):
@@ -258,12 +280,13 @@ def check_path(path: str | Path) -> None:
         raise ValueError(f"a name is longer than {LARGEST_NAME} bytes, or the path longer than {LARGEST_PATH}")
 
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{LARGEST_DEPTH}}}")
 
 
 def _check_values(root: Any) -> None:
-    """Check depth and whole numbers; goes level by level, so depth costs no stack."""
+    """Check depth, whole numbers and texts; goes level by level, so depth costs no stack."""
     level = [root]
     for _ in range(LARGEST_DEPTH + 1):
         deeper: list[Any] = []
@@ -275,6 +298,8 @@ def _check_values(root: Any) -> None:
                 deeper += value
             elif isinstance(value, int) and abs(value) > LARGEST_WHOLE_NUMBER:
                 raise ValueError("a whole number has more than 64 bits")
+            elif isinstance(value, str) and not value.isascii() and _SURROGATE.search(value):
+                raise ValueError("a text has half of a surrogate pair, which is no character")
         if not deeper:
             return
         level = deeper

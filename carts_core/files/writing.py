@@ -1,5 +1,6 @@
 """Files that are there whole or not at all, on disk when they are there, and never written through a link."""
 
+import itertools
 import os
 import secrets
 import stat
@@ -134,6 +135,24 @@ def remove_file(path: OutputPath | Path) -> None:
                 os.fsync(folder)
         except FileNotFoundError:
             return
+
+
+def set_aside(path: OutputPath | Path) -> Path:
+    """Rename a damaged file to `NAME.damaged-1`, or the next number that is free, so that it is not replaced.
+
+    Returns:
+        Its new path.
+
+    Raises:
+        OutputError: it cannot be renamed.
+    """
+    output = as_output(path)
+    with explained(output), opened_folder(output.parent) as folder:
+        numbered = (f"{output.name}.damaged-{number}" for number in itertools.count(1))
+        free = next(name for name in numbered if status(folder, name) is None)
+        os.rename(output.name, free, src_dir_fd=folder, dst_dir_fd=folder)
+        os.fsync(folder)
+    return output.path.with_name(free)
 
 
 def holds_file(path: OutputPath | Path) -> bool:

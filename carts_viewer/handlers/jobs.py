@@ -2,31 +2,55 @@
 
 import time
 from collections.abc import Generator
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, replace
 from functools import singledispatchmethod
 from typing import Any
 
 from carts_core.errors import CartsError
-from carts_core.export import FORMATS
 from carts_core.project import frames_in
 from carts_core.project.queries import UNREVIEWED
 from carts_viewer import intents
-from carts_viewer.adapting import LONGEST, adapt
-from carts_viewer.asker import Asker
+from carts_viewer.adapting import adapt
 from carts_viewer.checks import unknown
+from carts_viewer.companions import Decisions
 from carts_viewer.context import Context, OpenRun
 from carts_viewer.finding import found
 from carts_viewer.handlers.exporting import ExportingHandler
 from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.job_work import Progress, calibrate, optimize_frames
-from carts_viewer.jobs import Job, JobList, JobState
+from carts_viewer.jobs import (
+    AdaptOptions,
+    CalibrateOptions,
+    Job,
+    JobList,
+    JobState,
+    OptimizeOptions,
+    Options,
+    SolveOptions,
+)
 from carts_viewer.networks import Networks
+from carts_viewer.people import Person
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.solved import Comparison
 from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
 """How often it is written down how far a job is [s]."""
+_CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
+"""Fields of a tab's state that a job depends on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asker:
+    """Person who has asked for a job, and the state of their tab then."""
+
+    person: Person
+    state: ViewState
+
+    def choose(self, context: Context) -> None:
+        """Have a job run with these choices, in this person's name."""
+        context.session.editor.person = self.person
+        context.change(**{name: getattr(self.state, name) for name in _CHOICES})
 
 
 class JobsHandler:
@@ -46,7 +70,14 @@ class JobsHandler:
         self._propagating, self._exporting = propagating, exporting
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         project = context.session.editor.project
-        self._list = JobList(project.path, kept=project.writable)
+        decisions, identity = Decisions(), project.state.identity
+        self._list = JobList(
+            project.path,
+            kept=project.writable,
+            frame_ids=identity.frame_ids,
+            recording=identity.kinematics_sha256,
+            decisions=decisions,
+        )
         self._asker: Asker | None = None
         """Who asks for what is queued now."""
         self._asked: dict[int, Asker] = {}
@@ -54,7 +85,7 @@ class JobsHandler:
         self._work: Generator[Progress] | None = None
         self._wait = 0.0
         self._saved_at = 0.0
-        self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers)
+        self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers, decisions=decisions)
         self._publish()
 
     def ask(self, intent: intents.Intent, asker: Asker) -> None:
@@ -73,45 +104,53 @@ class JobsHandler:
 
     def wait_time(self) -> float | None:
         """0 while there is something to do; None when there is not."""
-        return self._wait if any(not job.over for job in self._list.jobs) else None
+        active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
+        return self._wait if active else None
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     @handle.register
     def _(self, intent: intents.Solve) -> None:
-        state, title = self._choices, "Solve all frames" if intent.whole else "Solve between keyframes"
-        options = {**asdict(intent), "at": state.index}
-        if state.range is not None:
-            options["range"] = list(state.range)
-            title = f"Solve {'' if intent.whole else 'between keyframes, '}frames {self._from_to(state.range)}"
-        self._queue("solve", title, options)
+        state = self._choices
+        self._queue("solve", {**asdict(intent), "at": state.index, "range": state.range})
 
     @handle.register
     def _(self, intent: intents.Export) -> None:
-        label = FORMATS[intent.format].label if intent.format in FORMATS else str(intent.format)
-        part = "" if intent.range is None else f", frames {self._from_to(intent.range)}"
-        self._queue("export", f"Export {intent.frames.lower()} as {label}{part}", asdict(intent))
+        self._queue("export", asdict(intent))
 
     @handle.register
     def _(self, intent: intents.OptimizeFrames) -> None:
-        frames = self._frames(intent.frames)
-        self._queue("optimize", f"Optimize {len(frames)} frames, each alone", {"frames": frames})
+        self._queue("optimize", {"frames": self._frames(intent.frames)})
 
     @handle.register
     def _(self, intent: intents.Calibrate) -> None:
-        self._queue("calibrate", f"Calibrate on {intent.frames} frames", {"frames": int(intent.frames)})
+        self._queue("calibrate", asdict(intent))
 
     @handle.register
     def _(self, intent: intents.Adapt) -> None:
-        minutes = min(max(int(intent.minutes), 1), LONGEST)
         if not self._context.session.editor.project.writable:
             raise CartsError("The project is read-only here, so no network can be kept beside it.")
-        options = {"minutes": minutes, "folder": self._networks.next_number()}
-        self._queue("adapt", f"Adapt the network to this recording, {minutes} minutes at most", options)
+        self._queue("adapt", {**asdict(intent), "folder": self._networks.next_number()})
 
     @handle.register
     def _(self, intent: intents.UseNetwork) -> None:
         self._networks.use(intent.name)
+        self._publish()
+
+    @handle.register
+    def _(self, intent: intents.AnswerNetwork) -> None:
+        try:
+            self._networks.answer(intent.accepted)
+        finally:
+            self._publish()
+
+    @handle.register
+    def _(self, intent: intents.AnswerJobs) -> None:
+        for job in self._list.jobs:
+            if job.state is JobState.ASKED and intent.accepted:
+                self._list.accept(job.number, self._safe_options(job))
+            elif job.state is JobState.ASKED:
+                self._end(job, JobState.CANCELLED, "Discarded; it did not run.")
         self._publish()
 
     @handle.register
@@ -127,11 +166,10 @@ class JobsHandler:
         job = self._list.find(intent.number)
         if not job.over:
             raise CartsError("This job has not ended yet.")
-        first = job.done if job.kind == "optimize" and job.state is not JobState.DONE else 0
-        options = {**job.options, "first": first}
-        if job.kind == "adapt" and job.state is JobState.DONE:
-            options["folder"] = self._networks.next_number()
-        self._queue(job.kind, job.title, options)
+        options = self._safe_options(job)
+        if isinstance(options, OptimizeOptions):
+            options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
+        self._queue(job.kind, asdict(options))
 
     @handle.register
     def _(self, intent: intents.ForgetJobs) -> None:
@@ -173,14 +211,21 @@ class JobsHandler:
             self._work.close()
         self._list.save()
 
-    def _queue(self, kind: str, title: str, options: dict[str, Any]) -> None:
-        job = self._list.add(kind, title, options)
+    def _queue(self, kind: str, values: dict[str, Any]) -> None:
+        job = self._list.add(kind, values)
         if self._asker is not None:
             self._asked[job.number] = self._asker
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
-            # At once, so that whoever asked for what cannot be learns it now.
+            # At once, so that an error of what was asked for is shown now.
             self._begin(job)
         self._publish()
+
+    def _safe_options(self, job: Job) -> Options:
+        """Options to run a job again: a training goes on only in a folder of this user's own that is not finished."""
+        own = self._list.is_own(job) and job.state is not JobState.DONE
+        if isinstance(job.options, AdaptOptions) and not own:
+            return replace(job.options, folder=self._networks.next_number())
+        return job.options
 
     def _begin(self, job: Job) -> None:
         self._list.change(job.number, "begun", state=JobState.RUNNING, began=time.time())
@@ -188,29 +233,28 @@ class JobsHandler:
         if asker is not None:
             asker.choose(self._context)
         try:
-            if job.kind == "solve":
-                self._propagating.solve(bool(job.options.get("whole")), int(job.options.get("at", 0)), job.frames)
-            elif job.kind == "export":
-                names = {field.name for field in fields(intents.Export)} & set(job.options)
-                self._exporting.handle(intents.Export(**{name: job.options[name] for name in names}))
-            else:
-                self._open_run.end("Stopped: a job was started")
-                self._work = self._own(job)
+            match job.options:
+                case SolveOptions() as options:
+                    self._propagating.solve(options.whole, options.at, job.frames)
+                case intents.Export() as export:
+                    self._exporting.handle(export)
+                case _:
+                    self._open_run.end("Stopped: a job was started")
+                    self._work = self._own(job.options)
         except Exception as error:
             self._end(job, JobState.FAILED, str(error))
             raise
         self._publish()
 
-    def _own(self, job: Job) -> Generator[Progress]:
-        if job.kind == "optimize":
-            frames = [index for index in job.options["frames"] if 0 <= index < len(self._context.session.sequence)]
-            return optimize_frames(self._context, self._comparison, frames, int(job.options.get("first", 0)))
-        if job.kind == "calibrate":
-            return calibrate(self._context, self._optimizers, int(job.options["frames"]))
-        if job.kind == "adapt":
-            folder, minutes = self._networks.folder(int(job.options["folder"])), float(job.options["minutes"])
-            return adapt(self._context.session.sequence.path, folder, minutes)
-        raise CartsError(f"There is no job of the kind {job.kind!r}.")
+    def _own(self, options: OptimizeOptions | CalibrateOptions | AdaptOptions) -> Generator[Progress]:
+        match options:
+            case OptimizeOptions():
+                return optimize_frames(self._context, self._comparison, options.frames, options.first)
+            case CalibrateOptions():
+                return calibrate(self._context, self._optimizers, options.frames)
+            case AdaptOptions():
+                folder = self._networks.folder(options.folder)
+                return adapt(self._context.session.sequence.path, folder, options.minutes)
 
     def _follow(self, job: Job) -> None:
         state = self._context.state
@@ -266,6 +310,8 @@ class JobsHandler:
     def _end(self, job: Job, state: JobState, text: str) -> None:
         self._wait = 0.0
         self._networks.look()
+        if isinstance(job.options, AdaptOptions) and job.state is JobState.RUNNING:
+            self._networks.trained(job.options.folder)
         done = {"done": job.total} if state is JobState.DONE and job.total else {}
         self._list.change(job.number, f"{state}: {text}", state=state, text=text, ended=time.time(), **done)
         self._context.change(busy=None)
@@ -289,12 +335,16 @@ class JobsHandler:
             raise CartsError("There is no such frame. Choose others.")
         return frames
 
-    def _from_to(self, ends: tuple[int, int]) -> str:
-        return " to ".join(self._context.session.sequence.frame_ids[index] for index in ends)
-
     @property
     def _choices(self) -> ViewState:
         return self._context.state if self._asker is None else self._asker.state
 
     def _publish(self) -> None:
-        self._context.change(jobs=self._list.jobs, networks=self._networks.names, network=self._networks.used)
+        networks = self._networks
+        self._context.change(
+            jobs=self._list.jobs,
+            networks=networks.names,
+            network=networks.used,
+            asked_network=networks.asked,
+            problems=tuple(filter(None, (self._list.problem, networks.problem))),
+        )

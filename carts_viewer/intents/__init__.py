@@ -54,6 +54,8 @@ from .finding import SetFilter as SetFilter
 from .finding import ShowFound as ShowFound
 from .importing import ImportMasks as ImportMasks
 from .jobs import Adapt as Adapt
+from .jobs import AnswerJobs as AnswerJobs
+from .jobs import AnswerNetwork as AnswerNetwork
 from .jobs import Calibrate as Calibrate
 from .jobs import CancelJob as CancelJob
 from .jobs import ForgetJobs as ForgetJobs

@@ -5,7 +5,6 @@ from typing import Literal
 
 from carts_viewer.intents.base import Intent
 
-JobKind = Literal["optimize", "solve", "calibrate", "adapt", "export"]
 Frames = Literal["found", "unreviewed", "range", "all"]
 
 
@@ -44,6 +43,20 @@ class UseNetwork(Jobs):
 
     name: str
     """One of `ViewState.networks`."""
+
+
+@dataclass(frozen=True)
+class AnswerNetwork(Jobs):
+    """Accept or refuse the weights that are asked for (`ViewState.asked_network`)."""
+
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class AnswerJobs(Jobs):
+    """Run or discard all jobs that are asked for (`JobState.ASKED`)."""
+
+    accepted: bool
 
 
 @dataclass(frozen=True)

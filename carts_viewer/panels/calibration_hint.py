@@ -59,7 +59,8 @@ class CalibrationHint:
 
 def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
     """The calibration that waits or runs, or that has ended and no other job has followed."""
-    found = (job for job in reversed(jobs) if job.kind == "calibrate" and (not job.over or job is jobs[-1]))
+    shown = [job for job in jobs if job.state is not JobState.ASKED]
+    found = (job for job in reversed(shown) if job.kind == "calibrate" and (not job.over or job is shown[-1]))
     return next(found, None)
 
 

@@ -80,6 +80,10 @@ HINTS = {
     "Reject all": "Reject every frame that was found, as one step of undo",
     "Reset all": "Make every frame that was found unreviewed, as one step of undo",
     # Jobs
+    "Run jobs": "Run the jobs that another user, or another computer, has queued",
+    "Discard jobs": "Cancel these jobs; nothing of them runs",
+    "Accept network": "Use these weights now, and whenever they are chosen again",
+    "Refuse network": "Do not use these weights",
     "Which frames": "What the job works on",
     "Optimize each alone": "Run on each of these frames from where it is; what would fit worse is not taken",
     "Calibrate": "Fit base frames, or what is ticked under Free parameters, to these frames together. All masks "

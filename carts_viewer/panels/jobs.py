@@ -6,7 +6,7 @@ import viser
 
 from carts_core.wording import spoken_time
 from carts_viewer import intents
-from carts_viewer.jobs import Job, JobState
+from carts_viewer.jobs import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
 from carts_viewer.networks import STARTED
 from carts_viewer.panels.calibration_hint import newest_calibration
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
@@ -15,6 +15,8 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"
+_LISTED = 5
+"""Jobs that a question names."""
 _UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
 _FRAMES = {_UNREVIEWED: "unreviewed", "Found (Review, Find)": "found", _RANGE: "range", "All": "all"}
 
@@ -26,6 +28,14 @@ class JobsPanel:
         gui = page.gui
         self._numbers: dict[str, int] = {}
         self._ranged = False
+        self._asked = gui.add_html("", visible=False)
+        self._run = gui.add_button("Run jobs", icon=viser.Icon.CHECK, color="teal", visible=False)
+        self._discard = gui.add_button("Discard jobs", icon=viser.Icon.X, color="gray", visible=False)
+        page.row(self._run, self._discard)
+        self._asked_network = gui.add_html("", visible=False)
+        self._accept = gui.add_button("Accept network", icon=viser.Icon.CHECK, color="teal", visible=False)
+        self._refuse = gui.add_button("Refuse network", icon=viser.Icon.X, color="gray", visible=False)
+        page.row(self._accept, self._refuse)
         with gui.add_folder("New job"):
             self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
             optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
@@ -33,13 +43,18 @@ class JobsPanel:
                 "Calibrate on [frames]",
                 intents.Calibrate().frames,
                 min=1,
-                max=500,
+                max=LARGEST_CALIBRATION,
                 step=1,
                 hint="Spread evenly over the whole sequence, whatever the range",
             )
             calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
             self._minutes = gui.add_number(
-                "Adapt for [min]", 15, min=1, max=240, step=1, hint="At most; it ends when it no longer gains"
+                "Adapt for [min]",
+                intents.Adapt().minutes,
+                min=1,
+                max=LONGEST_TRAINING,
+                step=1,
+                hint="At most; it ends when it no longer gains",
             )
             adapt = gui.add_button(
                 "Adapt the network",
@@ -65,6 +80,10 @@ class JobsPanel:
             self._forget = gui.add_button("Clear ended", color="gray")
             page.row(self._cancel, self._again)
             self._log = gui.add_html("")
+        on_click(self._run, lambda _: intents.AnswerJobs(True), emit)
+        on_click(self._discard, lambda _: intents.AnswerJobs(False), emit)
+        on_click(self._accept, lambda _: intents.AnswerNetwork(True), emit)
+        on_click(self._refuse, lambda _: intents.AnswerNetwork(False), emit)
         on_click(optimize, lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")), emit)  # type: ignore[arg-type]
         on_click(calibrate, lambda _: intents.Calibrate(int(self._count.value)), emit)
         on_click(adapt, lambda _: intents.Adapt(int(self._minutes.value)), emit)
@@ -79,6 +98,8 @@ class JobsPanel:
     def show(self, state: ViewState) -> None:
         """Bring the list up to date; the newest job is chosen when it comes."""
         self._show_networks(state)
+        self._show_question(self._asked, jobs_question(state), self._run, self._discard)
+        self._show_question(self._asked_network, network_question(state), self._accept, self._refuse)
         self._follow_range(state)
         calibration = newest_calibration(state.jobs)
         self._solve.label = whole_label(state)
@@ -102,6 +123,12 @@ class JobsPanel:
         lines = "<br>".join(escaped(line) for line in (job.log[-12:] if job else ()))
         self._log.content = f'<p class="carts-caption carts-log" role="log">{lines}</p>'
 
+    @staticmethod
+    def _show_question(text: viser.GuiHtmlHandle, question: str, *buttons: viser.GuiButtonHandle) -> None:
+        text.content = f'<p class="carts-notice" role="status">{escaped(question)}</p>'
+        for handle in (text, *buttons):
+            handle.visible = bool(question)
+
     def _follow_range(self, state: ViewState) -> None:
         """A range that is chosen is chosen here, too, and one that is dropped is not."""
         ranged = state.range is not None
@@ -120,6 +147,28 @@ class JobsPanel:
 
     def _number(self) -> int:
         return self._numbers.get(self._chosen.value, -1)
+
+
+def jobs_question(state: ViewState) -> str:
+    """Question about jobs of another user, as text; empty without any."""
+    titles = [job.title for job in state.jobs if job.state is JobState.ASKED]
+    if not titles:
+        return ""
+    shown = "; ".join(titles[:_LISTED]) + (f"; and {len(titles) - _LISTED} more" if len(titles) > _LISTED else "")
+    return (
+        f"Jobs in the list beside this project were not queued by you on this computer, so they do not run: {shown}. "
+        "Run or discard them."
+    )
+
+
+def network_question(state: ViewState) -> str:
+    """Question about a network of another user, as text; empty without one."""
+    if not state.asked_network:
+        return ""
+    return (
+        f"The network {state.asked_network!r} beside this project was not trained or accepted by you on this computer, "
+        f"so the network {state.network!r} is used. Accept it if you trust its author."
+    )
 
 
 def job_line(job: Job, now: float) -> str:

@@ -4,6 +4,7 @@ import viser
 
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.jobs import jobs_question, network_question
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
 from carts_viewer.transport.tab_page import TabPage
@@ -29,7 +30,10 @@ class SavedPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the line and the buttons up to date."""
-        path, notice = self._storage.project.path, self._storage.notice
+        path = self._storage.project.path
+        asked = jobs_question(state) or network_question(state)
+        decide = "Jobs or a network of another user wait for your decision: see Jobs." if asked else None
+        notice = " ".join(filter(None, (self._storage.notice, *state.problems, decide))) or None
         if notice != self._noticed:
             self._noticed = notice
             self._notice.visible = notice is not None

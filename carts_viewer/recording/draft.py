@@ -4,20 +4,21 @@ import json
 import secrets
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import remove_file, write_text
-from carts_core.files.reading import SETTINGS, VALUES, parse_json, read_text
+from carts_core.files.reading import SETTINGS, VALUES, parse_json, read_text, typed
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.place import data_dir
 from carts_core.settings.importing import ImportOptions
 
 _FORMAT = "carts-draft/1"
-_PATHS = ("calibration", "base")
+_LONGEST_NAME = 200
+"""Characters."""
 
 
 class Step(StrEnum):
@@ -65,17 +66,7 @@ class Draft:
             plain = parse_json(text)
             if plain.pop("format") != _FORMAT:
                 raise ValueError("it is of another version")
-            options = plain.pop("options")
-            for name in _PATHS:
-                options[name] = {key: Path(value) for key, value in options.get(name, {}).items()}
-            if options.get("kinematics") is not None:
-                options["kinematics"] = Path(options["kinematics"])
-            options["flip"] = tuple(options.get("flip", ()))
-            points = tuple(ImagePoint(**{**each, "pixel": tuple(each["pixel"])}) for each in plain.pop("points"))
-            known = {entry.name for entry in fields(Draft)}
-            rest = {name: value for name, value in plain.items() if name in known}
-            step = Step(rest.pop("step"))
-            return Draft(step=step, options=ImportOptions(**options), points=points, **rest)
+            return typed(plain, Draft)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
 
@@ -134,7 +125,7 @@ def drafts() -> list[DraftSummary]:
     for path in _folder().glob("*.json"):
         try:
             plain = parse_json(read_text(path, SETTINGS))
-            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)
+            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_LONGEST_NAME]
             found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
         except (CartsError, OSError, ValueError, AttributeError):
             found.append(DraftSummary(path.stem, "a damaged import", time.time()))

@@ -1,29 +1,32 @@
 """Recently opened sequences, with a small picture and the progress of their review."""
 
 import json
-import math
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Annotated
 
 import cv2
+import msgspec
 import numpy as np
 
 from carts_core.errors import CartsError
 from carts_core.files import write_bytes, write_text
-from carts_core.files.reading import TABLE, read_bytes, read_text
+from carts_core.files.reading import TABLE, is_regular, parse_json, read_bytes, read_text, typed
 from carts_core.project import ProjectState, ReviewState, read_state
 from carts_core.project.companions import LOG, beside
 from carts_core.project.place import data_dir
 from carts_viewer.app import ViewerApp
+from carts_viewer.companions import damage
 
 _KEPT = 24
 _WIDTH = 320
 """Of a thumbnail [px]."""
 _DONE = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
+_Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,12 @@ class RecentProject:
     name: str
     project: str
     """Path of its project."""
-    frames: int
-    reviewed: int
+    frames: _Count
+    reviewed: _Count
     """Frames that a person has accepted or rejected."""
-    corrected: int
+    corrected: _Count
     """Frames whose joints differ from the measured ones."""
-    changed: float
+    changed: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
     """When the project was changed or left last [s since 1970]."""
 
     @property
@@ -52,11 +55,29 @@ class RecentProject:
 def recent_projects() -> list[RecentProject]:
     """Those whose sequence files are still there, the newest first; none where the list cannot be read."""
     try:
-        rows = json.loads(read_text(_list(), TABLE))
-        found = [RecentProject(**row) for row in rows if isinstance(row, dict)]
-        known = [each for each in found if _plausible(each)]
-        return [each for each in known if Path(each.sequence).is_file()]
-    except (CartsError, OSError, ValueError, TypeError, RecursionError):
+        return [each for each in _read() if is_regular(Path(each.sequence))]
+    except (OSError, ValueError):
+        return []
+
+
+def set_damaged_aside() -> str:
+    """Set the list aside where it is damaged; what happened, for people, or an empty text."""
+    try:
+        _read()
+    except (OSError, ValueError) as error:
+        return damage(_list(), "list of recent recordings", error, "A new list was begun")
+    return ""
+
+
+def _read() -> list[RecentProject]:
+    """The list.
+
+    Raises:
+        OSError, ValueError: it is damaged.
+    """
+    try:
+        return typed(parse_json(read_text(_list(), TABLE)), list[RecentProject])
+    except FileNotFoundError:
         return []
 
 
@@ -93,7 +114,7 @@ def _changed(path: Path) -> float:
     """When a file was changed last [s since 1970]; 0 where there is none."""
     try:
         return path.stat().st_mtime
-    except OSError:
+    except (OSError, ValueError):
         return 0.0
 
 
@@ -138,16 +159,8 @@ def _picture(app: ViewerApp) -> bytes | None:
 
 
 def _write(projects: Iterable[RecentProject]) -> None:
+    set_damaged_aside()
     write_text(_list(), json.dumps([asdict(each) for each in projects][:_KEPT], indent=1))
-
-
-def _plausible(project: RecentProject) -> bool:
-    """Whether what the list says has the right types; others may have written it."""
-    texts = (project.sequence, project.name, project.project)
-    numbers = (project.frames, project.reviewed, project.corrected, project.changed)
-    return all(isinstance(text, str) for text in texts) and all(
-        isinstance(number, int | float) and math.isfinite(number) and number >= 0 for number in numbers
-    )
 
 
 def _folder() -> Path:

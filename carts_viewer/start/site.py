@@ -223,5 +223,7 @@ class Site:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            except Exception:
+            except Exception as error:
                 _log.exception("The page met an unexpected error")
+                with suppress(Exception):
+                    self.show_start(f"{type(error).__name__}: {error}")

@@ -11,7 +11,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer.recording.draft import DraftSummary, delete_draft, drafts
 from carts_viewer.start.browser import FileBrowser
 from carts_viewer.start.host import Host
-from carts_viewer.start.recent import RecentProject, forget, recent_projects, thumbnail, up_to_date
+from carts_viewer.start.recent import RecentProject, forget, recent_projects, set_damaged_aside, thumbnail, up_to_date
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import button, escaped
 
@@ -23,7 +23,7 @@ class StartPage:
 
     def __init__(self, site: Host, problem: str = "") -> None:
         self._site = site
-        self._problem = problem
+        self._problem = problem or set_damaged_aside()
         self._browser: FileBrowser | None = None
 
     def show(self) -> None:

@@ -20,7 +20,8 @@ from carts_core.recording import Sequence
 from carts_core.resources import shipped_weights
 from carts_viewer import adapting, intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs import Job, JobState
+from carts_viewer.companions import Decisions
+from carts_viewer.jobs import AdaptOptions, Job, JobState
 from carts_viewer.networks import STARTED, Networks
 from carts_viewer.running import OptimizerFactory
 
@@ -43,6 +44,12 @@ def at_desk(tiny_sequence: Callable[..., Path]) -> Desk:
     """A desk with the shipped networks."""
     sequence = Sequence.open(tiny_sequence(frames=2))
     return Desk(sequence, Project.open(sequence), OptimizerFactory(inference="torch", report=lambda line: None))
+
+
+def networks(project: Path, factory: OptimizerFactory | None = None, *, kept: bool = True) -> Networks:
+    """The networks of a project, as a new viewer finds them."""
+    factory = factory or OptimizerFactory(inference="torch", report=lambda line: None)
+    return Networks(project, kept=kept, optimizers=factory, decisions=Decisions())
 
 
 def ended(desk: Desk) -> Job:
@@ -75,18 +82,68 @@ def test_a_job_adapts_the_network_and_what_it_made_is_used_and_remembered(at_des
     assert before != after
     project = at_desk.session.editor.project.path
     again = OptimizerFactory(inference="torch", report=lambda line: None)
-    assert Networks(project, kept=True, optimizers=again).used == "Adapted 1" and again.prepare().sha256 == after
+    assert networks(project, again).used == "Adapted 1" and again.prepare().sha256 == after
     # Weights of the command line count more, and weights that are damaged are not used.
     given = OptimizerFactory(weights=(shipped_weights()[1],), inference="torch", report=lambda line: None)
-    assert Networks(project, kept=True, optimizers=given).used == STARTED
+    assert networks(project, given).used == STARTED
     (folder / "surface.safetensors").write_bytes(b"nothing")
-    assert Networks(project, kept=True, optimizers=again).used == STARTED
+    assert networks(project, again).used == STARTED
+    at_desk.do(intents.UseNetwork("Adapted 1"))
     with pytest.raises(CartsError, match=r"surface\.safetensors"):
-        at_desk.do(intents.UseNetwork("Adapted 1"))
+        at_desk.do(intents.AnswerNetwork(True))
     assert at_desk.do(intents.UseNetwork(STARTED)).network == STARTED
     assert at_desk.factory.prepare().sha256 == before
     with pytest.raises(CartsError, match=r"no network '\.\./\.\./else'"):
         at_desk.do(intents.UseNetwork("../../else"))
+
+
+@pytest.fixture
+def planted(tmp_path: Path) -> Path:
+    """A project with a network that another user has made and chosen."""
+    folder = tmp_path / "work_adapted_1"
+    folder.mkdir()
+    (folder / "surface.safetensors").write_bytes(shipped_weights()[1].read_bytes())
+    (tmp_path / "work_network.json").write_text('{"network": "Adapted 1"}')
+    return tmp_path / "work.carts"
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_weights_of_another_user_are_asked_for_once_a_file(
+    planted: Path, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = networks(planted, kept=kept)
+    assert (first.used, first.asked) == (STARTED, "Adapted 1")
+    first.answer(True)
+    assert (first.used, first.asked) == ("Adapted 1", "")
+    with pytest.raises(CartsError, match="No network waits"):
+        first.answer(True)
+    again = networks(planted, kept=kept)
+    assert (again.used, again.asked) == ("Adapted 1", "")
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "other user"))
+    other = networks(planted, kept=kept)
+    assert (other.used, other.asked) == (STARTED, "Adapted 1")
+    other.answer(False)
+    refused = networks(planted, kept=kept)
+    assert (refused.used, refused.asked) == (STARTED, "")
+    refused.use("Adapted 1")
+    assert (refused.used, refused.asked) == (STARTED, "Adapted 1")
+
+
+def test_weights_that_were_replaced_are_asked_for_again(planted: Path) -> None:
+    first = networks(planted)
+    first.answer(True)
+    planted.with_name("work_adapted_1").joinpath("surface.safetensors").write_bytes(b"others")
+    again = networks(planted)
+    assert (again.used, again.asked) == (STARTED, "Adapted 1")
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"network": 1}', '{"network": null}', "{}", "[" * 100])
+def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path, content: str) -> None:
+    file = planted.with_name("work_network.json")
+    file.write_text(content)
+    found = networks(planted)
+    assert (found.used, found.asked) == (STARTED, "") and "choice of a network work_network.json" in found.problem
+    assert file.with_name("work_network.json.damaged-1").read_text() == content and not file.exists()
 
 
 def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
@@ -115,9 +172,9 @@ def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
     monkeypatch.setattr(adapting, "OPTIONS", tuple(SMALL))
     at_desk.do(intents.RepeatJob(1))
     job = ended(at_desk)
-    assert job.state is JobState.DONE and job.options["folder"] == 1
+    assert job.state is JobState.DONE and job.options == AdaptOptions(1, 1)
     at_desk.do(intents.RepeatJob(2))
-    assert at_desk.state.jobs[-1].options["folder"] == 2
+    assert at_desk.state.jobs[-1].options == AdaptOptions(1, 2)
     at_desk.do(intents.CancelJob(3))
 
 

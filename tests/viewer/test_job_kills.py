@@ -11,8 +11,9 @@ import job_victim
 import pytest
 import viewer_victim
 
-from carts_core.project import Project
+from carts_core.project import Project, SequenceIdentity
 from carts_core.recording import Sequence
+from carts_viewer.companions import Decisions
 from carts_viewer.jobs import JobList, JobState
 
 FRAMES = 4
@@ -83,7 +84,15 @@ class JobLives:
 
     def _check(self) -> None:
         """The list as the next viewer will read it, the project, and what was exported."""
-        jobs = {job.number: job for job in JobList(self._project, kept=True).jobs}
+        identity = SequenceIdentity.of(self._sequence)
+        kept = JobList(
+            self._project,
+            kept=True,
+            frame_ids=identity.frame_ids,
+            recording=identity.kinematics_sha256,
+            decisions=Decisions(),
+        )
+        jobs = {job.number: job for job in kept.jobs}
         newest = sorted(self._known)[-40:]
         for number in newest:
             assert number in jobs, f"job {number} is gone"

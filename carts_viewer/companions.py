@@ -1,0 +1,80 @@
+"""Files beside a recording that the viewer reads: which content this user has accepted, and damaged files.
+
+Recordings are shared and copied, so a file beside one may be of another user. Each decision is a file in `decisions/`
+of the user's data folder, named by the SHA-256 digest of the content that was accepted or refused.
+"""
+
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+
+from carts_core.errors import CartsError
+from carts_core.files import OutputPath, output_path, remove_file, set_aside, write_text
+from carts_core.files.reading import Kind, read_text
+from carts_core.project.place import data_dir
+
+_FILE = Kind("decision", 64)
+_LONGEST_CAUSE = 300
+"""Characters."""
+_ACCEPTED, _REFUSED = "accepted", "refused"
+
+
+class Decisions:
+    """Contents that this user has made, accepted or refused; only in memory where the data folder cannot be written."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, bool] = {}
+
+    def find(self, content: bytes) -> bool | None:
+        """Whether content was accepted; None where nothing was decided."""
+        digest = _digest(content)
+        if digest in self._made:
+            return self._made[digest]
+        try:
+            return {_ACCEPTED: True, _REFUSED: False}.get(read_text(_path(digest).path, _FILE))
+        except (OSError, ValueError):
+            return None
+
+    def make(self, content: bytes, accepted: bool) -> None:
+        """Accept or refuse content."""
+        digest = _digest(content)
+        self._made[digest] = accepted
+        with suppress(CartsError):
+            write_text(_path(digest), _ACCEPTED if accepted else _REFUSED)
+
+    def forget(self, content: bytes) -> None:
+        """Remove a decision."""
+        digest = _digest(content)
+        self._made.pop(digest, None)
+        with suppress(CartsError):
+            remove_file(_path(digest))
+
+
+def _digest(content: bytes) -> str:
+    return sha256(content).hexdigest()
+
+
+def _path(digest: str) -> OutputPath:
+    return output_path(data_dir(), "decisions", digest)
+
+
+def damage(path: Path, what: str, error: Exception, effect: str, *, writable: bool = True) -> str:
+    """Set a damaged file aside, and describe the damage.
+
+    Args:
+        path: of the file.
+        what: kind of file, such as "list of jobs".
+        error: why it cannot be read.
+        effect: what happens instead, a sentence without its full stop.
+        writable: whether the file may be renamed.
+
+    Returns:
+        Cause, effect and new name, for people.
+    """
+    kept = "The file was left as it is"
+    if writable:
+        try:
+            kept = f"The damaged file is kept as {set_aside(path).name}"
+        except CartsError as failed:
+            kept = f"The damaged file could not be renamed: {failed}"
+    return f"The {what} {path.name} cannot be read: {str(error)[:_LONGEST_CAUSE]}. {effect}. {kept}."
