@@ -88,9 +88,9 @@ def up_to_date(project: RecentProject) -> RecentProject:
         ProjectError: the project cannot be read.
     """
     path = Path(project.project)
-    stamp = _changed(path), _changed(beside(path, LOG))
-    if not stamp[0]:
+    if not is_regular(path):
         return replace(project, reviewed=0, corrected=0)
+    stamp = _changed(path), _changed(beside(path, LOG))
     # A project that nothing has written to since it was left here is not read again.
     if max(stamp) <= project.changed:
         return project
@@ -114,7 +114,7 @@ def _changed(path: Path) -> float:
     """When a file was changed last [s since 1970]; 0 where there is none."""
     try:
         return path.stat().st_mtime
-    except (OSError, ValueError):
+    except OSError:
         return 0.0
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 
 from carts_core.errors import CartsError
+from carts_core.files.reading import is_regular
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer.recording.draft import DraftSummary, delete_draft, drafts
@@ -57,7 +58,7 @@ class StartPage:
                 return self._site.open_sample()
             case "recent" if value in (known := {project.sequence: project.project for project in recent_projects()}):
                 own = Path(known[value])
-                return self._site.open_sequence(Path(value), project=own if own.is_file() else None)
+                return self._site.open_sequence(Path(value), project=own if is_regular(own) else None)
             case "forget":
                 forget(value)
             case "open":

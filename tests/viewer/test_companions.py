@@ -187,6 +187,7 @@ class World:
         self._count = 0
         folder.mkdir()
         self.site = Site([folder], port=0, weights=(weights,))
+        self.site.wait(120)
 
     def opened(self, case: Case) -> str:
         """Why a case is not as it must be; empty if it is."""
