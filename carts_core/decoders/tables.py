@@ -78,13 +78,26 @@ def read_matlab(path: Path) -> dict[str, Any]:
     from scipy.io import loadmat  # noqa: PLC0415
 
     content = read_bytes(path, CALIBRATION)
+    if content.startswith(b"MATLAB 7.3"):
+        raise ValueError("it is a MATLAB file of version 7.3; save it with save(FILE, NAME, '-v7')")
     try:
         variables = loadmat(io.BytesIO(content), simplify_cells=True)
     except MemoryError:
         raise
     except Exception as error:  # scipy raises whatever its readers meet
         raise ValueError(f"it is no MATLAB file of version 5 ({error})") from error
+    names = [_name_of_object(name, value) for name, value in variables.items()]
+    if name := next(filter(None, names), ""):
+        raise ValueError(f"{name} is an object of MATLAB; save a struct of it: s = toStruct({name}); save(FILE, 's')")
     return {name: value for name, value in variables.items() if not name.startswith("__")}
+
+
+def _name_of_object(name: str, value: Any) -> str:
+    """Name of a variable that is an object (MCOS), whose content is in a workspace of MATLAB's own; else empty."""
+    if getattr(value, "dtype", None) is not None and value.dtype.names and "s0" in value.dtype.names:
+        found = value["s0"].reshape(-1)[0]
+        return found.decode("ascii", "replace") if isinstance(found, bytes) else str(found)
+    return "stereoParams" if name in ("None", "__function_workspace__") else ""
 
 
 def check_cells(count: int) -> None:

@@ -56,7 +56,13 @@ SETTINGS = Kind("settings file", MIB)
 ROBOT = Kind("URDF", 16 * MIB)
 MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
+_POINTER = b"version https://git-lfs"
+"""How a pointer of Git LFS begins, which stands for a file that was not fetched."""
+_LARGEST_POINTER = 1024
+"""[bytes]"""
+_POINTER_TEXT = "it is a Git LFS pointer, and its content was not fetched; run `git lfs pull` in its repository"
 BAG = Kind("ROS bag", 1024 * GIB)
+VIDEO = Kind("video", 1024 * GIB)
 CACHED = Kind("cached mesh", 256 * MIB)
 
 
@@ -94,6 +100,8 @@ def open_regular(path: Path, kind: Kind) -> BinaryIO:
             raise RefusedFileError("it is no regular file but a pipe, socket or device; only files are read")
         if status.st_size > kind.limit:
             raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
+        if status.st_size <= _LARGEST_POINTER and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
+            raise RefusedFileError(_POINTER_TEXT)
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)

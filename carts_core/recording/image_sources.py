@@ -110,6 +110,10 @@ class Bag:
         try:
             return self._decoder.call(function, self.path, *arguments, limits=self._limits)
         except (OSError, ValueError) as error:
+            if self.path.is_file() and (self.path.parent / "metadata.yaml").is_file():
+                folder = self.path.parent
+                text = f"bag {self.path} is one file of the ROS 2 bag {folder}, which describes it. Give the folder."
+                raise SequenceError(text) from error
             raise SequenceError(
                 f"bag {self.path} cannot be read ({error}). It is damaged, was cut off, or is no ROS bag: copy it "
                 "again, or have ROS index it anew (rosbag reindex, ros2 bag reindex)."

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..files.image_size import LARGEST_IMAGE, pixels_problem
-from ..files.reading import MIB, is_regular
+from ..files.reading import MIB, VIDEO, check_regular, is_regular
 
 _EXACT = ("mp4", "matroska")
 """Containers that give every frame its presentation time and find it again."""
@@ -73,6 +73,10 @@ def index_video(path: Path) -> VideoIndex:
         ) from error
     if not is_regular(path):
         raise SequenceError(f"video {path} is a folder, pipe or device. Name a video file.")
+    try:
+        check_regular(path, VIDEO)
+    except OSError as error:
+        raise SequenceError(f"video {path} cannot be read: {error}.") from error
     return _index(path.resolve(), status.st_mtime_ns, status.st_size)
 
 

@@ -1,6 +1,7 @@
 """What a person can say about a recording; everything else is found or guessed, and each guess is shown."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,8 @@ class ImportOptions:
     """Camera -> its images: a folder, pattern or video, or a topic of the bag."""
     calibration: Mapping[str, Path] = field(default_factory=dict)
     """Camera -> its calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
+    calibration_size: Mapping[str, str] = field(default_factory=dict)
+    """Camera -> size of the images that were calibrated, as 640x480, where the calibration does not state it."""
     kinematics: Path | None = None
     """Table of joint positions or tip poses (CSV, Parquet, NPY); `none` for images alone."""
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -57,6 +60,9 @@ class ImportOptions:
     """Axes of the camera in these files, where the file does not say."""
 
     def __post_init__(self) -> None:
+        for camera, size in self.calibration_size.items():
+            if not re.fullmatch(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}", size):
+                raise SettingsError(f"calibration_size of {camera} is {size!r}; give width and height, as 640x480.")
         for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate)):
             if value is not None and not math.isfinite(value):
                 raise SettingsError(f"{name} is {value}; give a finite number.")

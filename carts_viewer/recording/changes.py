@@ -39,6 +39,10 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         return _new_import(draft.with_options(**{name: value or None}))
     if name in _NUMBERS:
         return _new_import(draft.with_options(**{name: _number(value)}))
+    if kind == "calibration_size" and which:
+        others = {camera: size for camera, size in draft.options.calibration_size.items() if camera != which}
+        given = value.replace(" ", "").replace("×", "x")
+        return _new_import(draft.with_options(calibration_size={**others, which: given} if given else others))
     if kind == "flip" and which in JOINT_NAMES:
         without = tuple(joint for joint in draft.options.flip if joint != which)
         return _new_import(draft.with_options(flip=(*without, which) if value == "1" else without))

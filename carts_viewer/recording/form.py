@@ -35,6 +35,8 @@ def check_form(
     left = "".join(_camera(draft, guess, camera, pictures.get(camera.name, [])) for camera in cameras)
     if not cameras:
         left = "".join(_named_images(draft, guess, camera) for camera in draft.options.images)
+        wrong_lenses = [part.partition(" ")[2] for part in guess.problems if part.startswith("calibration ")]
+        left += "".join(_wrong_lens(draft, guess, camera) for camera in wrong_lenses)
     wrong = _problem(guess, "images") + _problem(guess, "calibration")
     left = f"<section><h2>Cameras</h2>{wrong}{left}{_add_camera(guess)}</section>"
     return f'{head}<div class="columns">{left}{_kinematics(draft, guess, delay)}</div>'
@@ -57,6 +59,7 @@ def _camera(draft: Draft, guess: Guess, camera: FoundCamera, pictures: list[tupl
         f"<p class='quiet-text'><code>{escaped(camera.images)}</code> · {camera.size[0]} × {camera.size[1]}<br>"
         f"Lens: {escaped(lens)}{'' if file is None else f' ({escaped(file.name)})'}</p>"
         f"<div class='bar'>{change}{_remove(draft, name)}</div>"
+        f"{_lens_size(draft, name) if name in draft.options.calibration_size else ''}"
         f"{_problem(guess, f'images {name}')}{_problem(guess, f'calibration {name}')}{_notes(guess, name)}"
     )
 
@@ -76,6 +79,20 @@ def _named_images(draft: Draft, guess: Guess, camera: str) -> str:
         f"<div class='bar'>{_change(f'images {camera}', 'Other images …', guess)}{_remove(draft, camera)}</div>"
         f"{_problem(guess, f'images {camera}')}"
     )
+
+
+def _wrong_lens(draft: Draft, guess: Guess, camera: str) -> str:
+    """A camera whose calibration cannot be used: another file, or the size of the images that it is for."""
+    return (
+        f"<h3>{escaped(camera)}</h3>{_problem(guess, f'calibration {camera}')}"
+        f"<div class='bar'>{_change(f'calibration {camera}', 'Calibration file …', guess)}</div>{_lens_size(draft, camera)}"
+    )
+
+
+def _lens_size(draft: Draft, camera: str) -> str:
+    size = draft.options.calibration_size.get(camera, "")
+    field = text_field(f"calibration_size {camera}", size, hint="640x480")
+    return f"<div class='bar'>Size of the calibrated images, width x height [px] {field}</div>"
 
 
 def _remove(draft: Draft, camera: str) -> str:

@@ -1,5 +1,6 @@
 """What a draft's files hold, as far as they can be read, with each problem where it is."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -97,6 +98,8 @@ def _place_of(message: str, options: ImportOptions) -> str:
     for camera, path in options.calibration.items():
         if str(path) in message:
             return f"calibration {camera}"
+    if (camera := re.search(r"--calibration (.+?) FILE", message)) is not None:
+        return f"calibration {camera[1]}"
     if options.kinematics is not None and options.kinematics.name in message:
         return "columns" if "column" in message else "kinematics"
     for word, place in (

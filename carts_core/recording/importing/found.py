@@ -43,8 +43,12 @@ class FoundCamera:
     """Where the first pixel's centre is in these: 0 in OpenCV's convention, 0.5 in ours."""
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients."""
-    T_camera_world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """[m]"""
+    T_camera_world: Float[np.ndarray, "4 4"] | None = None
+    """[m]; None where not known. The world is the frame of the first camera."""
+    rectification: Float[np.ndarray, "3 3"] | None = None
+    """R of ROS: from the camera's frame to the common one of a rectified pair."""
+    projection: Float[np.ndarray, "3 4"] | None = None
+    """P of ROS [px], whose last column has the baseline."""
     masks: str = ""
     """Pattern of its masks, below `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False

@@ -12,6 +12,13 @@ from .found import FoundRecording
 from .placing import completed
 from .writing import write_sequence
 
+_UNFINISHED = {
+    ".bag.active": "the recorder did not close it. Run `rosbag reindex` on a copy that is called .bag, and give that.",
+    ".mcap.zstd": "it is compressed as a whole. Unpack it with `zstd -d`, and give what comes out.",
+    ".db3.zstd": "it is one file of a bag. Give the folder with its metadata.yaml.",
+}
+"""Ends of names of bags that need another program first."""
+
 
 def detect(path: Path, name: str | None = None) -> Source:
     """The kind of a recording.
@@ -31,6 +38,9 @@ def detect(path: Path, name: str | None = None) -> Source:
             if source.name == name:
                 return source
         raise SequenceError(f"--source {name!r} is not known. Known are:\n{kinds}")
+    for suffix, remedy in _UNFINISHED.items():
+        if path.name.lower().endswith(suffix):
+            raise SequenceError(f"{path} ends with {suffix}: {remedy}")
     for source in SOURCES:
         if source.detect(path):
             return source
@@ -93,6 +103,7 @@ def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
         ("robot", options.robot, arms or ["PSM1"]),
         ("base", options.base, arms),
         ("calibration", options.calibration, cameras),
+        ("calibration-size", options.calibration_size, cameras),
     ):
         if unknown := [name for name in given if name not in known]:
             kind = "camera" if known is cameras else "arm"

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
 from ...wording import counted
+from .cameras import check_intrinsics, placed_cameras
 from .found import FoundArm, FoundCamera, FoundRecording, Note
 from .joint_units import check_limits
 from .views import check_in_view, check_pair, tips_of
@@ -39,7 +40,11 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
         raise SequenceError(f"{recording.name}: there are no frames ({recording.kind}). Name other images.")
     notes = list(recording.notes)
     recording = _frames_with_kinematics(recording, notes.append)
+    for camera in recording.cameras:
+        if camera.intrinsics is not None:
+            check_intrinsics(camera, options, notes.append)
     cameras = tuple(_with_intrinsics(camera, notes.append) for camera in recording.cameras)
+    cameras = placed_cameras(cameras, notes.append)
     if options.time_offset is not None and all(arm.times is None for arm in recording.arms):
         raise SequenceError(
             f"{recording.name}: --time-offset needs times, and rows are matched with images without any. Give the "

@@ -75,7 +75,10 @@ def check_pair(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -
     by_name = {camera.name: camera for camera in cameras}
     if not {"left", "right"} <= set(by_name):
         return
-    T_right_left = by_name["right"].T_camera_world @ np.linalg.inv(by_name["left"].T_camera_world)
+    left, right = (by_name[side].T_camera_world for side in ("left", "right"))
+    if right is None:
+        return
+    T_right_left = right if left is None else right @ np.linalg.inv(left)
     if T_right_left[0, 3] > abs(T_right_left[1, 3]):
         distance = 1e3 * float(T_right_left[0, 3])
         text = f"the right camera is {distance:.1f} mm at the left of the left one: left and right are swapped, or the"

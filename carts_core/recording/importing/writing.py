@@ -216,7 +216,8 @@ def _camera_lines(camera: FoundCamera, place: Path, moves: bool) -> list[str]:
         lines.append(f"masks = {_text(f'{parent}/{masks.name}')}")
         if camera.sparse_masks:
             lines.append("sparse_masks = true")
-    return [*lines, *_matrix("T_camera_world", camera.T_camera_world)]
+    pose = np.eye(4) if camera.T_camera_world is None else camera.T_camera_world
+    return [*lines, *_matrix("T_camera_world", pose)]
 
 
 def _matrix(key: str, values: np.ndarray | None) -> list[str]:

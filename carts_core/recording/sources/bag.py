@@ -148,7 +148,8 @@ def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])
         numbers = record[chosen]
-        found = camera_from_info(name, size, path, info, rectified="rect" in topics[name])
+        camera = FoundCamera(name, size, path)
+        found = camera_from_info(camera, info, options, notes, rectified="rect" in topics[name])
         cameras.append(calibration_of(found, options, notes, topic=topics[name], numbers=numbers))
         notes.append(Note("found", f"camera {name}: {topics[name]}, {len(record)} images, {size[0]} x {size[1]}."))
     return tuple(cameras), frame_times

@@ -1,5 +1,6 @@
 """Anything else: folders of images or videos, a table of kinematics, and calibration files, found by their names."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,11 @@ from .protocol import Source
 
 _DEPTH = 2
 _NOT_IMAGES = ("mask", "label", "segment", "ground_truth", "annot", "depth")
-_CALIBRATION_SUFFIXES = (".yaml", ".yml", ".mat", ".ini", ".json")
+_CALIBRATION_SUFFIXES = (".yaml", ".yml", ".mat", ".ini", ".json", ".xml")
+_CALIBRATION_WORDS = re.compile(
+    rb"camera_matrix|cameraMatrix|intrinsic|projection_parameters|[\"<]K[\">]|^K:|[\"<]?\bM1[\">:]|git-lfs",
+    re.MULTILINE,
+)
 _NO_TABLE = Path("none")
 """What `--kinematics` calls images without a table."""
 
@@ -114,9 +119,7 @@ def _looks_like_calibration(file: Path) -> bool:
             head = stream.read(20_000)
     except OSError:
         return False
-    return any(
-        word in head for word in (b"camera_matrix", b"intrinsics", b'"K"', b"\nK:", b"M1:", b'"M1"', b"cameraMatrix")
-    )
+    return _CALIBRATION_WORDS.search(head) is not None
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:

@@ -194,7 +194,7 @@ def test_a_truncated_bag_is_an_error_in_words_and_leaves_nothing(tmp_path, capsy
         (BagKind(info=lambda values: values.update(width=100, height=20)), {}, "another shape"),
         (BagKind(), {"robot": {"PSM1": "none.urdf"}}, "robot none.urdf of PSM1 is missing"),
         (BagKind(), {"base": {"PSM1": Path("none.json")}}, "none.json is missing"),
-        (BagKind(), {"calibration": {"left": Path("none.yaml")}}, "none.yaml of left is missing"),
+        (BagKind(), {"calibration": {"left": Path("none.yaml")}}, "calibration none.yaml is missing"),
     ],
 )
 def test_what_contradicts_or_is_missing_is_an_error_in_words(tmp_path, kind, options, message):

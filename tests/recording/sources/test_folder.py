@@ -23,6 +23,8 @@ FRAMES = 5
 ROS_YAML = f"""image_width: {SIZE[0]}
 image_height: {SIZE[1]}
 camera_name: left
+rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
+projection_matrix: {{rows: 3, cols: 4, data: [110, 0, 47.5, 0, 0, 110, 35.5, 0, 0, 0, 1, 0]}}
 camera_matrix: {{rows: 3, cols: 3, data: {K.reshape(-1).tolist()}}}
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.02, 0, 0, 0]}}
@@ -54,8 +56,7 @@ def lab(source: Path) -> Path:
     )
     (source / "left.yaml").write_text(ROS_YAML)
     (source / "right.yaml").write_text(
-        ROS_YAML.replace("left", "right")
-        + "projection_matrix: {rows: 3, cols: 4, data: [110, 0, 47.5, -0.55, 0, 110, 35.5, 0, 0, 0, 1, 0]}\n"
+        ROS_YAML.replace("left", "right").replace("[110, 0, 47.5, 0,", "[110, 0, 47.5, -0.55,")
     )
     return source
 

@@ -1,0 +1,334 @@
+"""Calibrations of other programs: ROS, OpenCV, Kalibr, camodocal, MATLAB, Bouguet's toolbox, the dVRK, JSON.
+
+Pixels count from 0 at the centre of the first one in what is returned, as in OpenCV; lengths are metres.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ...decoders.tables import read_matlab
+from ...errors import SequenceError
+from ...files.decoding import decoded
+from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_yaml, read_text
+from ...model.camera import DISTORTION_LENGTHS
+
+_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
+_PINHOLES = ("pinhole", "perspective", "")
+_KINDS = (
+    "ROS, OpenCV, Kalibr and camodocal YAML, OpenCV XML, JSON with K and distortion, MATLAB .mat, and .ini of the "
+    "dVRK's stereo calibration"
+)
+_MATRICES = ("camera_matrix", "K", "M", "cameraMatrix", "CameraMatrix", "intrinsic_matrix", "intrinsics", "mtx", "KK")
+_DISTORTIONS = ("distortion_coefficients", "distortion_coeffs", "distortion", "D", "distCoeffs", "dist_coeffs", "dist")
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("nx", "ny"), ("res_x", "res_y"))
+_PAIRS = ("imageSize", "image_size", "resolution", "img_size")
+_METRES_TO = 1.0
+"""[m] Longer baselines are millimetres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a file or message states of one camera."""
+
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy [px]; the first pixel's centre is at 0."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients."""
+    size: tuple[int, int] | None = None
+    """Width and height of the images it was made from [px]."""
+    T_right_left: Float[np.ndarray, "4 4"] | None = None
+    """[m] Of the right camera of a pair, where it is stated."""
+    R: Float[np.ndarray, "3 3"] | None = None
+    """Rectification: from the camera's frame to the pair's common one."""
+    P: Float[np.ndarray, "3 4"] | None = None
+    """Projection of the rectified camera [px], whose last column is -focal length * baseline [px m]."""
+    remarks: tuple[str, ...] = ()
+    """What was decided about the values, in sentences."""
+
+
+def read_calibration(path: Path, side: str) -> Calibration:
+    """The calibration of the left or right camera in a file.
+
+    Args:
+        path: of the file.
+        side: "left" or "right", which counts for files of a pair.
+
+    Raises:
+        SequenceError: the file is missing, damaged, of another camera model or of an unknown kind.
+    """
+    if not is_regular(path):
+        raise SequenceError(f"calibration {path} is missing. Correct the path.")
+    try:
+        suffix = path.suffix.lower()
+        if suffix == ".ini":
+            return _from_ini(path, side)
+        if suffix == ".mat":
+            return _from_matlab(decoded(read_matlab, path), side)
+        content = _content(path)
+        if not isinstance(content, dict):
+            raise ValueError("it holds no named values")
+        return _from_names(content, side)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise SequenceError(f"calibration {path} cannot be used: {error}. Known are: {_KINDS}.") from error
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else f"a value has another form ({error})"
+        raise SequenceError(f"calibration {path} cannot be used: {what}. Known are: {_KINDS}.") from error
+
+
+def calibration_from_info(info: Any) -> Calibration | None:
+    """The calibration of a `sensor_msgs/CameraInfo`; None of a camera that is not calibrated.
+
+    Raises:
+        ValueError: a distortion model that is not OpenCV's pinhole.
+    """
+
+    def numbers(name: str) -> np.ndarray:
+        return np.array(getattr(info, name.lower(), getattr(info, name, ())), np.float64).reshape(-1)
+
+    K = numbers("K")
+    if len(K) != 9 or K[0] == 0:
+        return None
+    check_model(str(info.distortion_model))
+    size = int(info.width), int(info.height)
+    found = _calibration(K, numbers("D"), size if min(size) > 0 else None)
+    return replace(found, R=_rotation(numbers("R")), P=_projection(numbers("P")))
+
+
+def check_model(model: str, camera_model: str = "") -> None:
+    """Check that a camera model is OpenCV's pinhole.
+
+    Raises:
+        ValueError: it is another one.
+    """
+    if camera_model.lower() not in _PINHOLES or model.lower() not in _MODELS:
+        wrong = camera_model.lower() not in _PINHOLES
+        given = f"camera model {camera_model!r}" if wrong else f"distortion model {model!r}"
+        raise ValueError(
+            f"it has the {given}; allowed are pinholes with plumb_bob or rational_polynomial (radtan in Kalibr). "
+            "Rectify the images, or calibrate them with such a model"
+        )
+
+
+def _content(path: Path) -> Any:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return parse_json(read_text(path, VALUES))
+    text = read_text(path, CALIBRATION)
+    if suffix == ".xml" or text.lstrip().startswith("<"):
+        return _opencv_xml(text)
+    # OpenCV's files begin with a directive that is not YAML, and tag their matrices.
+    return parse_yaml(re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", ""))
+
+
+def _opencv_xml(text: str) -> dict[str, Any]:
+    """The values of an XML file of OpenCV's FileStorage."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it declares a document type or entities")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no XML ({error})") from error
+    values: dict[str, Any] = {}
+    for entry in root:
+        data = entry.find("data")
+        content = entry.text if data is None else data.text
+        words = (content or "").split()
+        try:
+            numbers = [float(word) for word in words]
+            values[entry.tag] = numbers[0] if data is None and len(numbers) == 1 else numbers
+        except ValueError:
+            values[entry.tag] = " ".join(words)
+    return values
+
+
+def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
+    """ROS, OpenCV, Kalibr, camodocal and JSON, by the names of their values."""
+    if isinstance(kalibr := content.get("cam1" if side == "right" else "cam0"), dict):
+        return _from_kalibr(kalibr)
+    if isinstance(own := content.get(side), dict):
+        content = {**content, **own}
+    if content.get("fisheye_model") or content.get("fisheye"):
+        check_model("fisheye")
+    check_model(str(content.get("distortion_model") or ""), str(content.get("camera_model") or ""))
+    if "projection_parameters" in content:
+        return _from_camodocal(content)
+    suffixes = ("", "1" if side == "left" else "2", f"_{side}", "_l" if side == "left" else "_r", f"_{side[0].upper()}")
+    K, D = _first(content, _MATRICES, suffixes), _first(content, _DISTORTIONS, suffixes)
+    if K is None and (fc := _first(content, ("fc",), suffixes)) is not None:
+        # Bouguet's toolbox for MATLAB, whose pixels count from 0.
+        cc, D = _first(content, ("cc",), suffixes), _first(content, ("kc",), suffixes)
+        K = np.array([*fc.reshape(-1)[:2], *np.asarray(cc).reshape(-1)[:2]])
+    elif K is None and {"fx", "fy", "cx", "cy"} <= set(content):
+        K = np.array([content[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
+    if K is None:
+        raise ValueError(f"none of camera_matrix, K, M1, cam0 is in it; it has {', '.join(map(str, content))}")
+    found = _calibration(K, D, _size(content))
+    if side == "right":
+        found = _with_extrinsics(found, content)
+    R, P = (_first(content, (name,), suffixes) for name in ("rectification_matrix", "projection_matrix"))
+    return replace(found, R=_rotation(R), P=_projection(P))
+
+
+def _with_extrinsics(found: Calibration, content: Mapping[str, Any]) -> Calibration:
+    R, T = _first(content, ("R", "R_stereo"), ("",)), _first(content, ("T", "t", "T_stereo"), ("",))
+    if R is None and (om := _first(content, ("om",), ("",))) is not None and om.size == 3:
+        R = Rotation.from_rotvec(om.reshape(3)).as_matrix()
+    if R is None or T is None or R.size != 9 or T.size != 3:
+        return found
+    return _placed(found, R, T)
+
+
+def _placed(found: Calibration, R: np.ndarray, T: np.ndarray) -> Calibration:
+    """With a rotation and a translation in metres or, where it is longer than a metre, millimetres."""
+    pose = np.eye(4)
+    translation = np.asarray(T, np.float64).reshape(3)
+    distance = float(np.linalg.norm(translation))
+    in_mm = distance > _METRES_TO
+    pose[:3, :3] = np.asarray(R, np.float64).reshape(3, 3)
+    pose[:3, 3] = translation * (1e-3 if in_mm else 1.0)
+    remark = f"its translation of {distance:.4g} is taken as millimetres." if in_mm else ""
+    return replace(found, T_right_left=pose, remarks=(*found.remarks, *filter(None, [remark])))
+
+
+def _from_kalibr(content: Mapping[str, Any]) -> Calibration:
+    check_model(str(content.get("distortion_model") or ""), str(content.get("camera_model") or ""))
+    intrinsics = np.array(content["intrinsics"], np.float64)
+    if intrinsics.size != 4:
+        raise ValueError(f"its intrinsics have {intrinsics.size} numbers; a pinhole has fu, fv, pu, pv")
+    found = _calibration(intrinsics, np.array(content.get("distortion_coeffs", ()), np.float64), _size(content))
+    if "T_cn_cnm1" in content:
+        found = replace(found, T_right_left=np.array(content["T_cn_cnm1"], np.float64).reshape(4, 4))
+    return found
+
+
+def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
+    check_model("", str(content.get("model_type") or ""))
+    projection, distortion = content["projection_parameters"], content.get("distortion_parameters") or {}
+    K = np.array([projection[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
+    D = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2")], np.float64)
+    return _calibration(K, D, _size(content))
+
+
+def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
+    """With a matrix of 9 numbers, or fx, fy, cx, cy.
+
+    Raises:
+        ValueError: it is no matrix of a camera, or has another number of coefficients than OpenCV's models.
+    """
+    numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
+    if numbers.size == 9:
+        matrix = numbers.reshape(3, 3)
+        if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, 0] != 0 and matrix[2, 1] != 0:
+            matrix, remarks = matrix.T, ("its matrix is transposed, with the principal point in the last row.",)
+        if np.abs(matrix[[1, 2, 2], [0, 0, 1]]).max() > 1e-6 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > 1e-6:
+            raise ValueError(f"its matrix is {matrix.tolist()}, which is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
+            raise ValueError(f"its matrix has a skew of {matrix[0, 1]:g}; calibrate without skew")
+        numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if numbers.size != 4 or not np.isfinite(numbers).all():
+        raise ValueError(f"its matrix has {numbers.size} numbers; 9 finite ones are needed")
+    if min(numbers[:2]) <= 0:
+        raise ValueError(f"its focal lengths are {numbers[0]:g} and {numbers[1]:g} px, which must be positive")
+    coefficients = () if D is None else tuple(float(value) for value in np.asarray(D).reshape(-1))
+    if len(coefficients) not in DISTORTION_LENGTHS or not np.isfinite(coefficients).all():
+        allowed = ", ".join(map(str, DISTORTION_LENGTHS))
+        raise ValueError(
+            f"it has {len(coefficients)} distortion coefficients; allowed are {allowed}, k1 k2 p1 p2 k3 ..."
+        )
+    fx, fy, cx, cy = (float(value) for value in numbers)
+    return Calibration((fx, fy, cx, cy), coefficients, size, remarks=remarks)
+
+
+def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Width and height of the images; None where they are not stated."""
+    for wide, high in _SIZES:
+        if wide in content and high in content:
+            return int(float(content[wide])), int(float(content[high]))
+    for name in _PAIRS:
+        value = content.get(name)
+        if isinstance(value, list) and len(value) == 2:
+            return int(value[0]), int(value[1])
+    return None
+
+
+def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[str, ...]) -> np.ndarray | None:
+    for name in names:
+        for suffix in suffixes:
+            value = content.get(name + suffix)
+            if isinstance(value, dict):
+                value = value.get("data", [value[key] for key in ("fx", "fy", "cx", "cy") if key in value] or None)
+            if value is not None and not isinstance(value, str):
+                return np.array(value, np.float64)
+    return None
+
+
+def _rotation(values: np.ndarray | None) -> np.ndarray | None:
+    """A rectification, None where a camera has none (zeros)."""
+    if values is None or values.size != 9 or not np.abs(values).max() > 0:
+        return None
+    return values.reshape(3, 3)
+
+
+def _projection(values: np.ndarray | None) -> np.ndarray | None:
+    return None if values is None or values.size != 12 or not values.reshape(3, 4)[0, 0] > 0 else values.reshape(3, 4)
+
+
+def _from_ini(path: Path, side: str) -> Calibration:
+    """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are millimetres."""
+    parser = parse_ini(read_text(path, CALIBRATION))
+    section = parser["StereoRight" if side == "right" else "StereoLeft"]
+
+    def numbers(key: str, indices: range) -> list[float]:
+        return [float(section.get(f"{key}_{index}", "0")) for index in indices]
+
+    K = np.array([float(section[name]) for name in ("fc_x", "fc_y", "cc_x", "cc_y")])
+    found = _from_one(_calibration(K, np.array(numbers("kc", range(5))), _size(section)))
+    if side != "right":
+        return found
+    T = np.array(numbers("T", range(3))) * 1e-3
+    return replace(_placed(found, np.array(numbers("R", range(9))), T), remarks=found.remarks)
+
+
+def _from_matlab(content: Any, side: str) -> Calibration:
+    """Parameters as structs of MATLAB's toolbox, whose pixels count from 1, or plain matrices, which count from 0."""
+    while len(content) == 1 and isinstance(only := next(iter(content.values())), dict):
+        content = only
+    right = side == "right"
+    own = content.get("CameraParameters2" if right else "CameraParameters1", content)
+    if "MappingCoefficients" in own or "DistortionCenter" in own:
+        check_model("fisheye")
+    toolbox = {"IntrinsicMatrix", "RadialDistortion", "ImageSize", "TangentialDistortion"} & set(own)
+    if not toolbox:
+        return _from_names({name: _plain(value) for name, value in own.items()}, side)
+    K = np.asarray(own["K"], np.float64) if "K" in own else np.asarray(own["IntrinsicMatrix"], np.float64).T
+    radial = np.atleast_1d(np.asarray(own.get("RadialDistortion", [0, 0]), np.float64)).tolist() + [0.0] * 3
+    tangential = np.atleast_1d(np.asarray(own.get("TangentialDistortion", [0, 0]), np.float64)).tolist()
+    rows_columns = np.asarray(own.get("ImageSize", ())).reshape(-1)
+    size = (int(rows_columns[1]), int(rows_columns[0])) if rows_columns.size == 2 else None
+    D = np.array([radial[0], radial[1], tangential[0], tangential[1], radial[2]])
+    found = _from_one(_calibration(K, D, size))
+    if right and "RotationOfCamera2" in content:
+        T = np.asarray(content["TranslationOfCamera2"], np.float64) * 1e-3
+        return replace(_placed(found, np.asarray(content["RotationOfCamera2"]).T, T), remarks=found.remarks)
+    if right and isinstance(pose := content.get("PoseCamera2"), dict):
+        T = np.asarray(pose["Translation"], np.float64) * 1e-3
+        return replace(_placed(found, np.asarray(pose["R"]), T), remarks=found.remarks)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _from_one(found: Calibration) -> Calibration:
+    """MATLAB counts pixels from 1, OpenCV from 0."""
+    fx, fy, cx, cy = found.intrinsics
+    return replace(found, intrinsics=(fx, fy, cx - 1.0, cy - 1.0))
