@@ -18,6 +18,7 @@ from scipy.spatial.distance import pdist
 from trimesh.exchange.ply import export_ply
 
 from ..files import OutputPath, write_bytes, write_text
+from ..model.camera import HALF_PIXEL
 from ..model.scene import Arm, SceneState
 from ..rendering.geometry import link_transforms, vertices_in_camera
 from ..rendering.visibility_numba import rasterize
@@ -101,7 +102,8 @@ def _camera(dataset: Dataset, view: View) -> dict[str, Any]:
     fx, fy, cx, cy = state.intrinsics[row].double().tolist()
     T_view_world = state.T_view_world[row].double().numpy()
     return {
-        "cam_K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        # BOP's tools count pixels as OpenCV does, whose first pixel has its centre at 0.
+        "cam_K": [fx, 0.0, cx - HALF_PIXEL, 0.0, fy, cy - HALF_PIXEL, 0.0, 0.0, 1.0],
         "depth_scale": 1.0,
         "cam_R_w2c": T_view_world[:3, :3].ravel().tolist(),
         "cam_t_w2c": (_MM * T_view_world[:3, 3]).tolist(),

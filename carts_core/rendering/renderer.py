@@ -54,7 +54,8 @@ class Renderer:
         scene: arms, cameras and light.
         width, height: size of the rendered images [px], by default that of the first camera. The intrinsics of a
             state are those of the camera's own size and are scaled.
-        cameras: names of the cameras to render, all by default.
+        cameras: names of the cameras to render, in this order; all by default. States are of all cameras of the scene,
+            or of these alone where they are fewer.
         window: left, top, width and height [px] of the part of these images that is rendered, all of it by default.
         device: "cpu" (compiled visibility kernel) or a CUDA device (torch visibility).
     """
@@ -80,6 +81,7 @@ class Renderer:
         left, top, self.width, self.height = window or (0, 0, self.width, self.height)
         self._shift = torch.tensor([0, 0, left, top], dtype=torch.float32, device=device)
         self._indices = [scene.cameras.index(camera) for camera in self.scene.cameras]
+        self._count = len(scene.cameras)
 
     def __call__(self, state: SceneState) -> Rendering:
         """Render; gradients reach every tensor of the state."""
@@ -206,8 +208,8 @@ class Renderer:
 
     def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
         """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
-        if state.T_camera_world.shape[-3] != len(self._indices):
-            # A state of the whole scene is cut down to the cameras that are rendered.
+        if state.T_camera_world.shape[-3] == self._count and self._indices != list(range(self._count)):
+            # A state of the whole scene is cut down to the cameras that are rendered, in their order.
             state = SceneState(
                 state.joint_positions,
                 state.T_world_base,

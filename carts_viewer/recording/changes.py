@@ -33,25 +33,25 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         SettingsError: the value is not possible.
     """
     kind, _, which = name.partition(" ")
+    options: dict[str, Any] = {}
     if name in _CHOICES:
         if value and value not in _CHOICES[name]:
             raise SettingsError(f"{name} is {value!r}; allowed is {', '.join(_CHOICES[name])}.")
-        return _new_import(draft.with_options(**{name: value or None}))
-    if name in _NUMBERS:
-        return _new_import(draft.with_options(**{name: _number(value)}))
-    if kind == "calibration_size" and which:
+        options[name] = value or None
+    elif name in _NUMBERS:
+        options[name] = _number(value)
+    elif kind == "calibration_size" and which:
         others = {camera: size for camera, size in draft.options.calibration_size.items() if camera != which}
         given = value.replace(" ", "").replace("×", "x")
-        return _new_import(draft.with_options(calibration_size={**others, which: given} if given else others))
-    if kind == "flip" and which in JOINT_NAMES:
+        options[kind] = {**others, which: given} if given else others
+    elif kind == "flip" and which in JOINT_NAMES:
         without = tuple(joint for joint in draft.options.flip if joint != which)
-        return _new_import(draft.with_options(flip=(*without, which) if value == "1" else without))
-    if kind == "column" and which in _MEANINGS:
-        return _new_import(draft.with_options(columns=_columns(draft, which, value, guessed)))
-    if name == "remove-camera":
-        images = {camera: place for camera, place in draft.options.images.items() if camera != value}
-        return _new_import(draft.with_options(images=images))
-    return None
+        options[kind] = (*without, which) if value == "1" else without
+    elif kind == "column" and which in _MEANINGS:
+        options["columns"] = _columns(draft, which, value, guessed)
+    elif name == "remove-camera":
+        options["images"] = {camera: place for camera, place in draft.options.images.items() if camera != value}
+    return _new_import(draft.with_options(**options)) if options else None
 
 
 def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Draft:

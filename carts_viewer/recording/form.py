@@ -83,10 +83,9 @@ def _named_images(draft: Draft, guess: Guess, camera: str) -> str:
 
 def _wrong_lens(draft: Draft, guess: Guess, camera: str) -> str:
     """A camera whose calibration cannot be used: another file, or the size of the images that it is for."""
-    return (
-        f"<h3>{escaped(camera)}</h3>{_problem(guess, f'calibration {camera}')}"
-        f"<div class='bar'>{_change(f'calibration {camera}', 'Calibration file …', guess)}</div>{_lens_size(draft, camera)}"
-    )
+    part = f"calibration {camera}"
+    change = f"<div class='bar'>{_change(part, 'Calibration file …', guess)}</div>"
+    return f"<h3>{escaped(camera)}</h3>{_problem(guess, part)}{change}{_lens_size(draft, camera)}"
 
 
 def _lens_size(draft: Draft, camera: str) -> str:

@@ -11,6 +11,7 @@ from awkward import CAMERA, all_views
 from pycocotools.coco import COCO
 
 from carts_core.export import Dataset, export
+from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.keypoints import keypoints, project_keypoints
 
 
@@ -57,6 +58,7 @@ def test_bop_poses_put_the_models_where_the_masks_are(dataset: Dataset, tmp_path
     compared = 0
     for image, found in poses.items():
         K = np.array(cameras[image]["cam_K"]).reshape(3, 3)
+        np.testing.assert_allclose(K[:2, 2], camera.K[:2, 2] - HALF_PIXEL, rtol=1e-6)
         for number, (pose, counts) in enumerate(zip(found, seen[image], strict=True)):
             R, t = np.array(pose["cam_R_m2c"]).reshape(3, 3), np.array(pose["cam_t_m2c"])
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-5)
@@ -69,7 +71,7 @@ def test_bop_poses_put_the_models_where_the_masks_are(dataset: Dataset, tmp_path
             assert not (visible & ~whole).any()
             points = np.asarray(models[str(pose["obj_id"])].vertices) @ R.T + t
             pixels = points @ K.T
-            pixels = pixels[:, :2] / pixels[:, 2:]
+            pixels = pixels[:, :2] / pixels[:, 2:] + HALF_PIXEL
             inside = ((pixels >= 1) & (pixels < (camera.width - 1, camera.height - 1))).all(1) & (points[:, 2] > 1)
             # Every vertex in the image is projected onto the link's silhouette, or at most a pixel beside it.
             grown = cv2.dilate(whole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from carts_core.files.reading import Kind, RefusedFileError, parse_json, parse_t
 from carts_core.model.mesh_files import mesh_path, read_mesh
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
+from carts_core.recording.annotations.coco import read_coco
 from carts_core.recording.images import read_image
+from carts_core.recording.importing.foreign_tables import read_foreign_table
+from carts_core.recording.importing.importer import find
 from carts_core.recording.toml_table import read_toml
 from carts_core.recording.video_index import index_video
 
@@ -152,3 +156,31 @@ def test_an_image_of_no_known_kind_is_refused(tmp_path: Path):
     (tmp_path / "image.png").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes(4))
     with pytest.raises(SequenceError, match="must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"):
         read_image(tmp_path / "image.png")
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("recording.bag", find),
+        ("recording.mcap", find),
+        ("recording_0.db3", find),
+        ("image.png", read_image),
+        ("video.mp4", index_video),
+        ("weights.safetensors", read_weights),
+        ("robot.urdf", Robot.load),
+        ("mesh.stl", lambda path: read_mesh(path, np.ones(3), "a test")),
+        ("sequence.toml", read_toml),
+        ("table.csv", read_foreign_table),
+        ("table.parquet", read_foreign_table),
+        ("masks.json", lambda path: next(read_coco(path, Counter()))),
+    ],
+)
+def test_pointers_of_git_lfs_are_recognized_in_every_kind_of_file(
+    tmp_path: Path, name: str, read: Callable[[Path], object]
+):
+    (tmp_path / name).write_text(POINTER)
+    with pytest.raises(CartsError, match=r"a Git LFS pointer.*run `git lfs pull`"):
+        read(tmp_path / name)

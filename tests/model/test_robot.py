@@ -256,3 +256,39 @@ def test_derivatives_of_transforms_are_those_of_finite_differences(tmp_path: Pat
     positions = torch.tensor([[0.3, 0.02, -0.7], [0.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
     for link in ("finger", "tip"):
         assert torch.autograd.gradcheck(lambda q, link=link: robot.link_transform(q, link), positions)
+
+
+TETRAHEDRON = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><contributor/><unit name="any" meter="{metres}"/><up_axis>{axis}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 {size} 0 0 0 {size} 0 0 0 {size}</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>
+"""
+
+
+@pytest.mark.parametrize("axis", ["Y_UP", "Z_UP"])
+@pytest.mark.parametrize(("metres", "unit"), [("0.001", "mm"), ("0.0254", "inch"), ("1", "m")])
+def test_meshes_of_collada_are_scaled_by_their_unit_and_the_up_axis_is_said(
+    tmp_path: Path, metres: str, unit: str, axis: str
+) -> None:
+    size = 0.03 / float(metres)
+    (tmp_path / "tip.dae").write_text(TETRAHEDRON.format(metres=metres, axis=axis, size=size))
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="r"><link name="base"/><link name="tip"><visual><geometry><mesh filename="tip.dae"/></geometry>'
+        '</visual></link><joint name="j" type="revolute"><parent link="base"/><child link="tip"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    robot = Robot.load(tmp_path / "robot.urdf")
+    assert np.ptp(robot.meshes[0].vertices, axis=0) == pytest.approx([0.03] * 3, rel=1e-5)
+    # As in RViz, coordinates stay as they are in the file, and <origin> turns them.
+    assert robot.meshes[0].vertices.min() == pytest.approx(0.0, abs=1e-9)
+    said = " ".join(robot.remarks)
+    assert ("scaled by the unit of the COLLADA file" in said) == (unit != "m")
+    assert (f"up axis {axis} of the COLLADA file is not applied" in said) == (axis == "Y_UP")

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from tiny import tiny_scene
 
 from carts_core.model.meshes import is_closed
+from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
-from carts_core.rendering import visibility, visibility_torch
+from carts_core.rendering import Renderer, visibility, visibility_torch
 from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
 from carts_core.rendering.reference import visibility_ref
 from carts_core.rendering.visibility_numba import rasterize
@@ -154,3 +156,14 @@ def test_the_shipped_arms_look_the_same_without_their_backs() -> None:
         view = (vertices, geometry.faces.numpy(), state.intrinsics[0].tolist(), 640, 480)
         for fronts, every in zip(rasterize(*view, surfaces), rasterize(*view), strict=True):
             np.testing.assert_array_equal(fronts, every)
+
+
+def test_views_are_in_the_order_of_the_names_that_are_given(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 1, ("left", "right"), 96, 72)
+    state = tiny.scene.state({"PSM1": tiny.truth[0]})
+    left, right = Renderer(tiny.scene).segment(state)
+    assert (left != right).any()
+    for names in (["right", "left"], ["right"], ["left"], ["left", "right"]):
+        seen = Renderer(tiny.scene, cameras=names).segment(state)
+        for name, view in zip(names, seen, strict=True):
+            assert np.array_equal(view, {"left": left, "right": right}[name])

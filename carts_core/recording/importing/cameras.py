@@ -201,7 +201,7 @@ def _from_rectification(left: FoundCamera, right: FoundCamera) -> np.ndarray:
     assert left.projection is not None and right.projection is not None
     assert left.rectification is not None and right.rectification is not None
     T = np.eye(4)
-    shifts = [each.projection[:2, 3] / each.projection[[0, 1], [0, 1]] for each in (left, right)]
+    shifts = [P[:2, 3] / P[[0, 1], [0, 1]] for P in (left.projection, right.projection)]
     T[:2, 3] = shifts[1] - shifts[0]
     if np.linalg.norm(T[:3, 3]) > 1.0:
         T[:3, 3] *= 1e-3  # The board's squares were given in millimetres.

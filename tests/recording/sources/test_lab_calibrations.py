@@ -111,7 +111,7 @@ def test_images_that_are_rectified_use_the_projection(tmp_path: Path) -> None:
     left, right = find(tmp_path, options).cameras
     assert left.intrinsics == pytest.approx((P1[0, 0], P1[1, 1], P1[0, 2], P1[1, 2])) and not any(left.distortion)
     assert right.T_camera_world is not None
-    assert np.allclose(right.T_camera_world, rigid(np.eye(3), [-np.linalg.norm(T), 0, 0]), atol=1e-9)
+    assert np.allclose(right.T_camera_world, rigid(np.eye(3), np.array([-np.linalg.norm(T), 0, 0])), atol=1e-9)
 
 
 def test_camera_info_of_bags_is_combined_in_the_same_way(tmp_path: Path) -> None:
