@@ -6,7 +6,7 @@ from pathlib import Path
 
 from carts_core.recording import Sequence
 from carts_core.segmentation import Segmenter
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.keys import key_groups
 from carts_viewer.layers import Layer

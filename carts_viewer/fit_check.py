@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 from carts_core.optimization import Assessment, SolverSettings
 from carts_core.project import FitVerdict
-from carts_core.project.fit_verdict import VERDICTS
+from carts_core.project.values import VERDICTS
 from carts_viewer.observing import Target
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session

@@ -6,12 +6,12 @@ from pathlib import Path
 from carts_core.errors import WeightsError
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.surface_network import SurfaceNetwork
+from carts_core.networks.network import SurfaceNetwork
 from carts_core.networks.weights import read_weights
 from carts_core.optimization import Backgrounds, familiarity
 from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import NetworkSegmenter, Segmenter
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 
 REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
 """What people can do where the network does not know what it sees."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TextIO, TypeVar
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
 from carts_core.segmentation import Segmenter
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 from carts_viewer.app import ViewerApp
 from carts_viewer.ending import EndRequest
 from carts_viewer.opening import opened_in_browser

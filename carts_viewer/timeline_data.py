@@ -7,8 +7,8 @@ from typing import Any
 from carts_core.model.scene import Scene
 from carts_core.optimization import undetermined_joints
 from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
-from carts_core.project.fit_verdict import VERDICTS
 from carts_core.project.state import Record
+from carts_core.project.values import VERDICTS
 from carts_viewer.finding import BY_HAND, SOLVED, review_name
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState

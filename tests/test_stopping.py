@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.rendering.visibility_numba import rasterize
+from carts_core.rendering.rasterizer import rasterize
 from carts_core.stopping import Stopped, exit_status, finished_first, message, stopped_by_signals, when_stopped
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from carts_core.files import append_line, output_path, output_stream
-from carts_core.lab.baselines.weights import read_baseline
+from carts_core.lab.baselines.networks import read_baseline
 from carts_core.lab.benchmark import TEST_SEED, Run
 from carts_core.lab.benchmark.counterfactual import Counterfactual
 from carts_core.lab.benchmark.methods import METHODS

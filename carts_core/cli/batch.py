@@ -16,7 +16,7 @@ from .selection import output_folder
 if TYPE_CHECKING:
     from ..batch.manifest import Job
     from ..files import OutputPath
-    from ..settings.inference import Engine
+    from ..settings.optimization import Engine
 
 _NAMED = 5
 """Failed jobs that are named in the end."""

@@ -21,7 +21,7 @@ from ..errors import CartsError, SettingsError
 from ..files import OutputPath, remove_file, set_aside, write_text
 from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
-from ..settings.inference import Inference
+from ..settings.optimization import Inference
 from .calibrate import Calibrate
 from .evaluate import Evaluate
 from .export import Export

@@ -13,7 +13,7 @@ from ..wording import counted
 from .selection import Network, output_folder
 
 if TYPE_CHECKING:
-    from ..lab.baselines.weights import TrainedBaseline
+    from ..lab.baselines.networks import TrainedBaseline
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Bench:
 
     def _baselines(self) -> "dict[str, TrainedBaseline]":
         """Row -> network."""
-        from ..lab.baselines.weights import read_baseline
+        from ..lab.baselines.networks import read_baseline
 
         found: dict[str, TrainedBaseline] = {}
         for path in self.baselines:

@@ -3,7 +3,7 @@
 from typing import get_args
 
 from ..settings import DescentSolver, SequenceSettings, SurfaceSolver
-from ..settings.docstrings import described
+from ..settings.serialization import described
 from ..settings.stages import Stage
 
 

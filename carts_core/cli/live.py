@@ -10,7 +10,7 @@ import tyro
 
 from ..console import Terminal
 from ..errors import SettingsError
-from ..settings.streams import StreamAddress
+from ..settings.live import StreamAddress
 from .selection import Network, Selection, SequencePath, check_writable
 from .solver_options import FreeInFrames
 

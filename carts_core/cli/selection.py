@@ -12,7 +12,7 @@ import tyro
 
 from ..errors import ProjectError, SettingsError
 from ..files import OutputPath, output_path
-from ..settings.inference import Inference
+from ..settings.optimization import Inference
 from ..wording import closest, counted, shown
 
 if TYPE_CHECKING:

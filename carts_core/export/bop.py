@@ -21,7 +21,7 @@ from ..files import OutputPath, write_bytes, write_text
 from ..model.camera import HALF_PIXEL
 from ..model.scene import Arm, SceneState
 from ..rendering.geometry import link_transforms, vertices_in_camera
-from ..rendering.visibility_numba import rasterize
+from ..rendering.rasterizer import rasterize
 from .dataset import Dataset, View
 from .monitor import Monitor
 from .png import mask_png

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..recording import Sequence
-from ..settings.streams import StreamAddress, StreamKind
+from ..settings.live import StreamAddress, StreamKind
 from .messages import ResultMessage
 from .moments import Assembler, Source
 from .server import StreamServer

@@ -1,4 +1,4 @@
-"""The frozen networks that the optimizer uses."""
+"""Frozen networks as the optimizer uses them, and hybrid images (mean background with the rendering on top)."""
 
 import hashlib
 from pathlib import Path
@@ -9,11 +9,28 @@ from torch import Tensor
 
 from ..errors import WeightsError
 from ..resources import shipped_weights
-from ..settings.inference import Inference
+from ..settings.optimization import Inference
 from .inference import full_precision, surface_engine
-from .network import FeatureNetwork, UNet
-from .surface_network import SurfaceNetwork
+from .network import FeatureNetwork, SurfaceNetwork, UNet
 from .weights import Weights, read_weights
+
+
+def hybrid(
+    rendering_image: Float[Tensor, "*batch 3 h w"],
+    silhouette: Float[Tensor, "*batch h w"],
+    background: Float[Tensor, "*#batch 3 h w"],
+) -> Float[Tensor, "*batch 3 h w"]:
+    """BG_m + Î of the paper: the rendering where the silhouette is, the mean background elsewhere.
+
+    The rendering is black outside the silhouette, so the background only has to make room for it; at a silhouette
+    between 0 and 1 (blurred, or moving in a gradient) the two add up to what a lens would mix.
+
+    Args:
+        rendering_image: rendered arms, RGB in [0, 1], black where the silhouette is 0.
+        silhouette: Ŝ in [0, 1].
+        background: mean background BG_m, RGB in [0, 1]; it may lack the leading dimensions.
+    """
+    return background * (1.0 - silhouette.unsqueeze(-3)) + rendering_image
 
 
 class FeatureExtractor:

@@ -1,4 +1,7 @@
-"""Weights files: safetensors, with the architecture and the training settings as metadata."""
+"""Weights files: safetensors with the architecture and the training settings as metadata.
+
+Equal tensors give equal bytes.
+"""
 
 import hashlib
 import json
@@ -8,15 +11,34 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
 
 from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
 from ..files.reading import WEIGHTS, check_regular, parse_json, read_bytes
 from ..settings import Architecture
 from ..wording import shortened
-from .network import FeatureNetwork, UNet
-from .surface_network import SurfaceNetwork
-from .tensor_bytes import tensor_bytes
+from .network import FeatureNetwork, SurfaceNetwork, UNet
+
+_LENGTH = 8
+"""The header's own length comes first, and tensors begin at a multiple of it [bytes]."""
+
+
+def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
+    """A safetensors file; `safetensors` itself writes metadata in another order every time.
+
+    Args:
+        tensors: contiguous, by name.
+        metadata: texts for the header, in this order.
+    """
+    content = save(dict(tensors))
+    end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
+    header = {"__metadata__": dict(metadata), **json.loads(content[_LENGTH:end])}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _LENGTH)
+    return len(text).to_bytes(_LENGTH, "little") + text + content[end:]
+
 
 VERSION = "1"
 

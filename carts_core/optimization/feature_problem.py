@@ -9,8 +9,7 @@ from torch import Tensor
 
 from ..imaging.window import Window
 from ..model.scene import Scene
-from ..networks.extractor import FeatureExtractor
-from ..networks.hybrid import hybrid
+from ..networks.extractor import FeatureExtractor, hybrid
 from ..rendering import Renderer
 from ..settings import DescentSolver, Loss
 from ..settings.stages import FirstOrder, Observe, Stage

@@ -1,13 +1,9 @@
 """The annotation project: one SQLite file that keeps every correction, with undo and redo across restarts."""
 
-from .changes import Change as Change
 from .database import DamagedProject as DamagedProject
-from .fit_verdict import FitVerdict as FitVerdict
 from .identity import SequenceIdentity as SequenceIdentity
 from .imported import ImportReport as ImportReport
 from .imported import import_annotations as import_annotations
-from .imported_values import ImportedKeypoints as ImportedKeypoints
-from .imported_values import ImportedLabels as ImportedLabels
 from .keys import Edits as Edits
 from .keys import Key as Key
 from .keys import Kind as Kind
@@ -17,19 +13,23 @@ from .layers import MaskCorrection as MaskCorrection
 from .layers import PartLabels as PartLabels
 from .place import default_path as default_path
 from .place import rescued_copies as rescued_copies
+from .project import Change as Change
 from .project import Project as Project
 from .project import read_state as read_state
-from .queries import between_kept as between_kept
-from .queries import by_hand as by_hand
-from .queries import frames_in as frames_in
-from .queries import next_unreviewed as next_unreviewed
-from .queries import worst_first as worst_first
 from .state import ExportRecord as ExportRecord
 from .state import ProjectState as ProjectState
 from .state import Step as Step
+from .state import between_kept as between_kept
+from .state import by_hand as by_hand
+from .state import frames_in as frames_in
+from .state import next_unreviewed as next_unreviewed
+from .state import worst_first as worst_first
 from .values import CorrectedIntrinsics as CorrectedIntrinsics
 from .values import CorrectedTransform as CorrectedTransform
 from .values import Figures as Figures
+from .values import FitVerdict as FitVerdict
+from .values import ImportedKeypoints as ImportedKeypoints
+from .values import ImportedLabels as ImportedLabels
 from .values import JointCorrection as JointCorrection
 from .values import Keyframe as Keyframe
 from .values import Provenance as Provenance

@@ -1,22 +1,432 @@
-"""The project file that is open for writing: locked, and seen to be the same file before and after each commit.
+"""The project file on disk: regular files only, one writer, a checked copy in memory, verified commits.
 
-While it is open, edits go into SQLite's log beside it and the file itself is not written to. So any change of it, and
-any change of the log between two commits, was made by somebody else.
+The lock covers the bytes that SQLite locks and belongs to the open file (F_OFD_SETLK), so it ends with the process
+and not with another descriptor. Edits go into SQLite's log while the file is open, so any other change of the file is
+foreign. SQLite replays a log up to its first damaged frame; what follows may only be the beginning of an
+unacknowledged transaction. Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
 """
 
 import ctypes
+import errno
+import fcntl
 import os
+import socket
 import sqlite3
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+import stat
+import struct
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8, UInt32
 
 from ..errors import ProjectError
-from . import database
-from .companions import LOG, beside, open_regular
-from .lock import try_lock
-from .snapshot import verified_seal
-from .wal import HEADER, Mark, next_mark
+from . import database, digests
+
+LOG, JOURNAL = "-wal", "-journal"
+_OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | getattr(os, "O_NOCTTY", 0)
+
+
+def beside(path: Path, suffix: str) -> Path:
+    """A file of SQLite's beside a project."""
+    return path.with_name(path.name + suffix)
+
+
+def check_files(path: Path) -> bool:
+    """Check a project and what lies beside it before anything is opened; whether the project is there.
+
+    Raises:
+        ProjectError: something is a link, has a second name, or is no regular file; or a journal of another program is
+            there, which SQLite would play back.
+        OSError: the folder cannot be read.
+    """
+    there = _is_there(path)
+    log = _is_there(beside(path, LOG))
+    if _is_there(beside(path, JOURNAL)):
+        raise ProjectError(
+            f"{beside(path, JOURNAL)} lies beside the project, and carts makes no such file. Nothing was changed. If "
+            "another program changed the project, let it finish; else move that file away."
+        )
+    if log and not there:
+        raise ProjectError(
+            f"{beside(path, LOG)} is there without its project {path.name}, which was moved or deleted. Nothing was "
+            "changed. Move the project back beside it, or move that file away to begin a new project."
+        )
+    return there
+
+
+def open_regular(path: Path, *, write: bool = False) -> int:
+    """A descriptor of a regular file with one name; nothing is followed, nothing waited for.
+
+    Raises:
+        ProjectError: it is something else.
+        OSError: it cannot be opened.
+    """
+    _is_there(path)
+    descriptor = os.open(path, (os.O_RDWR if write else os.O_RDONLY) | _OPEN)
+    try:
+        _check(os.fstat(descriptor), path)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        found = os.stat(path, follow_symlinks=False)
+    except FileNotFoundError:
+        return False
+    _check(found, path)
+    return True
+
+
+def _check(found: os.stat_result, path: Path) -> None:
+    if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
+        return
+    kinds = {
+        stat.S_IFREG: f"one of {found.st_nlink} names of a file (hard links)",
+        stat.S_IFLNK: "a link",
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a pipe",
+    }
+    raise ProjectError(
+        f"{path} is {kinds.get(stat.S_IFMT(found.st_mode), 'a device or socket')}. A project and the files beside it "
+        "must be regular files with one name, so that nothing else is written to; nothing was changed. Move it away, "
+        "or copy the project to a file of its own."
+    )
+
+
+_START, _LENGTH = 0x40000000, 512
+"""Bytes of a database on which SQLite's locks lie, whether the file is so long or not."""
+
+
+def try_lock(descriptor: int) -> bool:
+    """Lock an open project file for writing until it is closed; False if somebody else has it open for writing.
+
+    Raises:
+        OSError: the file is not open for writing, or its file system knows no locks.
+    """
+    if sys.platform == "darwin":
+        request = struct.pack("qqihh", _START, _LENGTH, 0, fcntl.F_WRLCK, os.SEEK_SET)
+    else:
+        request = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, _START, _LENGTH, 0)
+    try:
+        fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, request)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        raise
+    return True
+
+
+def holder(path: Path) -> str:
+    """Who has a project open, for people, as far as this system tells."""
+    own = str(os.getpid())
+    with suppress(OSError):
+        wanted = os.stat(path, follow_symlinks=False)
+        for process in sorted(Path("/proc").glob("[0-9]*"), key=lambda folder: folder.name == own):
+            with suppress(OSError):
+                if any(_is_open_at(entry, wanted) for entry in (process / "fd").iterdir()):
+                    return f"process {process.name} on {socket.gethostname()}"
+    return "another process"
+
+
+def _is_open_at(entry: Path, wanted: os.stat_result) -> bool:
+    try:
+        return os.path.samestat(os.stat(entry), wanted)
+    except OSError:
+        return False
+
+
+HEADER = 32
+"""Bytes before the first frame."""
+FRAME_HEADER = 24
+"""Bytes before each frame's page."""
+_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC = 0x377F0683, 0x377F0682
+_COVERED = 8
+"""Bytes of a frame's header that its checksum covers, besides its page."""
+_WORD = 0xFFFFFFFF
+_FRAMES_AT_ONCE = 256
+_PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
+_Sum = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Playback:
+    """A database with its log played back."""
+
+    database: bytearray
+    damaged: bool
+    """Whether there is more in the log than finished transactions and the beginning of one; for logs that began empty,
+    as ours all do."""
+
+
+def played_back(database: bytes, log: bytes) -> Playback:
+    """The database after all transactions that were finished, as SQLite has it.
+
+    Args:
+        database: content of the database file.
+        log: content of the log, which may be empty.
+    """
+    result = bytearray(database)
+    if len(log) < HEADER:
+        # A header is written at once, before anything else; less of it is a kill in that moment.
+        return Playback(result, damaged=False)
+    magic, _, page_size, _, *salts = struct.unpack_from(">6I", log)
+    order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
+    first = struct.unpack_from(">2I", log, 24)
+    known = magic in (_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC)
+    if not known or page_size not in _PAGE_SIZES or _header_sum(order, log) != first:
+        return Playback(result, damaged=True)
+    unfinished: list[tuple[int, int]] = []
+    for start, running in _running_sums(order, log, HEADER, page_size, first):
+        number, pages, *rest = struct.unpack_from(">6I", log, start)
+        begin = start + FRAME_HEADER
+        if rest != [*salts, *running] or number == 0:
+            return Playback(result, damaged=True)
+        unfinished.append((number, begin))
+        if pages:
+            for page, place in unfinished:
+                end = page * page_size
+                result.extend(bytes(max(end - len(result), 0)))
+                result[end - page_size : end] = log[place : place + page_size]
+            unfinished.clear()
+            del result[pages * page_size :]
+    return Playback(result, damaged=False)
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where the last frame of a finished transaction begins."""
+
+    start: int = HEADER
+    """Offset of the frame in the log [bytes]."""
+    running: _Sum | None = None
+    """The checksum before it; None: the header's."""
+    frames: int = 0
+    """0: the log has no transaction yet, 1: this frame."""
+
+
+def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
+    """The last frame of the next transaction, if the frame at `mark` and all after it up to there are whole.
+
+    Args:
+        log: content of the log from `mark.start`.
+        header: the log's header.
+        mark: of the transaction before.
+    """
+    if len(header) < HEADER:
+        return None
+    magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
+    if page_size not in _PAGE_SIZES:
+        # Somebody has written over it.
+        return None
+    order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
+    before: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
+    commits = 0
+    for start, running in _running_sums(order, log, 0, page_size, before):
+        _, pages, *rest = struct.unpack_from(">6I", log, start)
+        if rest != [*salts, *running]:
+            return None
+        commits += bool(pages)
+        if commits > mark.frames:
+            return Mark(mark.start + start, before, 1)
+        before = running
+    return None
+
+
+def _running_sums(
+    order: Literal["<", ">"], log: bytes, start: int, page_size: int, running: _Sum
+) -> Iterator[tuple[int, _Sum]]:
+    """Where each whole frame begins, and the checksum of the log up to its end.
+
+    Args:
+        order: byte order of the words.
+        log: content of the log.
+        start: where the first frame begins.
+        page_size: what each frame holds [bytes].
+        running: the checksum before it.
+    """
+    size = FRAME_HEADER + page_size
+    weights, ((a, b), (c, d)) = _weights((_COVERED + page_size) // 4)
+    while count := min((len(log) - start) // size, _FRAMES_AT_ONCE):
+        frames = np.frombuffer(log, np.uint8, count * size, start).reshape(count, size)
+        covered = np.concatenate((frames[:, :_COVERED], frames[:, FRAME_HEADER:]), axis=1)
+        for x, y in (_words(order, covered) @ weights).tolist():
+            s, t = running
+            running = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
+            yield start, running
+            start += size
+
+
+def _header_sum(order: Literal["<", ">"], log: bytes) -> _Sum:
+    words = _words(order, np.frombuffer(log, np.uint8, HEADER - 8))
+    first, second = (words @ _weights(len(words))[0]).tolist()
+    return first, second
+
+
+def _words(order: Literal["<", ">"], data: UInt8[np.ndarray, "*rows bytes"]) -> UInt32[np.ndarray, "*rows words"]:
+    return data.view(np.dtype(np.uint32).newbyteorder(order)).astype(np.uint32, copy=False)
+
+
+@lru_cache(maxsize=8)
+def _weights(words: int) -> tuple[UInt32[np.ndarray, "words 2"], tuple[_Sum, _Sum]]:
+    """What each word adds to the two sums of a checksum, and the matrix that takes the sums before the words along.
+
+    Each pair of words (x, y) takes the sums (s, t) to s' = s + x + t and t' = t + y + s', modulo 2^32. This is linear,
+    so that any number of words are two sums of products.
+    """
+    columns, (a, b, c, d) = [], (1, 0, 0, 1)
+    for _ in range(words // 2):
+        # The last pair comes first: nothing follows it.
+        columns.append((((a + b) & _WORD, (c + d) & _WORD), (b, d)))
+        a, b, c, d = (value & _WORD for value in (a + b, a + 2 * b, c + d, c + 2 * d))
+    weights = [word for pair in reversed(columns) for word in pair]
+    return np.array(weights, np.uint32).reshape(-1, 2), ((a, b), (c, d))
+
+
+LARGEST = 768 * 2**20
+"""What a project may have, its log included [bytes]; twice that is held while it is opened."""
+_TRIES = 5
+_MAGIC = b"SQLite format 3\0"
+_WRITE_VERSION = slice(18, 20)
+"""Bytes that say whether a database keeps a log; one in memory must not."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a project file and its log hold."""
+
+    database: bytes
+    log: bytes
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A copy in memory, which nothing was checked of yet.
+
+    Attributes:
+        connection: to it.
+        fault: what was seen to be wrong with the files, for people; None if nothing was.
+    """
+
+    connection: sqlite3.Connection
+    fault: str | None
+
+
+def read_files(path: Path) -> Content:
+    """What lies there, at one moment.
+
+    Raises:
+        ProjectError: it is not there, is no regular file, is too large, or never holds still.
+        OSError: it cannot be read.
+    """
+    if not check_files(path):
+        raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
+    for _ in range(_TRIES):
+        descriptor = open_regular(path)
+        try:
+            before = os.fstat(descriptor)
+            main, log = _content(descriptor, path), b""
+            try:
+                log_descriptor = open_regular(beside(path, LOG))
+            except FileNotFoundError:
+                pass
+            else:
+                try:
+                    log = _content(log_descriptor, path)
+                finally:
+                    os.close(log_descriptor)
+            after = os.fstat(descriptor)
+        finally:
+            os.close(descriptor)
+        # Whoever has it open writes to the log, and to the file itself when that is full or at the end.
+        if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
+            return Content(main, log)
+    raise ProjectError(f"project {path} is being changed all the time. Try again when that has ended.")
+
+
+def open_copy(content: Content, path: Path) -> Copy:
+    """A connection to a copy in memory.
+
+    Raises:
+        ProjectError: it is no project, or of a newer version of carts.
+        sqlite3.Error: SQLite cannot read it at all.
+    """
+    main = content.database
+    if not main.startswith(_MAGIC) or len(main) < 512:
+        raise database.not_a_project(path)
+    played = played_back(main, content.log)
+    memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    try:
+        patched = played.database
+        patched[_WRITE_VERSION] = b"\1\1"
+        # SQLite opens nothing that was cut off; with the rest empty it reads what is there.
+        missing = min(_promised(patched), LARGEST) - len(patched)
+        patched.extend(bytes(max(missing, 0)))
+        memory.deserialize(patched)
+        database.hardened(memory)
+        database.check_version(memory, path)
+    except BaseException:
+        memory.close()
+        raise
+    # Logs of older versions were used again without being emptied, so that old frames lie at their end.
+    drops = played.damaged and database.version(memory) >= database.SEALED
+    fault = "the last edits in its log (-wal) cannot be read" if drops else None
+    return Copy(memory, f"{missing} bytes at its end are missing" if missing > 0 else fault)
+
+
+def check_copy(copy: Copy) -> None:
+    """See that a copy has our schema and is a sound database, before rows are read.
+
+    Raises:
+        DamagedProject, sqlite3.Error: it is not.
+    """
+    memory = copy.connection
+    if copy.fault is not None:
+        raise database.DamagedProject(copy.fault)
+    pages = memory.execute("PRAGMA page_count").fetchone()[0]
+    with database.time_limit(memory, 5.0 + pages / 5_000):
+        database.check_schema(memory)
+        found = memory.execute("PRAGMA integrity_check(3)").fetchall()
+    if found != [("ok",)]:
+        raise database.DamagedProject("; ".join(str(row[0]) for row in found)[:300])
+
+
+def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
+    """What `seal` of the file that lies there now says, if all of it is as it was written; None if it is not."""
+    try:
+        with database.errors_explained(path):
+            copy = open_copy(read_files(path), path)
+            with closing(copy.connection):
+                check_copy(copy)
+                digests.verify(copy.connection)
+                return copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone()
+    except ProjectError:
+        return None
+
+
+def _promised(main: bytearray) -> int:
+    """How many bytes a database has, as its header says."""
+    size = int.from_bytes(main[16:18], "big")
+    return int.from_bytes(main[28:32], "big") * (65536 if size == 1 else size)
+
+
+def _content(descriptor: int, path: Path) -> bytes:
+    size = os.fstat(descriptor).st_size
+    if size > LARGEST:
+        raise ProjectError(f"{path} has {size / 2**20:.0f} MiB; a project may have {LARGEST // 2**20}. Name another.")
+    parts = []
+    while len(part := os.pread(descriptor, 1 << 26, sum(map(len, parts)))):
+        parts.append(part)
+    return b"".join(parts)
+
 
 Statements = Sequence[tuple[str, Iterable[Sequence[object]]]]
 """SQL, each with the rows of its parameters."""

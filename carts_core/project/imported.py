@@ -7,11 +7,11 @@ import numpy as np
 
 from ..errors import ProjectError
 from ..wording import counted, listed
-from .imported_values import ImportedKeypoints, ImportedLabels
 from .keys import Key
 from .layers import ImportedMask
 from .project import Project
 from .state import ProjectState
+from .values import ImportedKeypoints, ImportedLabels
 
 if TYPE_CHECKING:
     from ..recording.annotations import Annotations

@@ -8,11 +8,19 @@ from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 from ..errors import ProjectError
-from .fit_verdict import FitVerdict
 from .identity import SequenceIdentity
-from .imported_values import ImportedKeypoints, ImportedLabels
 from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection, PartLabels
-from .values import CorrectedIntrinsics, CorrectedTransform, JointCorrection, Keyframe, Review, TimeOffset
+from .values import (
+    CorrectedIntrinsics,
+    CorrectedTransform,
+    FitVerdict,
+    ImportedKeypoints,
+    ImportedLabels,
+    JointCorrection,
+    Keyframe,
+    Review,
+    TimeOffset,
+)
 
 V_co = TypeVar("V_co", covariant=True)
 

@@ -1,27 +1,72 @@
 """An open project: edits that are on disk before the call returns, undo and redo, one writer at a time."""
 
 import json
+import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from ..errors import ProjectError
 from ..wording import counted
-from . import database, journal, opening
-from .changes import Action, Change, Listener, Listeners
-from .fit_verdict import FitVerdict
+from . import database, journal
 from .identity import SequenceIdentity
 from .keys import WHOLE_PROJECT, Edits, Key, check_edit
 from .place import default_path
 from .state import ExportRecord, ProjectState, Step, by_revision, step_at
-from .store import Store
-from .values import Figures
+from .store import Store, Writable, open_or_begin, read_project
+from .values import Figures, FitVerdict
 
 if TYPE_CHECKING:
     from ..recording import Sequence
+
+
+Action = Literal["apply", "undo", "redo", "figures", "export"]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What has just been saved. The new state is that of the project."""
+
+    action: Action
+    step: Step | None
+    """The step that was done or, for "undo", taken back; the furthest one when several were passed."""
+    keys: frozenset[Key[Any]]
+    """What may have another value now."""
+    frames: tuple[int, ...]
+    """Indices of the frames that it is about, in order; values of the whole project aside."""
+
+
+Listener = Callable[[Change], None]
+
+
+class Listeners:
+    """Functions that are called after each save, in the order in which they came."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Listener] = []
+
+    def add(self, listener: Listener) -> Callable[[], None]:
+        """Call a function from now on; what is returned ends this."""
+        self._listeners.append(listener)
+
+        def remove() -> None:
+            with suppress(ValueError):
+                self._listeners.remove(listener)
+
+        return remove
+
+    def notify(self, change: Change, project: Path) -> None:
+        """Call them all. One that fails is logged: the edit is saved, so it must not look as if it were not."""
+        for listener in tuple(self._listeners):
+            try:
+                listener(change)
+            except Exception:
+                logging.getLogger(__name__).exception("a listener of project %s failed", project)
+
 
 LONGEST_NAME = 200
 """Characters of a step's name."""
@@ -270,9 +315,9 @@ class Project:
     def _opened(self, identity: SequenceIdentity) -> ProjectState:
         with database.errors_explained(self._path):
             if self.read_only_reason is not None:
-                return opening.read(self._path, identity)
-            opened = opening.open_or_begin(self._path, identity)
-        if isinstance(opened, opening.Writable):
+                return read_project(self._path, identity)
+            opened = open_or_begin(self._path, identity)
+        if isinstance(opened, Writable):
             self._store = opened.store
         else:
             self.read_only_reason = opened.reason
@@ -305,7 +350,7 @@ def read_state(path: Path) -> ProjectState:
         ProjectError: it is not there, or cannot be read.
     """
     with database.errors_explained(path):
-        return opening.read(path, None)
+        return read_project(path, None)
 
 
 def _step_name(name: str) -> str:

@@ -1,17 +1,148 @@
-"""Where a project's edits go: into its file, and into a copy of it in memory, from which everything can be rescued."""
+"""Opening, committing to and rescuing a project: a file, and a copy of it in memory.
+
+Everything is checked on the copy first, so a refused file stays as it is. A file that is lost while open is rescued
+from the copy; of a damaged file, what can be read becomes a new project.
+"""
 
 import logging
+import secrets
 import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from ..errors import CartsError, ProjectError
+from ..errors import CartsError, OutputError, ProjectError
 from ..files import write_new
-from . import database, digests
-from .file import LostFile, ProjectFile, SealRow
+from ..wording import counted
+from . import database, digests, journal
+from .file import Copy, LostFile, ProjectFile, SealRow, check_copy, check_files, holder, open_copy, read_files
+from .identity import SequenceIdentity
 from .journal import Script
+from .keys import Key, Kind, check_edit, decode
 from .place import data_dir, rescue_paths
+from .state import ProjectState
+from .values import Figures
+
+UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
+"""What decoding of foreign values raises, besides `ProjectError`."""
+_LISTED = 5
+_LOST_STEP = "A step whose name was lost to damage"
+
+
+@dataclass
+class Rescued:
+    """A new project in memory, and what happened, for people."""
+
+    connection: sqlite3.Connection
+    kept: int = 0
+    lost: list[str] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        named = ", ".join(self.lost[:_LISTED]) + (" and more" if len(self.lost) > _LISTED else "")
+        missing = f"{len(self.lost)} could not ({named})" if self.lost else "what is missing left no trace"
+        return f"{counted(self.kept, 'row')} of it could be read, {missing}"
+
+
+def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
+    """What can be read of a project of this sequence; None if that is nothing."""
+    old = copy.connection
+    rescued = Rescued(database.empty(identity))
+    tables = {table: list(_rows(copy, table, rescued)) for table in digests.TABLES}
+    tables["changes"] = [row for row in tables["changes"] if _fits(identity, row, rescued)]
+    tables["figures"] = [row for row in tables["figures"] if _is_figure(identity, row, rescued)]
+    names = {number: (name, time) for number, name, time in tables["steps"]}
+    numbers = sorted(names.keys() | {row[3] for row in tables["changes"]})
+    renumbered = {old_number: number for number, old_number in enumerate(numbers, start=1)} | {0: 0}
+    steps = [(renumbered[n], *names.get(n, (_LOST_STEP, 0.0))) for n in numbers]
+    changes = {(kind, frame, name, renumbered[n]): value for kind, frame, name, n, value in tables["changes"]}
+    figures = {(frame, renumbered[n]): values for frame, n, *values in tables["figures"] if n in renumbered}
+    with database.transaction(rescued.connection) as new:
+        _insert(new, "steps", steps)
+        _insert(new, "changes", [(*key, value) for key, value in changes.items()])
+        _insert(new, "figures", [(*key, *values) for key, values in figures.items()])
+        _insert(new, "exports", tables["exports"])
+        new.execute("UPDATE project SET position = ?", (_position(old, numbers),))
+        digests.seal(new, b"")
+    rescued.kept = len(steps) + len(changes) + len(figures) + len(tables["exports"])
+    if rescued.kept:
+        return rescued
+    rescued.connection.close()
+    return None
+
+
+def _insert(new: sqlite3.Connection, table: str, rows: list[tuple]) -> None:
+    columns = digests.TABLES[table]
+    marks = ", ".join("?" * len(columns))
+    new.executemany(f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({marks})", rows)
+
+
+def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
+    """The rows that are as they were written, from both ends of the table up to where it cannot be read."""
+    connection, columns = copy.connection, ", ".join(digests.TABLES[table])
+    sealed = database.version(connection) >= database.SEALED
+    digest = "digest" if sealed else "NULL"
+    seen: set[int] = set()
+    for order in ("ASC", "DESC"):
+        query = f"SELECT rowid, {columns}, {digest} FROM {table} NOT INDEXED ORDER BY rowid {order}"
+        try:
+            with database.time_limit(connection, 3.0):
+                for number, *row, written in connection.execute(query):
+                    if number in seen:
+                        continue
+                    seen.add(number)
+                    if (sealed and digests.row_digest(table, row) != written) or not _has_types(table, row):
+                        rescued.lost.append(f"a row of {table}")
+                    else:
+                        yield tuple(row)
+            return
+        except (sqlite3.Error, *UNREADABLE):
+            rescued.lost.append(f"a part of {table}")
+
+
+def _has_types(table: str, row: list[Any]) -> bool:
+    types: dict[str, tuple[type | tuple[type, ...], ...]] = {
+        "steps": (int, str, float),
+        "changes": (str, int, str, int, (str, bytes, type(None))),
+        "figures": (int, int, (float, type(None)), (float, type(None))),
+        "exports": (float, str, str, int, str),
+    }
+    return all(isinstance(value, kind) for value, kind in zip(row, types[table], strict=True))
+
+
+def _fits(identity: SequenceIdentity, row: tuple, rescued: Rescued) -> bool:
+    kind, frame, name, _, value = row
+    try:
+        key: Key[Any] = Key(Kind(kind), frame, name)
+        check_edit(identity, key, decode(key.kind, value))
+    except (database.ProjectError, *UNREADABLE):
+        rescued.lost.append(f"{kind} of frame number {frame}")
+        return False
+    return True
+
+
+def _is_figure(identity: SequenceIdentity, row: tuple, rescued: Rescued) -> bool:
+    try:
+        check_edit(identity, Key.review(row[0]), None)
+        Figures(*row[2:])
+    except (database.ProjectError, *UNREADABLE):
+        rescued.lost.append(f"figures of frame number {row[0]}")
+        return False
+    return True
+
+
+def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
+    """How many of the steps are done; all, where the file does not say so."""
+    try:
+        (position,) = old.execute("SELECT position FROM project").fetchone()
+    except (sqlite3.Error, TypeError):
+        return len(numbers)
+    return sum(number <= position for number in numbers) if isinstance(position, int) else len(numbers)
+
 
 _log = logging.getLogger(__name__)
 
@@ -164,3 +295,130 @@ class Store:
             file.abandon()
             raise
         return file
+
+
+@dataclass(frozen=True)
+class Writable:
+    """A project that is open for writing."""
+
+    state: ProjectState
+    store: Store
+
+
+@dataclass(frozen=True)
+class ReadOnly:
+    """What a project says that somebody else has open for writing."""
+
+    state: ProjectState
+    reason: str
+
+
+def open_or_begin(path: Path, identity: SequenceIdentity) -> Writable | ReadOnly:
+    """Open the project of a sequence for writing, or for reading where somebody else writes; begin it if it is missing.
+
+    Raises:
+        DamagedProject: it is damaged; what can be read of it is in a new file by now.
+        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed.
+    """
+    if not check_files(path):
+        _begin(path, identity)
+    file = ProjectFile.locked(path)
+    if file is None:
+        reason = f"It is open for writing elsewhere ({holder(path)}). Close it there, then open it again."
+        return ReadOnly(read_project(path, identity), reason)
+    try:
+        memory, state, seal = _load(path, identity, keep_what_is_left=True)
+        return Writable(state, Store(memory, seal, state.position, file))
+    except LostFile as lost:
+        file.abandon()
+        raise ProjectError(f"project {path} {lost} while it was being opened. Open it again.") from lost
+    except BaseException:
+        file.dismiss()
+        raise
+
+
+def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
+    """State of the project of a sequence, or with None of any sequence.
+
+    Raises:
+        DamagedProject, ProjectError, OSError, sqlite3.Error: it cannot be read.
+    """
+    memory, state, _ = _load(path, identity, keep_what_is_left=False)
+    memory.close()
+    return state
+
+
+def _begin(path: Path, identity: SequenceIdentity) -> None:
+    try:
+        # Who began it in the same moment has made the same.
+        write_new(path, file_content(database.empty(identity)))
+    except OutputError as error:
+        if isinstance(error.__cause__, OSError):
+            raise error.__cause__ from error
+        raise ProjectError(str(error)) from error
+
+
+def _load(
+    path: Path, identity: SequenceIdentity | None, *, keep_what_is_left: bool
+) -> tuple[sqlite3.Connection, ProjectState, digests.Seal]:
+    """A copy of the file in memory, migrated, and what it says."""
+    content = read_files(path)
+    try:
+        copy = open_copy(content, path)
+    except sqlite3.Error as error:
+        raise database.DamagedProject(
+            f"project {path} is damaged: {error}. It was not changed. Nothing of it can be read. Go back to a copy of "
+            "it."
+        ) from error
+    try:
+        state, seal = _checked(copy)
+    except (ProjectError, sqlite3.Error, *UNREADABLE) as error:
+        raise _damaged(path, identity, copy, error, keep_what_is_left=keep_what_is_left) from error
+    if identity is not None and (difference := state.identity.difference(identity)) is not None:
+        copy.connection.close()
+        raise ProjectError(
+            f"project {path} belongs to another sequence ({state.identity.name!r}, not {identity.name!r}): "
+            f"{difference}. Nothing was changed. Open it with its own sequence, or name another project file."
+        )
+    return copy.connection, state, seal
+
+
+def _checked(copy: Copy) -> tuple[ProjectState, digests.Seal]:
+    check_copy(copy)
+    memory = copy.connection
+    if database.SEALED <= database.version(memory) < len(database.MIGRATIONS):
+        digests.verify(memory)
+    database.migrate(memory, secrets.token_bytes(digests.NONCE_BYTES))
+    return journal.load(memory)
+
+
+def _damaged(
+    path: Path, identity: SequenceIdentity | None, copy: Copy, error: BaseException, *, keep_what_is_left: bool
+) -> ProjectError:
+    """The error for a damaged file; what can be read of it is in a new file by then, where that is asked for."""
+    reason = (
+        str(error).rstrip(".") if isinstance(error, ProjectError | sqlite3.Error) else f"unreadable values ({error})"
+    )
+    begin = f"project {path} is damaged: {reason}. It was not changed."
+    if not keep_what_is_left or identity is None:
+        return database.DamagedProject(f"{begin} Open it for writing to have what can be read of it rescued.")
+    rescued = rescue(copy, identity)
+    copy.connection.close()
+    if rescued is None:
+        return database.DamagedProject(f"{begin} Nothing of it can be read. Go back to a copy of it.")
+    when = time.time()
+    with suppress(OSError, OverflowError, ValueError):
+        # The time of the file: whoever tries again finds what was rescued already.
+        when = path.stat().st_mtime
+        time.localtime(when)
+    target, new = next(rescue_paths(path, when)), False
+    with suppress(OutputError):
+        new = write_new(target, file_content(rescued.connection))
+    rescued.connection.close()
+    if not new and not target.exists():
+        return database.DamagedProject(f"{begin} {rescued.text}, but {target} could not be written. Make room for it.")
+    was = "is now" if new else "was rescued before and is"
+    return database.DamagedProject(
+        f"{begin} {rescued.text}; that {was} in {target}. Go back to a copy of the project, or go on with what was "
+        f"rescued: --project '{target}'."
+    )

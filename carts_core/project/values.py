@@ -1,4 +1,7 @@
-"""What a project keeps: corrections with their provenance, review marks and figures. All immutable."""
+"""Values of a project, all immutable.
+
+Corrections with provenance, review marks, figures, verdicts and imported annotations.
+"""
 
 import json
 import math
@@ -288,3 +291,80 @@ def _check_json(text: str) -> None:
         json.loads(text)
     except ValueError as error:
         raise ProjectError(f"settings are not JSON ({error}). Give what json.dumps writes.") from error
+
+
+@dataclass(frozen=True)
+class ImportedLabels(JsonValue):
+    """What the numbers in imported masks mean.
+
+    Raises:
+        ProjectError: there are more than 255 names, or one is no text.
+    """
+
+    names: tuple[str, ...]
+    """Of label 1 and so on."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        if len(self.names) > 255 or not all(isinstance(name, str) and len(name) <= 1000 for name in self.names):
+            raise ProjectError("imported labels must be at most 255 names of at most 1000 characters.")
+
+
+@dataclass(frozen=True)
+class ImportedKeypoints(JsonValue):
+    """Points that others marked in a frame.
+
+    Raises:
+        ProjectError: a place is not finite, or a name is no text.
+    """
+
+    points: tuple[tuple[str, float, float], ...]
+    """Name, column and row in the undistorted image [px]."""
+
+    def __post_init__(self) -> None:
+        points = []
+        for point in self.points:
+            if len(point) != 3 or not isinstance(point[0], str):
+                raise ProjectError(f"an imported keypoint is {point!r}. Give a name, a column and a row.")
+            place = float(point[1]), float(point[2])
+            if not all(map(math.isfinite, place)):
+                raise ProjectError(f"the imported keypoint {point[0]!r} is at {place}. Give finite numbers.")
+            points.append((point[0], *place))
+        object.__setattr__(self, "points", tuple(points))
+
+
+VERDICTS = ("good", "doubtful", "failed")
+"""As `carts_core.optimization.Verdict` has them."""
+LONGEST_TEXT = 2_000
+"""Characters."""
+
+
+@dataclass(frozen=True)
+class FitVerdict(JsonValue):
+    """How far a frame's fit can be relied on; see `ProjectState.verdict` for how long it holds.
+
+    Raises:
+        ProjectError: there is no such verdict, a text is too long, or the probability is none.
+    """
+
+    verdict: str
+    """One of `VERDICTS`."""
+    reason: str = ""
+    """For people."""
+    remedy: str = ""
+    """What to try, for people; empty where nothing has to be."""
+    failure: float = 0.0
+    """Probability that the mask is wrong (Dice below 0.9) [1]."""
+    cameras: tuple[tuple[str, float], ...] = ()
+    """The same in single cameras, by their names, where there are several."""
+
+    def __post_init__(self) -> None:
+        if self.verdict not in VERDICTS:
+            raise ProjectError(f"a verdict is {self.verdict!r}, but must be one of: {', '.join(VERDICTS)}.")
+        for text in (self.reason, self.remedy):
+            if not isinstance(text, str) or len(text) > LONGEST_TEXT:
+                raise ProjectError(f"reason and remedy must be texts of at most {LONGEST_TEXT} characters. Shorten it.")
+        object.__setattr__(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
+        for value in (self.failure, *(value for _, value in self.cameras)):
+            if not (isinstance(value, float | int) and 0.0 <= value <= 1.0):
+                raise ProjectError(f"the probability of a failure is {value!r}. Give a number from 0 to 1.")

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..model.scene import Light
-from .visibility_numba import BACKGROUND, NEAR
+from .rasterizer import BACKGROUND, NEAR
 
 
 def visibility_ref(

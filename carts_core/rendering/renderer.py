@@ -1,4 +1,4 @@
-"""The differentiable renderer: scene and state in, image and silhouette out (f_DR of the paper)."""
+"""The renderer: visibility, shading, surface maps and their derivatives, and picking of surface points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,17 +8,46 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..model.keypoints import Keypoint
 from ..model.scene import Scene, SceneState
-from ..model.surface import SURFACE_CHANNELS
+from ..model.surface import NORMALS, SURFACE_CHANNELS
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
-from .jacobian import Tangents, map_jacobian
+from .jacobian import JacobianBlock, Tangents, map_jacobian
 from .motion import carry_motion
 from .outline import Outline, normal_motion, outline_faces, outline_position
-from .points import visible_points
-from .shading import phong
-from .surface import SurfaceRendering, scattered, surface_values
-from .visibility_numba import rasterize
-from .visibility_torch import visibility_torch
+from .points import phong, visible_points
+from .rasterizer import rasterize, visibility_torch
+
+
+@dataclass(frozen=True)
+class SurfaceRendering:
+    """Surface maps of all cameras, without autograd."""
+
+    maps: Float[Tensor, "cameras 6 height width"]
+    """See `carts_core.model.surface`."""
+    image: Float[Tensor, "cameras 3 height width"]
+    """Shaded, linear RGB in [0, 1]."""
+    jacobian: tuple[JacobianBlock, ...]
+    """Derivative of the maps by the unknowns; empty if it was not asked for."""
+
+
+def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, "6 K"]:
+    """Surface map where points are seen, from their parts (index into `carts_core.model.parts.PARTS`) and their
+    normals, which point to the camera."""
+    values = normal.new_zeros(SURFACE_CHANNELS, len(parts))
+    values[parts, torch.arange(len(parts), device=parts.device)] = 1.0
+    values[NORMALS] = normal
+    return values
+
+
+def scattered(
+    values: Float[Tensor, "channels K"], pixel: Int[Tensor, " K"], shape: torch.Size
+) -> Float[Tensor, "views channels height width"]:
+    """Values of pixels, as indices into flattened images of a shape [views, height, width], in their places; 0 between
+    them."""
+    dense = values.new_zeros(len(values), shape.numel())
+    dense[:, pixel] = values
+    return dense.view(-1, *shape).transpose(0, 1).contiguous()
 
 
 @dataclass(frozen=True)
@@ -246,3 +275,44 @@ def _tangents(Ts: Float[Tensor, "states cameras links 4 4"], intrinsics: Tensor,
 def _side(position: Float[Tensor, "3 K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, " K"]:
     """1 where a normal points to the camera, -1 where it points away."""
     return torch.where((position * normal).sum(0) > 0, -1.0, 1.0)
+
+
+@torch.no_grad()
+def pick_point(
+    scene: Scene, renderer: Renderer, state: SceneState, pixel: tuple[float, float], radius: float = 0.0
+) -> Keypoint | None:
+    """The point of the rendered surface at a pixel, fixed to its link.
+
+    Args:
+        scene: arms and cameras.
+        renderer: of one camera of the scene alone, at its full size.
+        state: where the scene's arms and cameras are (no batch).
+        pixel: column and row, pixel centres at 0.5 [px].
+        radius: how far the centre of the nearest pixel with an arm may be [px]; 0 for the pixel that holds the place.
+
+    Returns:
+        The point, called after its link; None where no arm is that near.
+    """
+    (camera,) = renderer.scene.cameras
+    faces, inverse_depth = renderer.visibility(state)
+    face_ids = faces[0].cpu().numpy()
+    rows, columns = np.nonzero(face_ids >= 0)
+    if not len(rows):
+        return None
+    centres = np.column_stack([columns, rows]) + 0.5
+    nearest = int(np.linalg.norm(centres - pixel, axis=-1).argmin())
+    row, column = int(rows[nearest]), int(columns[nearest])
+    inside = (column, row) == (int(np.floor(pixel[0])), int(np.floor(pixel[1])))
+    if not inside and np.linalg.norm(centres[nearest] - pixel) > radius:
+        return None
+    depth = 1.0 / float(inverse_depth[0, row, column])
+    view = scene.cameras.index(scene.camera(camera.name))
+    fx, fy, cx, cy = state.intrinsics[view].tolist()
+    u, v = centres[nearest]
+    p_camera = np.array([(u - cx) / fx * depth, (v - cy) / fy * depth, depth, 1.0])
+    link = int(renderer.geometry.face_links[face_ids[row, column]])
+    T_camera_link = link_transforms(scene, state)[view, link].double().cpu().numpy()
+    x, y, z, _ = np.linalg.solve(T_camera_link, p_camera).tolist()
+    links = [(arm, number) for arm in scene.arms for number in range(len(arm.robot.link_names))]
+    arm, number = links[link]
+    return Keypoint(arm.name, arm.robot.link_names[number], number, (x, y, z))

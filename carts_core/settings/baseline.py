@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import SettingsError
-from .network import Architecture
+from .training import Architecture
 
 BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
 """Which network: three look at the image alone, Colleoni's at what is rendered of the kinematics, too."""

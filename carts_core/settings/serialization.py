@@ -1,13 +1,48 @@
-"""Settings as plain data and back: what results keep, and what people write in a settings file."""
+"""Settings as plain data and back, for results and settings files, and the documentation of their fields."""
 
+import ast
+import inspect
+import textwrap
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import StrEnum
+from functools import cache
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from ..errors import SettingsError
 from ..wording import closest
 from .stages import Stage
+
+
+@cache
+def field_docstrings(kind: type) -> dict[str, str]:
+    """The string below each field of a dataclass, which Python itself throws away."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for field, text in zip(body.body, body.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+            found[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
+    return found
+
+
+def described(kind: type) -> str:
+    """A settings dataclass as text: what it is, and each field with its default and meaning."""
+    lines = [f"{kind.__name__}: {inspect.getdoc(kind) or ''}"]
+    texts = field_docstrings(kind)
+    for field in fields(kind):
+        plain = field.default is not MISSING and not isinstance(field.default, tuple)
+        default = f" = {field.default}" if plain else ""
+        lines.append(
+            textwrap.fill(
+                f"{field.name}{default}: {texts.get(field.name, '')}",
+                110,
+                initial_indent="  ",
+                subsequent_indent="      ",
+            )
+        )
+    return "\n".join(lines)
+
 
 _Settings = TypeVar("_Settings")
 _STAGES: dict[str, type] = {kind.__name__: kind for kind in get_args(Stage)}

@@ -1,14 +1,212 @@
-"""Settings of a training run."""
+"""Settings of a training run: network architecture, loss weights, randomization of images, schedule."""
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from ..errors import SettingsError
+from ..files.reading import parse_json
 from ..resources import shipped_robot
-from .loss_weights import ObjectiveWeights, SurfaceWeights
-from .network import Architecture
-from .training_images import ImageSettings
+
+
+@dataclass(frozen=True)
+class ObjectiveWeights:
+    """Weights of the terms of the training loss; zero leaves a term out."""
+
+    cross_entropy: float = 1.0
+    """Binary cross-entropy of the instrument's probability, as in the paper."""
+    dice: float = 0.5
+    """One minus soft Dice per image, so that small instruments count as much as large ones."""
+    consistency: float = 1.0
+    """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not getattr(self, name) >= 0:
+                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
+
+
+@dataclass(frozen=True)
+class SurfaceWeights:
+    """Weights of the terms of the surface network's loss; zero leaves a term out."""
+
+    everywhere: float = 1.0
+    """Cross-entropy of coverage, all pixels."""
+    near: float = 1.0
+    """The same near instruments, where the optimizer compares."""
+    dice: float = 0.5
+    """One minus soft Dice per image and part, so that small parts count as much as large ones."""
+    normals: float = 1.0
+    """Smooth L1 of normals near instruments."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not getattr(self, name) >= 0:
+                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
+
+
+_MOST_LEVELS, _MOST_CHANNELS, _MOST_CONVOLUTIONS = 8, 1024, 16
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What distinguishes one feature network from another; it travels in the weights file."""
+
+    widths: tuple[int, ...] = (12, 24, 48, 64, 96)
+    """Channels per level, from full resolution down; each level halves the resolution."""
+    encoder_convolutions: tuple[int, ...] = (1, 2, 2, 2, 2)
+    """3x3 convolutions per level on the way down. Full resolution costs most, so it has one."""
+    decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
+    """3x3 convolutions per level on the way up, from full resolution down."""
+    local_mean: bool = True
+    """Take the local mean off an image first, and not that of the whole image: smooth haze then changes less."""
+    local_contrast: float = 0.0
+    """How much an image is divided by its local contrast instead of that of the whole image, from 0 (not at all) to 1
+    (entirely); needs `local_mean`. What takes contrast from a part of an image then changes less."""
+
+    def __post_init__(self) -> None:
+        levels = len(self.widths)
+        if not 2 <= levels <= _MOST_LEVELS or any(not 1 <= width <= _MOST_CHANNELS for width in self.widths):
+            raise SettingsError(
+                f"widths are {self.widths}; give 2 to {_MOST_LEVELS} channel counts of 1 to {_MOST_CHANNELS}."
+            )
+        for name, count in (("encoder_convolutions", levels), ("decoder_convolutions", levels - 1)):
+            values = getattr(self, name)
+            if len(values) != count or any(not 1 <= n <= _MOST_CONVOLUTIONS for n in values):
+                raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MOST_CONVOLUTIONS}.")
+        if not 0 <= self.local_contrast <= float(self.local_mean):
+            raise SettingsError(
+                f"local_contrast is {self.local_contrast}; give 0 to 1, and 0 without local_mean, which is "
+                f"{self.local_mean}."
+            )
+
+    @property
+    def stride(self) -> int:
+        """Width and height of an input must be multiples of this [px]."""
+        return 2 ** (len(self.widths) - 1)
+
+    def to_json(self) -> str:
+        """One line of JSON; the inverse of `from_json`."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> "Architecture":
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError, TypeError, KeyError, AttributeError: the text is not an architecture.
+            SettingsError: it is one that cannot exist.
+        """
+        values = parse_json(text)
+        local_mean, local_contrast = bool(values.pop("local_mean")), float(values.pop("local_contrast", 0.0))
+        return Architecture(
+            **{name: tuple(int(n) for n in counts) for name, counts in values.items()},
+            local_mean=local_mean,
+            local_contrast=local_contrast,
+        )
+
+
+Range = tuple[float, float]
+
+DARKEST_BRIGHTNESS = 0.65
+"""Training images are never darkened below this factor: low light is a domain that is only evaluated."""
+
+
+@dataclass(frozen=True)
+class AppearanceRanges:
+    """Ranges that the camera of an observed training image is drawn from.
+
+    There is deliberately no smoke, no blood and no low light: robustness to those is to be shown, not trained.
+    Nothing red is ever drawn over an instrument, nothing hides a part of the image, and `brightness` has a floor.
+    """
+
+    brightness: Range = (0.65, 1.35)
+    """Factor on the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
+    contrast: Range = (0.6, 1.3)
+    """Factor on the distance from the image's mean [1]."""
+    gamma: Range = (0.8, 1.25)
+    """Exponent of the tone curve [1]."""
+    white_balance: Range = (0.82, 1.2)
+    """Factor per colour channel [1]."""
+    blur: Range = (0.0, 1.1)
+    """Standard deviation of the lens blur [px at the working size]."""
+    noise: Range = (0.0, 0.03)
+    """Standard deviation of the sensor noise [1]."""
+    jpeg_quality: Range = (45.0, 98.0)
+    """Quality of the JPEG artefacts, 100 is best."""
+    vignette: Range = (0.0, 0.45)
+    """Darkening in the image corners [1]."""
+    unevenness: float = 0.4
+    """Largest deviation of the logarithm of the light over the image [1]; its mean is left as it is."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.unevenness <= 1:
+            raise SettingsError(f"unevenness is {self.unevenness}; give a value from 0 to 1.")
+        for name in self.__dataclass_fields__:
+            if name == "unevenness":
+                continue
+            low, high = getattr(self, name)
+            if not 0 <= low <= high:
+                raise SettingsError(f"{name} is ({low}, {high}); give two values with 0 <= lower <= upper.")
+        if self.brightness[0] < DARKEST_BRIGHTNESS:
+            raise SettingsError(
+                f"brightness starts at {self.brightness[0]}, below {DARKEST_BRIGHTNESS}. Low light is a domain that is "
+                "evaluated and must not be trained on; raise the lower value."
+            )
+        if self.gamma[0] == 0 or self.jpeg_quality[1] > 100:
+            raise SettingsError("gamma must be positive and jpeg_quality at most 100; correct the range.")
+
+
+_SHARES = ("two_arms", "same_kinematics", "same_background", "occluded", "things", "absent", "from_photographs")
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """What training images look like."""
+
+    width: int = 192
+    """Width of a training image [px]."""
+    height: int = 160
+    """Height of a training image [px]."""
+    field_width: int = 320
+    """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
+    two_arms: float = 0.4
+    """Share of pairs with two arms."""
+    same_kinematics: float = 0.5
+    """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
+    same_background: float = 0.7
+    """Share of pairs whose mean background is that of the observed image."""
+    occluded: float = 0.4
+    """Share of observed images in which something occludes the arms; the labels are those of the arms below it."""
+    things: float = 0.35
+    """Share of observed images with rods, plates, cables and the like behind the arms."""
+    absent: float = 0.1
+    """Share of observed images in which one arm or all are claimed to be in view and are not."""
+    photographs: Path | None = None
+    """Folder of photographs; `from_photographs` of the backgrounds are parts of them."""
+    from_photographs: float = 0.2
+    """Share of backgrounds that are parts of photographs, if a folder of them is given."""
+    recording: Path | None = None
+    """Sequence file; arms are then where its cameras see them, about, and not 5 to 25 cm from the camera."""
+    coverage: tuple[float, float] = (0.004, 0.5)
+    """Allowed share of the image that shows arms."""
+    appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
+    """The camera's ranges."""
+
+    def __post_init__(self) -> None:
+        if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
+            raise SettingsError(
+                f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
+            )
+        if self.field_width < self.width:
+            raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
+        for name in _SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
+        if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
+            raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")
+
 
 NetworkName = Literal["feature", "surface"]
 """Which network is trained."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_core.project import frames_in
-from carts_core.project.queries import UNREVIEWED
+from carts_core.project.state import UNREVIEWED
 from carts_viewer import intents
 from carts_viewer.adapting import adapt
 from carts_viewer.checks import unknown

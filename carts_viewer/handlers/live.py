@@ -10,7 +10,7 @@ from carts_core.live import LiveTracker, Recorder, Results, Tracked, open_stream
 from carts_core.live.moments import mounts_of
 from carts_core.optimization import Backgrounds
 from carts_core.project import Provenance, Source
-from carts_core.settings.streams import StreamAddress, StreamKind
+from carts_core.settings.live import StreamAddress, StreamKind
 from carts_viewer import intents
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun

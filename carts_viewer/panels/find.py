@@ -3,7 +3,7 @@
 import viser
 
 from carts_core.project import ProjectState, ReviewState
-from carts_core.project.fit_verdict import VERDICTS
+from carts_core.project.values import VERDICTS
 from carts_viewer import intents
 from carts_viewer.finding import ANY, BY_HAND, NOT_CHECKED, SOLVED, UNJUDGED, FrameFilter, found
 from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write

@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 import viser
 
 from carts_core.settings import DescentSolver, SurfaceSolver
-from carts_core.settings.docstrings import field_docstrings
+from carts_core.settings.serialization import field_docstrings
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
 from carts_viewer.presets import PRESETS

@@ -11,7 +11,7 @@ from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
 from carts_core.recording import Sequence, spread
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 
 FRAMES = 20
 """Frames that take part, spread evenly."""

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 from carts_viewer.start.roots import Roots
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page

@@ -12,7 +12,7 @@ import viser
 from carts_core.errors import CartsError
 from carts_core.resources import sample_sequence
 from carts_core.segmentation import Segmenter
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.recording.place import RecordingPlace

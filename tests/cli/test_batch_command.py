@@ -22,7 +22,7 @@ from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError
 from carts_core.files import output_path
 from carts_core.networks import FeatureExtractor
-from carts_core.settings.inference import Inference
+from carts_core.settings.optimization import Inference
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 

@@ -6,8 +6,7 @@ from safetensors.torch import save_file
 
 from carts_core.errors import WeightsError
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.network import FeatureNetwork
-from carts_core.networks.surface_network import SurfaceNetwork
+from carts_core.networks.network import FeatureNetwork, SurfaceNetwork
 from carts_core.networks.weights import VERSION, read_weights, save_weights
 from carts_core.settings import Architecture
 

@@ -11,8 +11,8 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.networks import FeatureExtractor, inference
-from carts_core.networks.onnx_surface import OnnxSurface
-from carts_core.networks.surface_network import SurfaceNetwork
+from carts_core.networks.inference import OnnxSurface
+from carts_core.networks.network import SurfaceNetwork
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
@@ -87,7 +87,7 @@ def test_the_graph_is_exported_once_and_again_where_it_was_damaged(
     FeatureExtractor.load(weights, inference="onnx")
     (graph,) = cache.glob("surface-*.onnx")
     whole = graph.read_bytes()
-    monkeypatch.setattr("carts_core.networks.onnx_surface._exported", lambda network: pytest.fail("exported again"))
+    monkeypatch.setattr("carts_core.networks.inference._exported", lambda network: pytest.fail("exported again"))
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
     monkeypatch.undo()
     monkeypatch.setenv("CARTS_CACHE", str(cache))

@@ -11,7 +11,7 @@ import pytest
 from project_model import IDENTITY
 
 from carts_core.project import Key, Project, Review
-from carts_core.project.lock import holder, try_lock
+from carts_core.project.file import holder, try_lock
 
 NOTE = {Key.review(0): Review(note="a")}
 

@@ -4,8 +4,8 @@ import torch
 
 from carts_core.model.scene import Light
 from carts_core.rendering.motion import carry_motion
+from carts_core.rendering.points import phong
 from carts_core.rendering.reference import carry_motion_ref, phong_ref
-from carts_core.rendering.shading import phong
 
 
 def random_points(count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -1,30 +1,243 @@
-"""Training of a baseline: frames of ours, the paper's loss, a checkpoint now and then."""
+"""Training of a baseline on shared synthetic frames.
+
+The loss is the paper's; augmentations are those of CaRTS and of SegSTRONG-C.
+"""
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.nn import functional
 
-from ...errors import SettingsError
-from ...files import OutputPath, locked_folder, output_path
-from ...model.surface import NORMALS
+from ...errors import SettingsError, WeightsError
+from ...files import OutputPath, holds_file, locked_folder, output_path, write_bytes
+from ...files.reading import WEIGHTS, check_regular
+from ...model.robot import Robot
+from ...model.surface import COVERAGE, NORMALS
 from ...networks.network import channels_last
-from ...settings.baseline import BaselineNetwork, BaselineTraining
+from ...networks.weights import tensor_bytes
+from ...resources import shipped_robot
+from ...settings import ImageSettings
+from ...settings.baseline import Augmentation, BaselineNetwork, BaselineTraining
 from ...stopping import finished_first
+from ..randomization import SURFACE_UNIT, SurfaceGenerator
 from ..training.checkpoint import History, load_checkpoint, save_checkpoint
 from ..training.training import schedule
 from ..training.validation import dice
-from .augmentation import augmentation
-from .frames import SIZE, TrainingFrames, chunks_of, make_chunk, missing_chunks
-from .networks import Baseline
-from .weights import save_baseline, start_from
+from .networks import Baseline, save_baseline, segmentation_models, start_from
+
+Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From an image [3, h, w], uint8, and its mask [1, h, w] to those that are learned from."""
+
+SMOKE_SHARE, SMOKE_STRENGTH = 0.2, 0.3
+"""Share of images with smoke and its largest opacity: `p` and `smoke_aug` of the paper's released configuration."""
+_SMOKE_WHITE = 255.0
+_GEOMETRIC = {"ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate"}
+
+
+def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
+    """The change of that name; torchvision's draw from torch's own random numbers."""
+    match name:
+        case "none":
+            return lambda image, mask: (image, mask)
+        case "smoke":
+            return lambda image, mask: (smoked(image, rng), mask)
+        case "autoaugment":
+            return _AutoAugment()
+        case "elastic" | "projective":
+            return _warped(name)
+
+
+def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Tensor, "3 h w"]:
+    """An image of five with a flat layer of smoke from the diamond-square algorithm, the others as they are."""
+    if rng.random() >= SMOKE_SHARE:
+        return image
+    height, width = image.shape[1:]
+    side = 2 ** int(np.ceil(np.log2(max(height, width)))) + 1
+    opacity = SMOKE_STRENGTH * torch.from_numpy(diamond_square(side, rng)[:height, :width])
+    return ((1 - opacity) * image + opacity * _SMOKE_WHITE).round().to(torch.uint8)
+
+
+def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) -> Float[np.ndarray, "side side"]:
+    """A plasma fractal, scaled to [0, 1].
+
+    Args:
+        side: one more than a power of two.
+        rng: source of randomness.
+        roughness: amplitude of each level relative to the one before.
+    """
+    field = np.zeros((side, side), np.float32)
+    step, amplitude = side - 1, 1.0
+    field[::step, ::step] = rng.normal(size=(2, 2))
+    while step > 1:
+        half = step // 2
+        corners = field[::step, ::step]
+        squares = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
+        field[half::step, half::step] = squares + amplitude * rng.normal(size=squares.shape)
+        # Each diamond's middle is the mean of its neighbours at half a step, of which the border has three.
+        padded = np.pad(field, half, constant_values=np.nan)
+        for rows, columns in (
+            (slice(0, None, step), slice(half, None, step)),
+            (slice(half, None, step), slice(0, None, step)),
+        ):
+            target = field[rows, columns]
+            top, left = rows.start, columns.start
+            around = [
+                padded[top + half + dy :: step, left + half + dx :: step][: target.shape[0], : target.shape[1]]
+                for dy, dx in ((-half, 0), (half, 0), (0, -half), (0, half))
+            ]
+            field[rows, columns] = np.nanmean(around, axis=0) + amplitude * rng.normal(size=target.shape)
+        step, amplitude = half, amplitude * roughness
+    low, high = float(field.min()), float(field.max())
+    return (field - low) / max(high - low, 1e-6)
+
+
+class _AutoAugment:
+    """torchvision's AutoAugment with ImageNet's policy; what moves the image moves the mask with it."""
+
+    def __init__(self) -> None:
+        segmentation_models()
+        from torchvision.transforms import autoaugment  # noqa: PLC0415
+
+        self._module, self._policy = autoaugment, autoaugment.AutoAugment()
+
+    def __call__(self, image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        policy = self._policy
+        chosen, chances, signs = policy.get_params(len(policy.policies))
+        space = policy._augmentation_space(10, (image.shape[1], image.shape[2]))
+        for place, (name, chance, level) in enumerate(policy.policies[chosen]):
+            if float(chances[place]) > chance:
+                continue
+            values, signed = space[name]
+            magnitude = float(values[level]) if level is not None else 0.0
+            if signed and int(signs[place]) == 0:
+                magnitude = -magnitude
+            image = self._applied(image, name, magnitude)
+            if name in _GEOMETRIC:
+                mask = self._applied(mask, name, magnitude)
+        return image, mask
+
+    def _applied(self, picture: Tensor, name: str, magnitude: float) -> Tensor:
+        return self._module._apply_op(picture, name, magnitude, self._policy.interpolation, None)
+
+
+def _warped(name: Augmentation) -> Change:
+    segmentation_models()
+    from torchvision import tv_tensors  # noqa: PLC0415
+    from torchvision.transforms import v2  # noqa: PLC0415
+
+    transform = v2.ElasticTransform() if name == "elastic" else v2.RandomPerspective()
+
+    def change(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        image, mask = transform(tv_tensors.Image(image), tv_tensors.Mask(mask))
+        return image.as_subclass(Tensor), mask.as_subclass(Tensor)
+
+    return change
+
+
+SIZE = (256, 192)
+"""Width and height of a training frame [px]: a whole image, not a crop."""
+IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
+"""Regular images: no smoke, blood or low light, nothing that hides the arms or looks like one, and no arm missing."""
+CHUNK = 250
+"""Frames of a file."""
+
+
+class TrainingFrames:
+    """Images, what is rendered of kinematics that are a few degrees off, and masks.
+
+    Args:
+        folder: with the files that `make_chunk` wrote.
+        chunks: numbers of the files.
+
+    Raises:
+        WeightsError: a file cannot be read, or holds other frames.
+    """
+
+    def __init__(self, folder: OutputPath, chunks: Iterable[int]) -> None:
+        parts = [_read(_file(folder, chunk).path) for chunk in chunks]
+        self._images, self._given, self._masks = (torch.cat(part) for part in zip(*parts, strict=True))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def batch(
+        self, numbers: Iterable[int]
+    ) -> tuple[UInt8[Tensor, "batch 3 h w"], Float[Tensor, "batch 6 h w"], Float[Tensor, "batch 1 h w"]]:
+        """Images, surface maps of the given kinematics, and masks, by their numbers."""
+        chosen = list(numbers)
+        return (
+            self._images[chosen],
+            self._given[chosen].float() / SURFACE_UNIT,
+            self._masks[chosen].float()[:, None],
+        )
+
+
+def missing_chunks(folder: OutputPath, count: int) -> list[int]:
+    """Numbers of the files that have to be made for so many frames."""
+    return [chunk for chunk in range(chunks_of(count)) if not holds_file(_file(folder, chunk))]
+
+
+def chunks_of(count: int) -> int:
+    """Files that hold so many frames."""
+    return -(-count // CHUNK)
+
+
+def make_chunk(folder: OutputPath, chunk: int, seed: int, progress: Callable[[int], None] = lambda done: None) -> None:
+    """Make one file of frames; it depends on the seed and its number only.
+
+    Args:
+        folder: where it is written.
+        chunk: its number.
+        seed: of all frames.
+        progress: is called with the number of frames that are made.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    generator = SurfaceGenerator([Robot.load(shipped_robot())], IMAGES, (seed, chunk))
+    images, given, masks = [], [], []
+    for number in range(CHUNK):
+        sample = generator(number)
+        images.append(sample.observed.transpose(2, 0, 1))
+        given.append(sample.given.transpose(2, 0, 1))
+        covered = sample.surface[..., COVERAGE].sum(-1, dtype=np.int16)
+        masks.append((2 * covered > SURFACE_UNIT).astype(np.uint8))
+        progress(number + 1)
+    arrays = {"images": images, "given": given, "masks": masks}
+    tensors = {name: torch.from_numpy(np.stack(values)).contiguous() for name, values in arrays.items()}
+    write_bytes(_file(folder, chunk), tensor_bytes(tensors, {"settings": _settings(), "seed": str(seed)}))
+
+
+def _file(folder: OutputPath, chunk: int) -> OutputPath:
+    return folder / f"frames_{chunk:03d}.safetensors"
+
+
+def _settings() -> str:
+    return json.dumps(asdict(IMAGES))
+
+
+def _read(path: Path) -> tuple[Tensor, Tensor, Tensor]:
+    try:
+        check_regular(path, WEIGHTS)
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get("settings") != _settings():
+                raise ValueError("its frames were made with other settings")
+            images, given, masks = (file.get_tensor(name) for name in ("images", "given", "masks"))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(
+            f"training frames {path} cannot be read ({error}). Delete the file to have them made again."
+        ) from error
+    return images, given, masks
+
 
 WEIGHTS_FILE = "baseline.safetensors"
 VALIDATION = 100

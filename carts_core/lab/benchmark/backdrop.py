@@ -8,10 +8,9 @@ from ...files import holds_file, output_path, write_bytes
 from ...model.mesh_cache import cache_dir
 from ...recording.images import read_image
 from ...settings import EndoscopeConfig, SynthesisConfig
-from ..synthesis.layout import place_cameras
+from ..synthesis.domains import expose, exposure_gain
 from ..synthesis.path_tracer import PathTracer
-from ..synthesis.sensor import expose, exposure_gain
-from ..synthesis.tissue import KINDS, grow_tissue
+from ..synthesis.scene import KINDS, grow_tissue, place_cameras
 
 
 def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:

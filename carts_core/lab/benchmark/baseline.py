@@ -13,7 +13,7 @@ from ...model.surface import COVERAGE
 from ...networks.extractor import FeatureExtractor
 from ...recording import Frame
 from ...rendering import Renderer
-from ..baselines.weights import TrainedBaseline
+from ..baselines.networks import TrainedBaseline
 from .frame import Truth
 from .machine import machine
 from .measurement import Measurement

@@ -11,11 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 from ...recording import Frame, MeanBackground, Sequence
 from ...recording.background import spread
 from ...settings import DOMAINS, DomainConfig, SensorConfig, SynthesisConfig
-from ..synthesis.blood import Bleeding
+from ..synthesis.domains import Bleeding, Smoke, SmokeOverlay, expose, linear
 from ..synthesis.path_tracer import Surface
-from ..synthesis.sensor import expose, linear
-from ..synthesis.smoke import Smoke, SmokeOverlay
-from ..synthesis.tissue import Tissue, grow_tissue
+from ..synthesis.scene import Tissue, grow_tissue
 from .real_surface import DISTANCE, RealSurface
 
 _FRAME_INTERVAL = 0.25

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ...settings import SensorConfig
-from ..synthesis.noise import smooth_noise, smoothstep
-from ..synthesis.sensor import expose, linear
+from ..synthesis.domains import expose, linear, smooth_noise, smoothstep
 
 OCCLUSION = "occlusion"
 """Name of the domain."""

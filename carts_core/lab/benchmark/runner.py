@@ -15,7 +15,7 @@ from ...recording import Frame
 from ...rendering import Renderer
 from ...settings import DescentSolver
 from ...wording import counted
-from ..baselines.weights import TrainedBaseline
+from ..baselines.networks import TrainedBaseline
 from .baseline import segment_rendered, segment_with
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment

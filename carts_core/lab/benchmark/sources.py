@@ -18,7 +18,7 @@ from ...recording import Frame, MeanBackground, Sequence
 from ...recording.background import spread
 from ...settings import DOMAINS, EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ...wording import counted
-from ..synthesis.layout import place_cameras
+from ..synthesis.scene import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from .another_room import AnotherRoom
 from .backdrop import backdrop

@@ -14,7 +14,7 @@ from ...optimization import DescentSolver, FrameOptimizer, SolverSettings, Surfa
 from ...recording import Sequence
 from ...rendering import Renderer, visibility_torch
 from ...rendering.geometry import link_transforms, vertices_in_camera
-from ...rendering.visibility_numba import rasterize
+from ...rendering.rasterizer import rasterize
 from ...wording import counted
 
 

@@ -2,14 +2,14 @@
 
 from ...settings import AppearanceRanges as AppearanceRanges
 from ...settings import ImageSettings as ImageSettings
-from .pairs import BACKGROUND as BACKGROUND
-from .pairs import HEAD as HEAD
-from .pairs import SHAFT as SHAFT
-from .pairs import PairGenerator as PairGenerator
-from .pairs import TrainingPair as TrainingPair
-from .surfaces import SURFACE_UNIT as SURFACE_UNIT
-from .surfaces import SurfaceGenerator as SurfaceGenerator
-from .surfaces import SurfaceSample as SurfaceSample
+from .samples import BACKGROUND as BACKGROUND
+from .samples import HEAD as HEAD
+from .samples import SHAFT as SHAFT
+from .samples import SURFACE_UNIT as SURFACE_UNIT
+from .samples import PairGenerator as PairGenerator
+from .samples import SurfaceGenerator as SurfaceGenerator
+from .samples import SurfaceSample as SurfaceSample
+from .samples import TrainingPair as TrainingPair
 
 __all__ = [
     "BACKGROUND",

@@ -1,10 +1,276 @@
-"""Things on the background that are not instruments, and shadows, theirs and the instruments'."""
+"""Distractors of training images: solid objects, small items, occluders and shadows.
+
+Solid objects (rods, plates, cables, tools) are shaded as the arms are, so that neither gloss nor shape alone identifies
+an instrument. The occluded surface of an arm remains the label.
+"""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from .arms import Intrinsics, PosedRobot
+from .backgrounds import random_background, smooth_noise
+from .shading import render_gbuffer, shade
+
 Image = Float[np.ndarray, "h w 3"]
+
+_SUPERSAMPLING = 2
+_DEPTH = (0.05, 0.40)
+"""Distance from the camera [m]."""
+_NO_SHAFT = -1
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A thing's triangles; see `Body`."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    faces: np.ndarray
+    face_part: np.ndarray
+    shaft: int
+    """Part that is painted as shafts are, mostly dark; `_NO_SHAFT` if none is."""
+    shaft_axis: Float[np.ndarray, "3"]
+    shaft_end: Float[np.ndarray, "3"]
+
+
+def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
+    """One to four things at random in front of a background, with shadows beside them.
+
+    Args:
+        rng: random numbers.
+        image: the background.
+        intrinsics: fx, fy, cx, cy [px].
+    """
+    height, width = image.shape[:2]
+    things = [random_thing(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
+    posed = [_placed(rng, thing, intrinsics, width, height) for thing in things]
+    fx, fy, cx, cy = (value * _SUPERSAMPLING for value in intrinsics)
+    view = render_gbuffer(things, posed, (fx, fy, cx, cy), width * _SUPERSAMPLING, height * _SUPERSAMPLING)
+    color = shade(rng, view, things, image.mean((0, 1)))
+    layers = view.image(np.column_stack([color, np.ones(len(color))]).astype(np.float32))
+    layers = cv2.resize(layers, (width, height), interpolation=cv2.INTER_AREA)
+    coverage = np.ascontiguousarray(layers[..., 3])
+    for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
+        image = cast_shadow(rng, image, coverage)
+    return image * (1 - coverage[..., None]) + layers[..., :3]
+
+
+def random_thing(rng: np.random.Generator) -> Solid:
+    """A rod, plate, rail, cable, tool or ring of centimetres, about its own origin."""
+    kinds = [_rod, _plate, _rails, _cable, _tool, _ring]
+    make = kinds[int(rng.choice(len(kinds), p=[0.3, 0.2, 0.12, 0.16, 0.14, 0.08]))]
+    parts = make(rng)
+    counts = [len(vertices) for vertices, _ in parts]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    vertices = np.concatenate([vertices for vertices, _ in parts]).astype(np.float32)
+    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)]).astype(np.int32)
+    face_part = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts]).astype(np.int32)
+    vertices -= vertices.mean(0)
+    axis = np.array([0.0, 0.0, 1.0])
+    end = axis * float(vertices[:, 2].min())
+    shaft = 0 if rng.random() < 0.5 else _NO_SHAFT
+    return Solid(vertices, _normals(vertices, faces), faces, face_part, shaft, axis, end)
+
+
+Part = tuple[np.ndarray, np.ndarray]
+"""Vertices [V, 3] and triangles [F, 3]."""
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _rod(rng: np.random.Generator) -> list[Part]:
+    """A rod or tube, sometimes of two materials or with a collar."""
+    radius, length = _log_uniform(rng, 0.0008, 0.012), _log_uniform(rng, 0.04, 0.5)
+    cut = length * rng.uniform(0.1, 0.9) if rng.random() < 0.4 else length
+    parts = [_straight(0, cut, radius, radius * rng.uniform(0.8, 1.0))]
+    if cut < length:
+        parts.append(_straight(cut, length, radius * rng.uniform(0.7, 1.4), radius * rng.uniform(0.5, 1.4)))
+    if rng.random() < 0.3:
+        at = rng.uniform(0, length)
+        wide = radius * rng.uniform(1.2, 2.5)
+        parts.append(_straight(at, at + radius * rng.uniform(0.5, 4), wide, wide))
+    return parts
+
+
+def _plate(rng: np.random.Generator) -> list[Part]:
+    """A disc or a rectangular plate, sometimes with a rim."""
+    thickness = _log_uniform(rng, 0.0008, 0.02)
+    if rng.random() < 0.4:
+        radius = _log_uniform(rng, 0.006, 0.12)
+        parts = [_straight(0, thickness, radius, radius * rng.uniform(0.8, 1.0), sides=36)]
+        if rng.random() < 0.4:
+            parts.append(_bent(_circle(radius), thickness * rng.uniform(0.6, 1.5)))
+        return parts
+    return [_box(np.array([_log_uniform(rng, 0.01, 0.2), _log_uniform(rng, 0.006, 0.2), thickness]), np.zeros(3))]
+
+
+def _rails(rng: np.random.Generator) -> list[Part]:
+    """Parallel bars, round or square, as of a frame or a rack."""
+    radius, length, gap = _log_uniform(rng, 0.001, 0.008), rng.uniform(0.1, 0.5), _log_uniform(rng, 0.008, 0.05)
+    square, parts = rng.random() < 0.5, []
+    for index in range(int(rng.integers(2, 6))):
+        offset = np.array([index * gap, 0.0, 0.0])
+        if square:
+            parts.append(_box(np.array([2 * radius, 2 * radius, length]), offset))
+        else:
+            vertices, faces = _straight(0, length, radius, radius, sides=12)
+            parts.append((vertices + offset - (0, 0, length / 2), faces))
+    if rng.random() < 0.5:
+        extent = np.array([gap * len(parts), 2.2 * radius, 2 * radius])
+        parts.append(_box(extent, np.array([gap * (len(parts) - 1) / 2, 0.0, length * rng.uniform(-0.5, 0.5)])))
+    return parts
+
+
+def _cable(rng: np.random.Generator) -> list[Part]:
+    """A winding cable, hose or wire."""
+    steps = 40
+    turns = np.cumsum(rng.normal(0, rng.uniform(0.02, 0.25), (steps, 3)), axis=0)
+    heading = np.array([0.0, 0.0, 1.0]) + turns
+    heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+    points = np.cumsum(heading, axis=0) * rng.uniform(0.1, 0.5) / steps
+    return [_bent(points, _log_uniform(rng, 0.0005, 0.006))]
+
+
+def _tool(rng: np.random.Generator) -> list[Part]:
+    """Two bars that cross, as of scissors, pliers and tweezers, often with rings to hold it by."""
+    length, thickness = rng.uniform(0.06, 0.2), _log_uniform(rng, 0.0015, 0.005)
+    opening, joint = rng.uniform(0.02, 0.35), rng.uniform(-0.4, 0.4) * length
+    parts: list[Part] = []
+    for side in (-1, 1):
+        R = _turn_about_y(side * opening / 2)
+        vertices, faces = _box(np.array([thickness * rng.uniform(1, 3), thickness, length]), np.array([0, 0, joint]))
+        parts.append((vertices @ R.T, faces))
+        if rng.random() < 0.6:
+            radius = rng.uniform(0.008, 0.016)
+            ring, faces = _bent(_circle(radius), thickness / 2)
+            ring = ring @ _turn_about_x(np.pi / 2).T + (0, 0, joint - length / 2 - radius)
+            parts.append((ring @ R.T, faces))
+    return parts
+
+
+def _ring(rng: np.random.Generator) -> list[Part]:
+    radius = _log_uniform(rng, 0.004, 0.05)
+    return [_bent(_circle(radius), radius * rng.uniform(0.05, 0.4))]
+
+
+def _straight(low: float, high: float, near: float, far: float, sides: int = 20) -> Part:
+    """A cylinder or cone along z with flat ends, whose vertices are its own so that edges stay sharp."""
+    rings = [(low, 0.0), (low, near), (low, near), (high, far), (high, far), (high, 0.0)]
+    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    vertices = np.concatenate([np.column_stack([radius * circle, np.full(sides, z)]) for z, radius in rings])
+    return vertices, np.concatenate([_band(index * sides, sides) for index in (0, 2, 4)])
+
+
+def _bent(points: np.ndarray, radius: float, sides: int = 10) -> Part:
+    """A tube along points [n, 3]; a closed one where the last point is the first."""
+    along = np.gradient(points, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True) + 1e-12
+    helper = np.eye(3)[np.abs(along).mean(0).argmin()]
+    u = np.cross(along, helper)
+    u /= np.linalg.norm(u, axis=1, keepdims=True) + 1e-12
+    v = np.cross(along, u)
+    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    around = np.cos(angles)[None, :, None] * u[:, None] + np.sin(angles)[None, :, None] * v[:, None]
+    vertices = (points[:, None] + radius * around).reshape(-1, 3)
+    return vertices, np.concatenate([_band(index * sides, sides) for index in range(len(points) - 1)])
+
+
+def _band(start: int, sides: int) -> np.ndarray:
+    """Triangles between a ring of vertices and the next one."""
+    here = start + np.arange(sides)
+    beside = start + (np.arange(sides) + 1) % sides
+    corners = np.stack([here, beside, here + sides, beside, beside + sides, here + sides], 1)
+    return corners.reshape(-1, 3)
+
+
+def _circle(radius: float) -> np.ndarray:
+    angles = np.linspace(0, 2 * np.pi, 33)
+    return radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+
+
+def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
+    """A box whose faces have vertices of their own."""
+    vertices, faces = [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            corners = np.zeros((4, 3))
+            corners[:, axis] = sign
+            corners[:, (axis + 1) % 3] = (-1, 1, 1, -1)
+            corners[:, (axis + 2) % 3] = (-1, -1, 1, 1)
+            faces.append(np.array([[0, 1, 2], [0, 2, 3]]) + 4 * len(vertices))
+            vertices.append(corners * extents / 2 + centre)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"]:
+    """Means of the triangles at each vertex, weighted by area; the sign does not matter (see `render_gbuffer`)."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    cross, normals = np.cross(b - a, c - a), np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], cross)
+    return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-20)).astype(np.float32)
+
+
+def _placed(rng: np.random.Generator, thing: Solid, intrinsics: Intrinsics, width: int, height: int) -> PosedRobot:
+    """Somewhere in or near the image, turned any way."""
+    fx, fy, cx, cy = intrinsics
+    depth = _log_uniform(rng, *_DEPTH)
+    u, v = rng.uniform(-0.1, 1.1, 2) * (width, height)
+    centre = np.array([(u - cx) / fx * depth, (v - cy) / fy * depth, depth])
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32)
+    vertices = thing.vertices @ R.T + centre
+    return PosedRobot(vertices.astype(np.float32), thing.normals @ R.T)
+
+
+def _turn_about_x(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def _turn_about_y(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
+    """One to three things of any texture but a red one over the arms, ragged or smooth; none where there is no arm."""
+    rows, columns = np.nonzero(coverage > 0.5)
+    if not len(rows):
+        return image
+    height, width = coverage.shape
+    for _ in range(rng.integers(1, 4)):
+        at = rng.integers(len(rows))
+        shape = _shape(rng, (float(columns[at]), float(rows[at])), width, height)[..., None]
+        image = image + shape * (_texture(rng, width, height) - image)
+    return image
+
+
+def _texture(rng: np.random.Generator, width: int, height: int) -> Image:
+    """Any texture without red in it: blood over an instrument is evaluated, so it must not be trained on."""
+    texture = random_background(rng, width, height).astype(np.float32) * rng.uniform(0.6, 1.2)
+    # Where red is strongest it changes places with the next, which leaves no seam where both are as strong.
+    red, strongest = texture[..., 0].copy(), 1 + texture[..., 1:].argmax(2)[..., None]
+    other = np.take_along_axis(texture, strongest, 2)[..., 0]
+    texture[..., 0] = np.minimum(red, other)
+    np.put_along_axis(texture, strongest, np.maximum(red, other)[..., None], 2)
+    return texture
+
+
+def _shape(rng: np.random.Generator, centre: tuple[float, float], width: int, height: int) -> Float[np.ndarray, "h w"]:
+    """Share of each pixel that is hidden: an ellipse with a waved, ragged or smooth edge."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    angle, radius = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(0.012), np.log(0.1))) * width
+    u = ((x - centre[0]) * np.cos(angle) + (y - centre[1]) * np.sin(angle)) / (radius * np.exp(rng.uniform(0, 1)))
+    v = ((y - centre[1]) * np.cos(angle) - (x - centre[0]) * np.sin(angle)) / radius
+    waves = smooth_noise(rng, width, height, rng.uniform(4, 40), int(rng.integers(1, 4)))
+    inside = 1 - np.hypot(u, v) + rng.uniform(0, 0.5) * waves
+    return cv2.GaussianBlur((inside > 0).astype(np.float32), (0, 0), rng.uniform(0.4, 1.5))
 
 
 def add_clutter(rng: np.random.Generator, image: Image) -> Image:

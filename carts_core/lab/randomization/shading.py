@@ -1,6 +1,6 @@
-"""Shading of observed training images: microfacet highlights, several lights and an environment to reflect.
+"""Deferred shading of observed training images: G-buffer, microfacet highlights, lights, environment, lens.
 
-This path is on purpose not the optimizer's Phong: the network must learn what an instrument is, not our shader.
+It differs from the optimizer's Phong shading on purpose: the network must learn instruments and not one shader.
 """
 
 from collections.abc import Sequence
@@ -8,10 +8,157 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from .gbuffer import GBuffer
-from .geometry import Body
+from ...rendering import visibility
+from ...settings import AppearanceRanges
+from .arms import Body, Intrinsics, PosedRobot
+from .backgrounds import smooth_noise
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """Surface points of the pixels that see an arm; n is their number."""
+
+    size: tuple[int, int]
+    """Width and height of the image [px]."""
+    rows: Int[np.ndarray, " n"]
+    columns: Int[np.ndarray, " n"]
+    arm: Int[np.ndarray, " n"]
+    part: Int[np.ndarray, " n"]
+    """Index into `Robot.meshes`."""
+    points: Float[np.ndarray, "n 3"]
+    """In the camera's frame [m]."""
+    normals: Float[np.ndarray, "n 3"]
+    """Unit, towards the camera."""
+    points_link: Float[np.ndarray, "n 3"]
+    """In the frame of the link, for textures that move with it [m]."""
+
+    def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
+        """Scatter per-pixel values [n, ...] into an image [height, width, ...]."""
+        width, height = self.size
+        image = np.full((height, width, *values.shape[1:]), empty, values.dtype)
+        image[self.rows, self.columns] = values
+        return image
+
+
+def render_gbuffer(
+    geometries: Sequence[Body],
+    posed: Sequence[PosedRobot],
+    intrinsics: Intrinsics,
+    width: int,
+    height: int,
+) -> GBuffer:
+    """Rasterise the arms with the same visibility kernel as the renderer; nothing else is shared with it."""
+    vertices = np.concatenate([arm.vertices for arm in posed])
+    normals = np.concatenate([arm.normals for arm in posed])
+    link_points = np.concatenate([geometry.vertices for geometry in geometries])
+    offsets = np.cumsum([0, *[len(geometry.vertices) for geometry in geometries[:-1]]])
+    faces = np.concatenate([g.faces + offset for g, offset in zip(geometries, offsets, strict=True)]).astype(np.int32)
+    face_part = np.concatenate([geometry.face_part for geometry in geometries])
+    face_arm = np.repeat(np.arange(len(geometries)), [len(geometry.faces) for geometry in geometries])
+    face_ids, depth = visibility(vertices, faces, intrinsics, width, height)
+    rows, columns = np.nonzero(face_ids >= 0)
+    face = face_ids[rows, columns]
+    z = depth[rows, columns].astype(np.float32)
+    fx, fy, cx, cy = intrinsics
+    points = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=1).astype(np.float32)
+    weights = _barycentric(points, vertices[faces[face]])
+    corner = faces[face]
+    normal = np.einsum("nk,nkc->nc", weights, normals[corner])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+    away = _row_dot(normal, points) > 0
+    normal[away] *= -1
+    return GBuffer(
+        (width, height), rows, columns, face_arm[face], face_part[face], points, normal.astype(np.float32),
+        np.einsum("nk,nkc->nc", weights, link_points[corner]).astype(np.float32),
+    )  # fmt: skip
+
+
+def _row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("nc,nc->n", a, b)
+
+
+def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Weights [n, 3] of points [n, 3] in the planes of triangles [n, 3, 3]."""
+    a = triangles[:, 0]
+    u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
+    uu, vv, uv = _row_dot(u, u), _row_dot(v, v), _row_dot(u, v)
+    wu, wv = _row_dot(w, u), _row_dot(w, v)
+    scale = 1.0 / np.maximum(uu * vv - uv * uv, 1e-24)
+    s, t = (vv * wu - uv * wv) * scale, (uu * wv - uv * wu) * scale
+    # Round-off on slivers must not extrapolate a normal.
+    s, t = np.clip(s, 0, 1), np.clip(t, 0, 1)
+    return np.stack([np.clip(1 - s - t, 0, 1), s, t], axis=1).astype(np.float32)
+
+
+Image = Float[np.ndarray, "h w 3"]
+
+
+def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
+    """Vignette, blur, exposure, colour, noise and JPEG artefacts, each drawn from `ranges`; result in [0, 1]."""
+    image = image * _vignette(rng, image.shape[1], image.shape[0], ranges)
+    sigma = rng.uniform(*ranges.blur)
+    if sigma > 0.2:
+        image = cv2.GaussianBlur(image, (0, 0), sigma)
+    if rng.random() < 0.25:  # cameras sharpen; that leaves bright seams along dark shafts
+        image = image + rng.uniform(0.2, 1.0) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
+    image = tone(rng, image, ranges)
+    image = np.clip(_noise(rng, image, ranges), 0, 1)
+    if rng.random() < 0.7:
+        image = _jpeg(rng, image, ranges)
+    if rng.random() < 0.08:
+        image = image * _round_mask(rng, image.shape[1], image.shape[0])
+    return image.astype(np.float32)
+
+
+def tone(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
+    """Exposure, white balance, contrast and tone curve alone."""
+    factor = rng.uniform(*ranges.brightness) * rng.uniform(*ranges.white_balance, size=3)
+    # The floor holds for the whole image; white balance moves colours about it.
+    factor *= max(1.0, ranges.brightness[0] / factor.mean())
+    image = np.clip(image * factor.astype(np.float32), 0, 1.2)
+    mean = image.mean()
+    image = mean + (image - mean) * rng.uniform(*ranges.contrast)
+    return np.clip(image, 0, 1) ** np.float32(rng.uniform(*ranges.gamma))
+
+
+def _vignette(rng: np.random.Generator, width: int, height: int, ranges: AppearanceRanges) -> np.ndarray:
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    x, y = x / width - 0.5, y / height - 0.5
+    light = 1 - rng.uniform(*ranges.vignette) * np.clip((x * x + y * y) * 2, 0, 1)
+    if rng.random() < 0.6:
+        light = light * np.exp(
+            rng.uniform(0, ranges.unevenness) * smooth_noise(rng, width, height, rng.uniform(2, 5), 1)
+        )
+        # Light that is uneven is not low light: the image as a whole stays as bright as it was.
+        light = light / light.mean()
+    return np.clip(light, 0.35, 1.6)[..., None]
+
+
+def _noise(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:
+    height, width = image.shape[:2]
+    sigma = rng.uniform(*ranges.noise)
+    luminance = rng.standard_normal((height, width, 1), np.float32)
+    color = cv2.resize(rng.standard_normal((height // 2, width // 2, 3), np.float32), (width, height))
+    return image + sigma * (luminance + 0.7 * color) * (0.5 + image)
+
+
+def _jpeg(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:
+    quality = int(rng.uniform(*ranges.jpeg_quality))
+    coded = cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1].astype(np.float32) / 255
+
+
+def _round_mask(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """The black surround of a round endoscope image."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    radius = np.hypot(x - width * rng.uniform(0.4, 0.6), y - height * rng.uniform(0.4, 0.6))
+    edge = rng.uniform(0.55, 0.75) * width
+    return np.clip((edge - radius) / rng.uniform(1, 6), 0, 1)[..., None]
+
 
 _ENVIRONMENT = (24, 48)
 _GAMMA = 1 / 2.2

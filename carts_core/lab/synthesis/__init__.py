@@ -8,6 +8,6 @@ from ...settings import MotionConfig as MotionConfig
 from ...settings import RenderConfig as RenderConfig
 from ...settings import SensorConfig as SensorConfig
 from ...settings import SynthesisConfig as SynthesisConfig
-from .progress import progress_bar as progress_bar
 from .synthesize import Progress as Progress
+from .synthesize import progress_bar as progress_bar
 from .synthesize import synthesize as synthesize

@@ -18,9 +18,8 @@ from ...model.camera import Camera
 from ...model.robot import Robot
 from ...model.scene import Arm
 from ...settings import EndoscopeConfig, MeasurementError, SynthesisConfig
-from .layout import WORK_POINTS, rotation_between
 from .motion import Rejected, check_clearance, clouds, in_view, random_motion, sample_times, surface_points
-from .tissue import Tissue
+from .scene import WORK_POINTS, Tissue, rotation_between
 
 ARM_NAME = "arm"
 

@@ -1,4 +1,4 @@
-"""Smooth motion of two instruments that stay in view, apart from each other and above the tissue."""
+"""Smooth motion of two instruments that stay in view, apart and above the tissue, and its erroneous measurement."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -13,10 +13,32 @@ from ...errors import SettingsError
 from ...model.camera import Camera
 from ...model.robot import Robot
 from ...model.scene import Arm
-from ...settings import SynthesisConfig
-from .layout import WORK_POINTS
+from ...settings import MeasurementError, SynthesisConfig
 from .path_tracer import NEAR
-from .tissue import Tissue
+from .scene import WORK_POINTS, Tissue
+
+
+def measure(
+    truth: Float[np.ndarray, "frames dofs"],
+    times: Float[np.ndarray, " frames"],
+    error: MeasurementError,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "frames dofs"]:
+    """Measured joint positions T_m = T + bias + drift(t) + noise(t), [rad] or [m] per joint as in `truth`.
+
+    Raises:
+        SettingsError: the error does not have one value per joint, or one more: that of jaws, which some tools lack.
+    """
+    dofs = truth.shape[-1]
+    if len(error.bias) not in (dofs, dofs + 1):
+        raise SettingsError(f"MeasurementError has {len(error.bias)} values per kind, but the robot has {dofs} joints.")
+    bias = np.asarray(error.bias[:dofs]) * rng.choice([-1.0, 1.0], dofs) * rng.uniform(0.6, 1.2, dofs)
+    periods = error.drift_period * rng.uniform(0.6, 1.6, (2, dofs))
+    phases = rng.uniform(0.0, 2.0 * np.pi, (2, dofs))
+    waves = np.sin(2.0 * np.pi * times[:, None, None] / periods + phases).mean(axis=1)
+    noise = rng.standard_normal(truth.shape) * np.asarray(error.noise[:dofs])
+    return truth + bias + np.asarray(error.drift[:dofs]) * waves + noise
+
 
 WRIST_LENGTH = 0.0193
 """From the wrist's first axis to the point between the jaws' tips [m]: 9.1 + 10.2 mm of the classic PSM."""

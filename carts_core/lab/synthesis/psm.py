@@ -21,8 +21,8 @@ from ...resources import shipped_robot
 try:
     from manifold3d import Manifold
 
-    from . import psm_jaw, psm_shaft, psm_wrist
-    from .psm_shapes import cylinder
+    from . import psm_parts
+    from .psm_parts import cylinder
 except ImportError as error:
     raise RobotError(
         f"the PSM's meshes need manifold3d ({error}). Install the extra: pip install 'carts[synthesis]'."
@@ -91,14 +91,14 @@ class Part:
 def parts() -> tuple[Part, ...]:
     """Every mesh of the instrument; `jaw_2_link` shares those of `jaw_1_link`."""
     return (
-        Part("shaft_tube", "roll_link", TUBE, psm_shaft.tube, keep_rings=True),
-        Part("shaft_clevis", "roll_link", METAL, psm_shaft.clevis),
-        Part("shaft_cables", "roll_link", CABLE, psm_shaft.cables),
-        Part("wrist_body", "wrist_pitch_link", METAL, psm_wrist.body),
-        Part("wrist_cables", "wrist_pitch_link", CABLE, psm_wrist.cables),
+        Part("shaft_tube", "roll_link", TUBE, psm_parts.tube, keep_rings=True),
+        Part("shaft_clevis", "roll_link", METAL, psm_parts.clevis),
+        Part("shaft_cables", "roll_link", CABLE, psm_parts.shaft_cables),
+        Part("wrist_body", "wrist_pitch_link", METAL, psm_parts.wrist_body),
+        Part("wrist_cables", "wrist_pitch_link", CABLE, psm_parts.wrist_cables),
         Part("yaw_pin", "wrist_yaw_link", METAL, lambda: cylinder(0.61, -2.84, 2.62, "z", 20)),
-        Part("jaw_body", "jaw_1_link", METAL, psm_jaw.body),
-        Part("jaw_insert", "jaw_1_link", CARBIDE, psm_jaw.insert),
+        Part("jaw_body", "jaw_1_link", METAL, psm_parts.jaw_body),
+        Part("jaw_insert", "jaw_1_link", CARBIDE, psm_parts.insert),
     )
 
 
@@ -181,7 +181,7 @@ def _link(name: str) -> list[str]:
         return [f'  <link name="{name}"/>']
     origin = ""
     if mirrored:
-        origin = f'<origin xyz="0 0 {psm_jaw.OTHER_JAW_SHIFT * 1e-3:g}" rpy="{_numbers((0.0, np.pi, 0.0))}"/>'
+        origin = f'<origin xyz="0 0 {psm_parts.OTHER_JAW_SHIFT * 1e-3:g}" rpy="{_numbers((0.0, np.pi, 0.0))}"/>'
     materials = {color: material for material, color in _MATERIALS}
     visuals = [
         f'    <visual>{origin}<geometry><mesh filename="meshes/{part.name}.ply"/></geometry>'

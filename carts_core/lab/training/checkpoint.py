@@ -11,7 +11,7 @@ from torch import Tensor
 from ...errors import WeightsError
 from ...files import output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json
-from ...networks.tensor_bytes import tensor_bytes
+from ...networks.weights import tensor_bytes
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 

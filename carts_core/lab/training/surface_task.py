@@ -12,7 +12,7 @@ from torch.nn import functional
 from ...model.parts import PARTS
 from ...model.robot import Robot
 from ...model.surface import COVERAGE, NORMALS
-from ...networks.surface_network import SurfaceNetwork
+from ...networks.network import SurfaceNetwork
 from ...settings import TrainingConfig
 from ..randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
 from .objective import dilated, weighted_mean

@@ -10,12 +10,17 @@ from safetensors.torch import save_file
 
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
-from carts_core.lab.baselines import frames as frames_module
-from carts_core.lab.baselines.augmentation import SMOKE_STRENGTH, augmentation, diamond_square, smoked
-from carts_core.lab.baselines.frames import TrainingFrames, make_chunk, missing_chunks
-from carts_core.lab.baselines.networks import Baseline
-from carts_core.lab.baselines.training import train_baseline
-from carts_core.lab.baselines.weights import read_baseline, save_baseline, start_from
+from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline, start_from
+from carts_core.lab.baselines.training import (
+    SMOKE_STRENGTH,
+    TrainingFrames,
+    augmentation,
+    diamond_square,
+    make_chunk,
+    missing_chunks,
+    smoked,
+    train_baseline,
+)
 from carts_core.networks.weights import read_weights
 from carts_core.settings import Architecture
 from carts_core.settings.baseline import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
@@ -131,7 +136,7 @@ def test_smoke_brightens_one_image_in_five_and_never_by_more_than_its_strength()
 
 
 def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames_module, "CHUNK", 2)
+    monkeypatch.setattr("carts_core.lab.baselines.training.CHUNK", 2)
     folder, other = output_path(tmp_path / "a"), output_path(tmp_path / "b")
     assert missing_chunks(folder, 3) == [0, 1]
     make_chunk(folder, 0, seed=5)

@@ -8,8 +8,7 @@ from handmade import make_measurement
 
 from carts_core.console import Terminal
 from carts_core.files import output_path
-from carts_core.lab.baselines.networks import Baseline
-from carts_core.lab.baselines.weights import read_baseline, save_baseline
+from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
 from carts_core.lab.benchmark import Benchmark, Measurement, Target, plan
 from carts_core.lab.benchmark.accuracy_tables import main_tables
 from carts_core.lab.benchmark.image_alone import image_alone_table, image_alone_targets

@@ -15,7 +15,7 @@ from carts_core.lab.benchmark.backdrop import backdrop
 from carts_core.lab.benchmark.counterfactual import Counterfactual
 from carts_core.lab.benchmark.real_surface import DISTANCE, RealSurface
 from carts_core.lab.synthesis import DOMAINS, path_tracer
-from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.lab.synthesis.scene import Tissue
 from carts_core.recording import Sequence
 
 SIZE = {"width": 160, "height": 120}

@@ -14,18 +14,12 @@ from carts_core.lab.randomization import (
     PairGenerator,
     SurfaceGenerator,
     TrainingPair,
-    variants,
+    arms,
 )
-from carts_core.lab.randomization.backgrounds import MAKERS, random_background
-from carts_core.lab.randomization.clutter import contact_shadow
-from carts_core.lab.randomization.gbuffer import render_gbuffer
-from carts_core.lab.randomization.geometry import RobotGeometry
-from carts_core.lab.randomization.lens import tone
-from carts_core.lab.randomization.occluders import occlude
-from carts_core.lab.randomization.photographs import Photographs
-from carts_core.lab.randomization.placement import perturbed, random_intrinsics, random_placement
-from carts_core.lab.randomization.shading import shade
-from carts_core.lab.randomization.things import add_things, random_thing
+from carts_core.lab.randomization.arms import RobotGeometry, perturbed, random_intrinsics, random_placement
+from carts_core.lab.randomization.backgrounds import MAKERS, Photographs, random_background
+from carts_core.lab.randomization.clutter import add_things, contact_shadow, occlude, random_thing
+from carts_core.lab.randomization.shading import render_gbuffer, shade, tone
 from carts_core.model.robot import Robot
 from carts_core.settings import DARKEST_BRIGHTNESS
 
@@ -72,7 +66,7 @@ def test_about_half_of_the_hybrids_show_the_observed_kinematics(pairs: list[Trai
 
 
 def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Robot, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(variants, "PERFECT_MODEL", 1.0)
+    monkeypatch.setattr(arms, "PERFECT_MODEL", 1.0)
     settings = ImageSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
     pair = PairGenerator([shipped_psm], settings, seed=11)()
     overlap = (pair.observed_classes > 0) & (pair.hybrid_classes > 0)

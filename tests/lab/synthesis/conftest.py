@@ -13,7 +13,7 @@ from carts_core.lab.synthesis import (
     SynthesisConfig,
     synthesize,
 )
-from carts_core.lab.synthesis.tissue import EXTENT, Tissue
+from carts_core.lab.synthesis.scene import EXTENT, Tissue
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from carts_core.evaluation import dice
 from carts_core.lab.benchmark.seven_joint_arm import write_arm
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
 from carts_core.lab.synthesis.any_robot import enlarged, enlargement, measurement_error
-from carts_core.lab.synthesis.layout import place_cameras
+from carts_core.lab.synthesis.scene import place_cameras
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from carts_core.lab.synthesis import DomainConfig
-from carts_core.lab.synthesis.blood import Bleeding
+from carts_core.lab.synthesis.domains import Bleeding
 from carts_core.lab.synthesis.path_tracer import Surface
-from carts_core.lab.synthesis.tissue import Tissue, grow_tissue
+from carts_core.lab.synthesis.scene import Tissue, grow_tissue
 
 H, W = 90, 120
 EYE = np.array([0.0, 0.0, 0.1])

@@ -6,7 +6,7 @@ import torch
 
 from carts_core.errors import RobotError
 from carts_core.lab.synthesis import EndoscopeConfig, SynthesisConfig
-from carts_core.lab.synthesis.layout import WORK_POINTS, is_instrument, load_robot, place_arms, place_cameras
+from carts_core.lab.synthesis.scene import WORK_POINTS, is_instrument, load_robot, place_arms, place_cameras
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 

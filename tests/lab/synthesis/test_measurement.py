@@ -5,7 +5,7 @@ import pytest
 
 from carts_core.errors import SettingsError
 from carts_core.lab.synthesis import MeasurementError
-from carts_core.lab.synthesis.measurement import measure
+from carts_core.lab.synthesis.motion import measure
 
 TIMES = np.arange(400) / 20.0
 

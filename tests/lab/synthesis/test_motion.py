@@ -9,9 +9,8 @@ from scipy.spatial import KDTree
 
 from carts_core.errors import SettingsError
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, SynthesisConfig
-from carts_core.lab.synthesis.layout import place_arms, place_cameras
 from carts_core.lab.synthesis.motion import plan_motion, reach_tip
-from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.lab.synthesis.scene import Tissue, place_arms, place_cameras
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene

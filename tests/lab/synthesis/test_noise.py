@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carts_core.lab.synthesis.noise import smooth_noise, smoothstep
+from carts_core.lab.synthesis.scene import smooth_noise, smoothstep
 
 
 @pytest.mark.parametrize("shape", [(64,), (48, 64), (24, 16, 20)])

@@ -7,10 +7,8 @@ import pytest
 
 from carts_core.errors import CartsError
 from carts_core.lab.synthesis import EndoscopeConfig, RenderConfig, path_tracer
-from carts_core.lab.synthesis.layout import place_arms, place_cameras
-from carts_core.lab.synthesis.path_tracer import PathTracer
-from carts_core.lab.synthesis.stage import Stage
-from carts_core.lab.synthesis.tissue import Tissue
+from carts_core.lab.synthesis.path_tracer import PathTracer, Stage
+from carts_core.lab.synthesis.scene import Tissue, place_arms, place_cameras
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carts_core.lab.synthesis import SensorConfig
-from carts_core.lab.synthesis.sensor import expose, exposure_gain
+from carts_core.lab.synthesis.domains import expose, exposure_gain
 
 IDEAL = SensorConfig(vignette=0.0, blur=0.0, full_well=1e6, read_noise=0.0, sharpening=0.0)
 

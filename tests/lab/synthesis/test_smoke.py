@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carts_core.lab.synthesis import DomainConfig
-from carts_core.lab.synthesis.smoke import Smoke, SmokeOverlay
+from carts_core.lab.synthesis.domains import Smoke, SmokeOverlay
 
 EYE = np.zeros(3)
 H, W = 60, 80

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carts_core.lab.synthesis.tissue import EXTENT, KINDS, Tissue, grow_tissue
+from carts_core.lab.synthesis.scene import EXTENT, KINDS, Tissue, grow_tissue
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ import torch
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SequenceError, SettingsError
-from carts_core.lab.randomization.geometry import RobotGeometry
-from carts_core.lab.randomization.recorded import RecordedPlacements
+from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
 from carts_core.lab.training.adaptation import BACKGROUNDS, adapted_to, gain
 from carts_core.lab.training.checkpoint import load_checkpoint
 from carts_core.lab.training.training import train

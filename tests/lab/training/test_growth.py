@@ -7,7 +7,7 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.lab.training.growth import grow
-from carts_core.networks.surface_network import SurfaceNetwork
+from carts_core.networks.network import SurfaceNetwork
 from carts_core.settings import Architecture
 
 SMALL = Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 2), decoder_convolutions=(1, 1))

@@ -1,0 +1,398 @@
+"""Arms of training images: variants of colour and proportion, meshes, and poses, random or from a recording."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from ...errors import SettingsError
+from ...model.camera import Camera
+from ...model.parts import link_parts
+from ...model.robot import Robot
+from ...model.scene import Arm, Light, Scene
+from ...recording import Sequence as SequenceFile
+from ...rendering import Renderer
+
+THICKNESS = (0.88, 1.15)
+"""Factor on the thickness of links, so that the network is not tied to one instrument's exact shape."""
+
+PERFECT_MODEL = 0.5
+"""Share of scenes whose rendered arms have exactly the proportions of the observed ones."""
+
+
+@dataclass(frozen=True)
+class PosedRobot:
+    """Vertices of one arm in the camera's frame."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+
+
+class Body(Protocol):
+    """Triangles that can be rasterised and shaded; see `RobotGeometry` for the attributes."""
+
+    @property
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Of all parts, each in the frame of its link [m]."""
+        ...
+
+    @property
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        """Triangles."""
+        ...
+
+    @property
+    def face_part(self) -> Int[np.ndarray, " F"]:
+        """Index of the part that a triangle belongs to."""
+        ...
+
+    @property
+    def shaft(self) -> int:
+        """Index of the longest part."""
+        ...
+
+    @property
+    def shaft_axis(self) -> Float[np.ndarray, "3"]:
+        """Unit vector along the shaft, pointing away from the tip."""
+        ...
+
+    @property
+    def shaft_end(self) -> Float[np.ndarray, "3"]:
+        """The shaft's end at the tip [m]."""
+        ...
+
+
+class RobotGeometry:
+    """What placing and shading need to know about a robot.
+
+    Attributes:
+        vertices, normals: of all parts, each in the frame of its link [V, 3].
+        faces: triangles [F, 3].
+        face_part: index of the part (`Robot.meshes`) that a triangle belongs to [F].
+        part_class: index into `carts_core.model.parts.PARTS` of each part.
+        shaft: index of the longest part, the instrument's shaft.
+        shaft_axis: unit vector along the shaft in its link's frame, pointing away from the tip [3].
+        shaft_end: the shaft's end at the tip, in its link's frame [3] [m].
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        meshes = robot.meshes
+        counts = [len(mesh.vertices) for mesh in meshes]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        self.vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
+        self.normals = np.concatenate([mesh.normals for mesh in meshes]).astype(np.float32)
+        self.faces: Int[np.ndarray, "F 3"] = np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+        ).astype(np.int32)
+        self.face_part = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]).astype(np.int32)
+        self._vertex_part = np.repeat(np.arange(len(meshes)), counts)
+        self._vertex_link = np.repeat([mesh.link for mesh in meshes], counts)
+        self.part_link = np.array([mesh.link for mesh in meshes])
+        self.part_class = link_parts(robot)[self.part_link]
+        extents = [np.ptp(mesh.vertices, axis=0).max() for mesh in meshes]
+        self.shaft = int(np.argmax(extents))
+        self.shaft_axis, self.shaft_end = self._shaft_line()
+
+    def _shaft_line(self) -> tuple[np.ndarray, np.ndarray]:
+        points = self.robot.meshes[self.shaft].vertices.astype(np.float64)
+        centre = (points.min(0) + points.max(0)) / 2
+        axis = np.zeros(3)
+        axis[np.argmax(np.ptp(points, axis=0))] = 1.0
+        tip = self._tip_in_shaft_link(np.zeros(len(self.robot.joint_names)))
+        if axis @ (centre - tip) < 0:
+            axis = -axis
+        return axis, centre + axis * ((points - centre) @ axis).min()
+
+    def _tip_in_shaft_link(self, joint_positions: np.ndarray) -> np.ndarray:
+        Ts = self.link_transforms(joint_positions)
+        points = self._posed(Ts)
+        shaft_link = self.part_link[self.shaft]
+        centre = points[self._vertex_part == self.shaft].mean(0)
+        tip = points[np.argmax(((points - centre) ** 2).sum(1))]
+        others = self._vertex_link != shaft_link
+        if others.any():
+            tip = points[others].mean(0)
+        return np.linalg.inv(Ts[shaft_link])[:3] @ np.append(tip, 1.0)
+
+    def link_transforms(self, joint_positions: np.ndarray) -> Float[np.ndarray, "links 4 4"]:
+        """Ts_base_link [m] at these joint positions [dofs]."""
+        return self.robot.forward_kinematics(torch.as_tensor(joint_positions, dtype=torch.float64)).numpy()
+
+    def _posed(self, Ts: np.ndarray) -> np.ndarray:
+        Ts = Ts[self._vertex_link]
+        return np.einsum("vij,vj->vi", Ts[:, :3, :3], self.vertices) + Ts[:, :3, 3]
+
+    def posed(self, Ts_camera_link: Float[np.ndarray, "links 4 4"]) -> PosedRobot:
+        """Vertices and normals in the camera's frame."""
+        vertices = np.empty_like(self.vertices)
+        normals = np.empty_like(self.normals)
+        for link in np.unique(self.part_link):
+            chosen = self._vertex_link == link
+            T = Ts_camera_link[link].astype(np.float32)
+            vertices[chosen] = self.vertices[chosen] @ T[:3, :3].T + T[:3, 3]
+            normals[chosen] = self.normals[chosen] @ T[:3, :3].T
+        return PosedRobot(vertices, normals)
+
+
+DEPTH = (0.05, 0.25)
+"""Distance of the wrist from the camera [m]."""
+FOCAL_LENGTH = (0.7, 2.0)
+"""Focal length in image widths [1]: of whole endoscope images, and of enlarged ones."""
+OUTSIDE = 0.12
+"""How far outside the image a wrist may be, in image sizes [1]."""
+ELEVATION = (-20.0, 60.0)
+"""Angle at which the shaft comes towards the camera [deg]; negative goes away from it."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One or two arms, ready to be posed, shaded and rendered."""
+
+    geometries: tuple[RobotGeometry, ...]
+    """The arms that the camera observes."""
+    rendered: tuple[RobotGeometry, ...]
+    """The arms as the optimizer knows them: the same, or of slightly other proportions, as models are."""
+    renderer: Renderer
+    """The optimizer's renderer of `rendered`, for hybrid images."""
+
+
+def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
+    """A scene of `arms` arms, each a robot of `robots` with random colours and thickness."""
+    chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
+    observed = [_vary(rng, robot) for robot in chosen]
+    rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]
+    scene = Scene(
+        tuple(Arm(f"arm{index}", robot, np.eye(4)) for index, robot in enumerate(rendered)),
+        (Camera("training", width, height, (float(width), float(width), width / 2, height / 2), np.eye(4)),),
+        _random_light(rng),
+    )
+    geometries = tuple(RobotGeometry(robot) for robot in observed)
+    known = geometries if rendered is observed else tuple(RobotGeometry(robot) for robot in rendered)
+    return Variant(geometries, known, Renderer(scene, width=width, height=height))
+
+
+def _vary(rng: np.random.Generator, robot: Robot) -> Robot:
+    varied = copy.copy(robot)
+    thickness = rng.uniform(*THICKNESS)
+    own_colors = rng.random() < 0.4
+    shade = rng.uniform(0.02, 0.6)
+    meshes = []
+    for mesh in robot.meshes:
+        extents = np.ptp(mesh.vertices, axis=0)
+        scale = np.full(3, thickness * rng.uniform(0.94, 1.06))
+        scale[np.argmax(extents)] = 1.0
+        # Normals of a surface that is stretched by S are those of the surface pressed by S.
+        normals = mesh.normals / scale
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+        color = mesh.color if own_colors else np.clip(shade * np.clip(rng.normal(1, 0.12, 3), 0.6, 1.5), 0, 1)
+        if not own_colors and rng.random() < 0.7:
+            color = np.clip(rng.uniform(0.15, 0.8) * np.clip(rng.normal(1, 0.08, 3), 0.6, 1.4), 0, 1)
+        vertices = (mesh.vertices * scale).astype(np.float32)
+        meshes.append(replace(mesh, vertices=vertices, normals=normals.astype(np.float32), color=color))
+    varied.meshes = tuple(meshes)
+    return varied
+
+
+def _random_light(rng: np.random.Generator) -> Light:
+    return Light(
+        position=(float(rng.normal(0, 0.01)), float(rng.normal(0, 0.01)), float(rng.uniform(-0.04, 0.0))),
+        ambient=float(rng.uniform(0.15, 0.4)),
+        diffuse=float(rng.uniform(0.5, 0.85)),
+        specular=float(rng.uniform(0.1, 0.6)),
+        shininess=float(rng.uniform(8, 50)),
+    )
+
+
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy [px]."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One arm in front of the camera."""
+
+    joint_positions: Float[np.ndarray, " dofs"]
+    """[rad, m], in the order of `Robot.joint_names`."""
+    T_camera_base: Float[np.ndarray, "4 4"]
+
+
+def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> Intrinsics:
+    """fx, fy, cx, cy [px] of a camera that is `field` px wide and of which a part of `width` x `height` px is seen."""
+    focal = float(np.exp(rng.uniform(*np.log(FOCAL_LENGTH)))) * field
+    cx, cy = rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height
+    return focal, focal * rng.uniform(0.98, 1.02), cx, cy
+
+
+def random_placement(
+    rng: np.random.Generator, geometry: RobotGeometry, intrinsics: Intrinsics, width: int, height: int
+) -> Placement:
+    """A random configuration whose wrist is in or near the image and whose shaft leaves it across a random border."""
+    joints = _random_joints(rng, geometry)
+    Ts_base_link = geometry.link_transforms(joints)
+    T_base_shaft = Ts_base_link[geometry.part_link[geometry.shaft]]
+    wrist = T_base_shaft[:3, :3] @ geometry.shaft_end + T_base_shaft[:3, 3]
+    axis = T_base_shaft[:3, :3] @ geometry.shaft_axis
+    fx, fy, cx, cy = intrinsics
+    depth = float(np.exp(rng.uniform(*np.log(DEPTH))))
+    u = rng.uniform(-OUTSIDE, 1 + OUTSIDE) * width
+    v = rng.uniform(-OUTSIDE, 1 + OUTSIDE) * height
+    target = np.array([(u - cx) / fx * depth, (v - cy) / fy * depth, depth])
+    azimuth = rng.uniform(0, 2 * np.pi)
+    elevation = np.deg2rad(rng.uniform(*ELEVATION))
+    direction = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)])
+    R = _frame(direction, rng.normal(size=3)) @ _frame(axis, rng.normal(size=3)).T
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, target - R @ wrist
+    return Placement(joints, T)
+
+
+def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Placement, scale: float) -> Placement:
+    """The placement with wrong kinematics: joints off by some degrees, the arm turned and moved a little.
+
+    Args:
+        scale: 1 moves the wrist by some 3 mm and turns joints by some 3 degrees.
+    """
+    joints = placement.joint_positions.copy()
+    for index, kind in enumerate(geometry.robot.joint_types):
+        if kind == "revolute":
+            joints[index] += rng.normal(0, np.deg2rad(3.0) * scale)
+    # The arm turns about its own wrist, so that the error in the image does not grow with the arm's length.
+    shaft_link = geometry.part_link[geometry.shaft]
+    T_camera_shaft = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
+    T_camera_shaft_moved = placement.T_camera_base @ geometry.link_transforms(joints)[shaft_link]
+    turn = turned(rng.normal(0, np.deg2rad(2.0) * scale, 3))
+    wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3]
+    # Farther away, what moves the image by as much is a larger distance.
+    wrist = wrist + rng.normal(0, 0.003 * scale, 3) * max(1.0, np.linalg.norm(wrist) / DEPTH[1])
+    R = turn @ T_camera_shaft[:3, :3]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, wrist - R @ geometry.shaft_end
+    return Placement(joints, T @ np.linalg.inv(T_camera_shaft_moved) @ placement.T_camera_base)
+
+
+def _random_joints(rng: np.random.Generator, geometry: RobotGeometry) -> np.ndarray:
+    limits = geometry.robot.joint_limits.numpy()
+    low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], -np.pi)
+    high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.pi)
+    anywhere = rng.uniform(low, high)
+    # Instruments are mostly held rather straight and their jaws are mostly nearly closed.
+    straight = np.clip(rng.normal(0, 0.4, len(low)), low, high)
+    return np.where(rng.random(len(low)) < 0.6, straight, anywhere)
+
+
+def _frame(axis: np.ndarray, helper: np.ndarray) -> np.ndarray:
+    """A rotation whose last column is `axis`, turned about it by chance."""
+    x = np.cross(axis, helper)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation about a vector by its length [rad]."""
+    angle = np.linalg.norm(vector)
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+_FRAMES = 200
+"""Frames that joint positions are taken from, spread over the recording."""
+_TURN = np.deg2rad(8.0)
+"""How far an arm is turned in front of the camera, standard deviation [rad]."""
+_SHIFT = 0.06
+"""How far it is moved, standard deviation in distances from the camera [1]."""
+_JOINTS = 0.12
+"""How far joints are moved, standard deviation in parts of their range in the recording, and at least..."""
+_LEAST = np.deg2rad(6.0)
+"""...so many [rad], and a tenth of that in [m] for sliding joints."""
+_ZOOM = 0.12
+"""Standard deviation of the logarithm of the focal length [1]."""
+
+
+class RecordedPlacements:
+    """Placements like those of a recording.
+
+    Args:
+        path: sequence file.
+
+    Raises:
+        SequenceError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        sequence = SequenceFile.open(path)
+        indices = sorted({round(i) for i in np.linspace(0, len(sequence) - 1, min(_FRAMES, len(sequence)))})
+        self._arms = {arm.name: arm for arm in sequence.scene.arms}
+        self._cameras = sequence.scene.cameras
+        self._joints = {name: np.asarray(sequence.measured[name], dtype=float)[indices] for name in self._arms}
+        self._names: dict[Path, list[str]] = {}
+        for name, arm in self._arms.items():
+            self._names.setdefault(arm.robot.urdf, []).append(name)
+
+    def __call__(
+        self, rng: np.random.Generator, geometries: tuple[RobotGeometry, ...], size: tuple[int, int], field: int
+    ) -> tuple[Intrinsics, list[Placement]]:
+        """A camera and a place for each robot, some part of the first of which is in the image.
+
+        Args:
+            rng: random numbers.
+            geometries: robots of the recording.
+            size: width and height of the image [px], a part of the camera's image.
+            field: width of the camera's image [px].
+
+        Raises:
+            SettingsError: a robot is none of the recording.
+        """
+        camera = self._cameras[int(rng.integers(len(self._cameras)))]
+        zoom = field / camera.width * float(np.exp(rng.normal(0, _ZOOM)))
+        fx, fy = camera.intrinsics[0] * zoom, camera.intrinsics[1] * zoom
+        taken: list[str] = []
+        placements = []
+        for geometry in geometries:
+            names = self._names.get(geometry.robot.urdf)
+            if names is None:
+                raise SettingsError(f"robot {geometry.robot.urdf} is none of the recording's. Leave out `robots`.")
+            free = [name for name in names if name not in taken] or names
+            taken.append(free[int(rng.integers(len(free)))])
+            placements.append(self._placement(rng, taken[-1], geometry, camera.T_camera_world))
+        seen = _points(geometries[0], placements[0])
+        seen = seen[seen[:, 2] > 1e-3]
+        if not len(seen):
+            return (fx, fy, size[0] / 2, size[1] / 2), placements
+        x, y, z = seen[int(rng.integers(len(seen)))]
+        # That point comes to lie anywhere in the image.
+        u, v = rng.uniform(0.1, 0.9, 2) * size
+        return (fx, fy, u - fx * x / z, v - fy * y / z), placements
+
+    def _placement(
+        self, rng: np.random.Generator, name: str, geometry: RobotGeometry, T_camera_world: Float[np.ndarray, "4 4"]
+    ) -> Placement:
+        rows = self._joints[name]
+        least = np.where(np.array(geometry.robot.joint_types) == "revolute", _LEAST, 0.1 * _LEAST)
+        spread = np.maximum(_JOINTS * np.ptp(rows, axis=0), least)
+        low, high = geometry.robot.joint_limits.numpy().T
+        joints = np.clip(rows[int(rng.integers(len(rows)))] + rng.normal(0, 1, rows.shape[1]) * spread, low, high)
+        T_camera_base = T_camera_world @ self._arms[name].T_world_base
+        placement = Placement(joints, T_camera_base)
+        ahead = _points(geometry, placement)
+        ahead = ahead[ahead[:, 2] > 0]
+        distance = float(np.median(ahead[:, 2])) if len(ahead) else 0.1
+        pivot = ahead.mean(0) if len(ahead) else np.array([0.0, 0.0, distance])
+        turn = np.eye(4)
+        turn[:3, :3] = turned(rng.normal(0, _TURN, 3))
+        turn[:3, 3] = pivot - turn[:3, :3] @ pivot + rng.normal(0, _SHIFT * distance, 3)
+        return Placement(joints, turn @ T_camera_base)
+
+
+def _points(geometry: RobotGeometry, placement: Placement) -> Float[np.ndarray, "V 3"]:
+    """The arm's vertices in the camera's frame [m]."""
+    Ts_base_link = geometry.link_transforms(placement.joint_positions)
+    return geometry.posed(placement.T_camera_base @ Ts_base_link).vertices.astype(float)
