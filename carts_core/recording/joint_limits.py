@@ -117,7 +117,7 @@ def misfits(
             joints[index],
             float(values[:, index].min()),
             float(values[:, index].max()),
-            order or _remedies(joints[index], values[:, index]),
+            (*_remedies(joints[index], values[:, index]), *order),
         )
         for index in wrong
     )
@@ -146,12 +146,13 @@ def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) 
     alphabetical = [sorted(names).index(name) for name in names]
     if alphabetical != list(range(len(names))) and fit(alphabetical):
         return ("the alphabetical order of the joints' names",)
+    found = []
     for a, b in combinations(range(len(joints)), 2):
         order = list(range(len(joints)))
         order[a], order[b] = b, a
         if (a in wrong or b in wrong) and fit(order):
-            return (f"the columns of {names[a]} and {names[b]} the other way round",)
-    return ()
+            found.append(f"the columns of {names[a]} and {names[b]} the other way round")
+    return tuple(found)
 
 
 def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert: Callable[..., np.ndarray]) -> bool:

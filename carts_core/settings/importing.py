@@ -54,6 +54,8 @@ class ImportOptions:
     """Arm -> its robot: a URDF, or `builtin:psm_lnd`, which is the default."""
     wrist_length: float | None = None
     """From wrist pitch to wrist yaw [m], for inverse kinematics; by default that of the instrument, else 0.0091."""
+    tool_point: float | None = None
+    """How far along the tool the point of tip poses is from the dVRK's tip [m]; by default as joints and poses show."""
     base: Mapping[str, Path] = field(default_factory=dict)
     """Arm -> registration, configuration or set-up joint file of the dVRK with its base frame."""
     axes: Axes | None = None

@@ -70,6 +70,29 @@ def fit_base_frame(
     return BaseFrame(T, float(np.median(distances)), float(distances.max()), float(turned))
 
 
+def fit_tool_point(
+    Ts_reference_point: Float[np.ndarray, "rows 4 4"],
+    joints: Float[np.ndarray, "rows 6"],
+    geometry: PsmGeometry = CLASSIC,
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Where the point of poses is, seen from the tip, and how far the base moves with it in the median row [m].
+
+    With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the places of the point at d from the tip are
+    p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
+
+    Raises:
+        CartsError: there are no rows with both.
+    """
+    known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_point).all((1, 2))
+    R = fit_base_frame(Ts_reference_point, joints, geometry).T_reference_base[:3, :3]
+    Ts = forward(joints[known], geometry)
+    A = np.concatenate([R @ Ts[:, :3, :3], np.broadcast_to(np.eye(3), (len(Ts), 3, 3))], axis=2).reshape(-1, 6)
+    b = (Ts_reference_point[known, :3, 3] - Ts[:, :3, 3] @ R.T).reshape(-1)
+    solved = np.linalg.lstsq(A, b, rcond=None)[0]
+    residuals = np.linalg.norm((b - A @ solved).reshape(-1, 3), axis=1)
+    return solved[:3], float(np.median(residuals))
+
+
 @dataclass(frozen=True, eq=False)
 class InstrumentCheck:
     """How well instruments explain a recording."""

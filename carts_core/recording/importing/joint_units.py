@@ -126,6 +126,8 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
             return unit
     highest = max(float(np.nanmax(np.abs(values[:, index]))) for index in chosen)
     limit = max(abs(joints[index].upper) for index in chosen)
+    if any("order" in text or "way round" in text for misfit in misfits(joints, values) for text in misfit.remedies):
+        return "m"
     return length_unit(highest, limit, arm, " ".join(joints[index].name for index in chosen))
 
 
@@ -168,12 +170,16 @@ def check_limits(arm: FoundArm, note: Callable[[Note], None]) -> bool:
     there = [index for index, name in enumerate(arm.columns) if name in known]
     found = misfits([known[arm.columns[index]] for index in there], arm.values[:, there])
     for misfit in found:
-        remedy = ""
-        if any("other sign" in text for text in misfit.remedies):
-            remedy = f" Turn it: --flip {misfit.joint.name}."
-        elif any("order" in text or "way round" in text for text in misfit.remedies):
-            remedy = " Name the columns: --columns yaw COLUMN pitch COLUMN ..."
-        elif misfit.remedies:
-            remedy = f" Give it: --units {misfit.joint.name} {misfit.remedies[0].partition(' ')[0]}."
+        options = dict.fromkeys(_option(misfit.joint.name, text) for text in misfit.remedies)
+        remedy = f" Give {' or '.join(options)}." if options else " Check the columns."
         note(Note("warning", f"{arm.name}: {misfit.sentence()}.{remedy}"))
     return not found
+
+
+def _option(joint: str, remedy: str) -> str:
+    """The option that takes a remedy."""
+    if remedy == "the other sign":
+        return f"--flip {joint}"
+    if "order" in remedy or "way round" in remedy:
+        return "--columns yaw COLUMN pitch COLUMN ..."
+    return f"--units {joint} {remedy.partition(' ')[0]}"

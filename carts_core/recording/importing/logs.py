@@ -17,13 +17,16 @@ from ..joint_limits import Joint
 from .alignment import at_times, clock_offset, nearest
 from .dvrk_files import read_base_frames
 from .found import FoundArm, Note
-from .instrument import CANDIDATES, check_instrument, fit_base_frame
+from .instrument import ACCEPTED, CANDIDATES, check_instrument, fit_base_frame, fit_tool_point
 from .joint_units import in_si, joints_of_arm
 
 _SAME_BASE = 1e-3
 """[m], [rad] A base frame nearer to the identity than this was not set in the dVRK."""
 _CHECKED_ROWS = 5000
 _FEWEST_REACHABLE = 0.5
+_FEWEST_ROWS = 20
+_SAME_POINT = 1e-4
+"""[m] A point nearer to the tip than this is the tip."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +97,7 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
         robot = options.robot[log.name]
         return FoundArm(log.name, log.names, log.joints.values, log.joints.times, robot, T_base, base_from)
     log = log if log.si else _in_si(log, options, note)
+    log = _at_the_tip(log, options, note)
     geometry = _geometry(log, options, note)
     T_camera_base, base_from = _base_frame(log, options, geometry, note)
     joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, note)
@@ -136,22 +140,72 @@ def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) ->
     return replace(log, joints=applied(log.joints, JOINT_NAMES), jaw=applied(log.jaw, ("jaw",)))
 
 
+def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
+    """Poses and joints of some rows that have both; None where they are too few to compare."""
+    poses = log.poses or log.local_poses
+    if log.joints is None or poses is None:
+        return None
+    offset = clock_offset(poses.times, log.joints.times)
+    measured = at_times(poses.times - offset, log.joints.times, log.joints.values)
+    rows = np.flatnonzero(np.isfinite(measured).all(1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _CHECKED_ROWS)).astype(int)] if len(rows) else rows
+    return None if len(rows) < _FEWEST_ROWS else (transforms(poses.values[rows]), measured[rows])
+
+
+def _at_the_tip(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> ArmLog:
+    """The log with poses of the tip, where they are those of another point of the tool."""
+    if options.tool_point is not None:
+        point = np.array([0.0, 0.0, options.tool_point])
+    elif (both := _checked_rows(log)) is not None and not _stands_still(*both):
+        inverted = np.linalg.inv(both[0])
+        if _stands_still(inverted, both[1]):
+            text = "measured_cp holds inverse transforms (the reference in the tip's frame); they are turned round"
+            note(Note("warning", f"{log.name}: {text}."))
+            return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
+        fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
+        point, moves = min(fits, key=lambda fit: fit[1])
+        if moves > ACCEPTED or np.linalg.norm(point) < _SAME_POINT:
+            return log
+        x, y, z = 1e3 * point
+        text = f"poses are of a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
+        note(Note("found", f"{log.name}: {text}; they are brought to the tip (change: --tool-point)."))
+    else:
+        return log
+    return replace(log, poses=_moved(log.poses, -point), local_poses=_moved(log.local_poses, -point))
+
+
+def _stands_still(Ts: np.ndarray, joints: np.ndarray) -> bool:
+    return any(fit_base_frame(Ts, joints, geometry).deviation <= ACCEPTED for geometry in CANDIDATES.values())
+
+
+def _moved(poses: Track | None, point: np.ndarray) -> Track | None:
+    """Poses of a point that is fixed to the tool [m]."""
+    if poses is None:
+        return None
+    values = poses.values.copy()
+    values[:, :3] += transforms(values)[:, :3, :3] @ point
+    return replace(poses, values=values)
+
+
+def _inverse_of(poses: Track | None) -> Track | None:
+    if poses is None:
+        return None
+    Ts = transforms(poses.values)
+    there = np.isfinite(Ts).all((1, 2))
+    Ts = np.linalg.inv(Ts[there])
+    return Track(poses.times[there], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
+
+
 def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> PsmGeometry:
     """The instrument's lengths: as given, as the recording itself shows, or those of a Large Needle Driver."""
     if log.tool:
         note(Note("found", f"{log.name}: tool_type is {log.tool}."))
     chosen = replace(CLASSIC, wrist_length=options.wrist_length) if options.wrist_length is not None else CLASSIC
-    poses = log.poses or log.local_poses
-    if log.joints is None or poses is None:
+    if (both := _checked_rows(log)) is None:
         return chosen
-    offset = clock_offset(poses.times, log.joints.times)
-    measured = at_times(poses.times - offset, log.joints.times, log.joints.values)
-    rows = np.flatnonzero(np.isfinite(measured).all(1))
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _CHECKED_ROWS)).astype(int)] if len(rows) else rows
-    if len(rows) < 20:
-        return chosen
+    Ts, measured = both
     name = f"{1e3 * chosen.wrist_length:.1f} mm wrist"
-    check = check_instrument(transforms(poses.values[rows]), measured[rows], {**CANDIDATES, name: chosen})
+    check = check_instrument(Ts, measured, {**CANDIDATES, name: chosen})
     best = check.fits[check.best]
     if check.decides:
         note(

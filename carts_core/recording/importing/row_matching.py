@@ -21,6 +21,8 @@ from .media import Images
 
 _STAMPED_DIGITS = 13
 """Names of images with numbers this long are times."""
+_LONGEST = 1e6
+"""[s] No recording lasts longer."""
 _FEW = 0.1
 """Share of rows without an image up to which a column of numbers is taken for numbers of images."""
 _INDEX = ("index", "id", "", "unnamed 0", "row", "seq", "sequence")
@@ -151,14 +153,16 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
     values = np.asarray(values, np.float64)
     values = values[np.isfinite(values)]
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
+    lasts = float(np.ptp(values)) if len(values) else 0.0
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
-        if largest >= least:
+        # A log of hours counts from its own begin, in a smaller unit.
+        if largest >= least and lasts * SECONDS[unit] < _LONGEST:
             return unit  # pyright: ignore[reportReturnType]
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
-    guess: Clock = "s"
+    guess: str = "s"
     for unit, least in (("ns", 9e5), ("us", 9e2), ("ms", 0.9)):
         if step >= least:
-            guess = unit  # pyright: ignore[reportAssignmentType]
+            guess = unit
             break
     if span is not None and span > 0 and len(values) > 1 and values[-1] > values[0]:
         lasts = {unit: (values[-1] - values[0]) * factor / span for unit, factor in SECONDS.items()}
@@ -166,7 +170,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
             best = min(lasts, key=lambda unit: abs(np.log(lasts[unit])))
             if 0.2 <= lasts[best] <= 50.0:
                 return best  # pyright: ignore[reportReturnType]
-    return guess
+    return guess  # pyright: ignore[reportReturnType]
 
 
 def row_seconds(

@@ -14,7 +14,9 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
+from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
+from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import ArmLog, Track, arm_from_log, track
@@ -108,8 +110,10 @@ def _packed(path: Path, arm: str) -> dict[str, Any]:
     if not file.is_file():
         return dict.fromkeys(_TRACKS)
     table = read_foreign_table(file)
+    given = [table.columns.get(f"measured_js.name.{index}") for index in range(len(JOINT_NAMES))]
+    order = order_of_names(tuple(str(cells[0]) for cells in given if cells is not None))
     columns = {
-        "joints": [f"measured_js.position.{index}" for index in range(6)],
+        "joints": [f"measured_js.position.{index}" for index in order or range(len(JOINT_NAMES))],
         "poses": [
             *(f"measured_cp.position.{i}" for i in range(3)),
             *(f"measured_cp.orientation.{i}" for i in range(4)),
@@ -144,7 +148,7 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
             # Offline recordings keep the jaw inside the arm.
             jaw = top.get("jaw") or body.get("jaw") or {}
             values = {
-                "joints": (measured.get("measured_js") or {}).get("position"),
+                "joints": _named_positions(measured.get("measured_js") or {}),
                 "poses": _pose(measured.get("measured_cp")),
                 "local_poses": _pose(measured.get("local_measured_cp")),
                 "jaw": (jaw.get("measured_data") or {}).get("position"),
@@ -156,6 +160,13 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
             raise SequenceError(f"{file} is no kinematics of one frame ({error!r}). Copy it again.") from error
     found: dict[str, Track | None] = {role: track(entries) for role, entries in rows.items()}
     return found
+
+
+def _named_positions(state: dict[str, Any]) -> list[float] | None:
+    """Joint positions in the order of the PSM, by their names where these are there."""
+    positions = state.get("position")
+    order = order_of_names(tuple(map(str, state.get("name") or ())))
+    return positions if positions is None or order is None else [positions[index] for index in order]
 
 
 def _pose(block: Any) -> list[float] | None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from carts_core.errors import CartsError
 from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.ecm_kinematics import forward as ecm
-from carts_core.model.psm_kinematics import forward
+from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.recording.importing.importer import import_recording
 
 SIZE = (96, 72)
@@ -81,6 +81,10 @@ class BagKind:
     frames: int = 6
     endoscope: str = ""
     """Topic below /ECM that says where the endoscope is; none by default."""
+    names: tuple[str, ...] = ()
+    """Of the joints of arms, which are in this order then; all "outer_yaw" and in the PSM's order by default."""
+    tool_point: float = 0.0
+    """How far the point of measured_cp is from the tip, along the tool [m]."""
     info: Callable[[dict[str, Any]], None] | None = None
     """Changes the values of every camera_info."""
 
@@ -104,6 +108,13 @@ def write_bag(path: Path, kind: BagKind = BagKind()) -> Path:
     return path
 
 
+def along_the_tool(distance: float) -> np.ndarray:
+    """T_tip_point [m] of a point further out."""
+    T = np.eye(4)
+    T[2, 3] = distance
+    return T
+
+
 def _messages(store: Any, kind: BagKind):
     def make(kind_of_message: str, **values: Any) -> Any:
         return store.types[kind_of_message](**values)
@@ -124,16 +135,22 @@ def _messages(store: Any, kind: BagKind):
                 rows["state_joint_current" if old else "measured_js"] = q
             rows["state_jaw_current" if old else "jaw/measured_js"] = jaw_at(row / 100)[None]
             for topic, values in rows.items():
+                names, positions = ["outer_yaw"] * len(values), np.asarray(values, np.float64)
+                if kind.names and len(values) > 1:
+                    names = list(kind.names)
+                    bare = [name.removeprefix("outer_") for name in names]
+                    if sorted(bare) == sorted(JOINT_NAMES):
+                        positions = positions[[JOINT_NAMES.index(name) for name in bare]]
                 message = make(
                     "sensor_msgs/msg/JointState",
                     header=header(time, ""),
-                    name=["outer_yaw"] * len(values),
-                    position=np.asarray(values, np.float64),
+                    name=names,
+                    position=positions,
                     velocity=np.empty(0),
                     effort=np.empty(0),
                 )
                 yield time + 900_000, f"{prefix}/{topic}", message
-            T = forward(q)
+            T = forward(q) @ along_the_tool(kind.tool_point)
             poses = {"measured_cp": T_DVRK_OPENCV @ T_CAMERA_BASE @ T}
             if kind.local:
                 poses["local/measured_cp"] = T
