@@ -6,7 +6,7 @@ them. Every way is said by a note, and so is what was left out.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PureWindowsPath
 
@@ -23,6 +23,13 @@ _STAMPED_DIGITS = 13
 """Names of images with numbers this long are times."""
 _LONGEST = 1e6
 """[s] No recording lasts longer."""
+_LEAST: Mapping[Clock, tuple[float, float]] = {
+    "ns": (1e17, 9e5),
+    "us": (1e14, 9e2),
+    "ms": (1e11, 0.9),
+    "s": (1e8, 0.0),
+}
+"""Unit -> least time since 1970, and least spacing of rows, in that unit."""
 _FEW = 0.1
 """Share of rows without an image up to which a column of numbers is taken for numbers of images."""
 _INDEX = ("index", "id", "", "unnamed 0", "row", "seq", "sequence")
@@ -154,23 +161,21 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
     values = values[np.isfinite(values)]
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
     lasts = float(np.ptp(values)) if len(values) else 0.0
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
+    for unit in _LEAST:
         # A log of hours counts from its own begin, in a smaller unit.
-        if largest >= least and lasts * SECONDS[unit] < _LONGEST:
-            return unit  # pyright: ignore[reportReturnType]
+        if largest >= _LEAST[unit][0] and lasts * SECONDS[unit] < _LONGEST:
+            return unit
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
-    guess: str = "s"
-    for unit, least in (("ns", 9e5), ("us", 9e2), ("ms", 0.9)):
-        if step >= least:
-            guess = unit
-            break
+    guess: Clock = "s"
+    for unit in _LEAST:
+        guess = unit if step >= _LEAST[unit][1] and SECONDS[unit] <= SECONDS[guess] else guess
     if span is not None and span > 0 and len(values) > 1 and values[-1] > values[0]:
-        lasts = {unit: (values[-1] - values[0]) * factor / span for unit, factor in SECONDS.items()}
-        if not 0.2 <= lasts[guess] <= 50.0:
-            best = min(lasts, key=lambda unit: abs(np.log(lasts[unit])))
-            if 0.2 <= lasts[best] <= 50.0:
-                return best  # pyright: ignore[reportReturnType]
-    return guess  # pyright: ignore[reportReturnType]
+        shares = {unit: (values[-1] - values[0]) * factor / span for unit, factor in SECONDS.items()}
+        if not 0.2 <= shares[guess] <= 50.0:
+            best: Clock = min(SECONDS, key=lambda unit: abs(np.log(shares[unit])))
+            if 0.2 <= shares[best] <= 50.0:
+                return best
+    return guess
 
 
 def row_seconds(
