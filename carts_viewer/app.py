@@ -9,7 +9,6 @@ from carts_core.segmentation import Segmenter
 from carts_core.settings.optimization import Inference
 from carts_viewer.intent_queue import IntentQueue
 from carts_viewer.keys import key_groups
-from carts_viewer.layers import Layer
 from carts_viewer.listening import Listening
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.running import OptimizerFactory
@@ -72,7 +71,7 @@ class ViewerApp:
         renderer.arm_ids(self.state.pose.scene, self.state.camera)
         self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
         self.url = self.page.url
-        self.page.key_groups = key_groups(Layer)
+        self.page.key_groups = key_groups()
         self.page.project = sequence.name
         self._thumbnails = Thumbnails(sequence)
         self.page.thumbnail = self._thumbnails.answer

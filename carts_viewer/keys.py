@@ -6,7 +6,6 @@ brings the table in a text file up to date, between the lines that say where it 
 """
 
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -42,8 +41,8 @@ class Shortcut:
         return held + self.hotkey.capitalize()
 
 
-def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
-    """All of them, for these layers.
+def shortcuts() -> list[Shortcut]:
+    """All of them, the same in every recording.
 
     Letters that viser uses to fly the camera (W A S D Q E) are left alone, and so are the arrow keys, which move a
     slider that has the focus.
@@ -92,7 +91,7 @@ def shortcuts(layers: Iterable[Layer]) -> list[Shortcut]:
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
             Shortcut(str(number), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
-            for number, layer in enumerate(layers, start=1)
+            for number, layer in enumerate(Layer, start=1)
         ),
     ]
 
@@ -112,12 +111,12 @@ _POINTER = (
 """What the pointer does on the picture while a key is held."""
 
 
-def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]]]:
+def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
     """The shortcuts for the sheet of keys: group by group, each key with what it does."""
     groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
     groups["On the picture"] = list(_POINTER)
     order = ["Review", "Optimize", "Paint", "Frames", "View"]
-    for shortcut in shortcuts(layers):
+    for shortcut in shortcuts():
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
     groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold it, or press it to keep it"))
@@ -127,9 +126,9 @@ def key_groups(layers: Iterable[Layer]) -> list[tuple[str, list[tuple[str, str]]
     return list(groups.items())
 
 
-def key_table(layers: Iterable[Layer]) -> str:
+def key_table() -> str:
     """The shortcuts as a Markdown table."""
-    rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts(layers)]
+    rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts()]
     rows += [
         *(f"| **{key}** | {text} |" for key, text in _POINTER),
         "| **,** | Loupe: pixels, coordinates, colour; hold it, or press it to keep it |",
@@ -149,7 +148,7 @@ def with_keys(text: str) -> str:
     _, end, after = rest.partition(_END)
     if not (begin and end):
         raise ValueError(f"the text has no lines {_BEGIN!r} and {_END!r} that say where the table of keys belongs.")
-    return f"{before}{begin}\n{key_table(Layer)}\n{end}{after}"
+    return f"{before}{begin}\n{key_table()}\n{end}{after}"
 
 
 if __name__ == "__main__":

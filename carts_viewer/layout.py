@@ -19,7 +19,7 @@ from carts_viewer.panels.keypoints import KeypointsPanel
 from carts_viewer.panels.live import LivePanel
 from carts_viewer.panels.message import MessagePanel
 from carts_viewer.panels.optimize import OptimizePanel
-from carts_viewer.panels.overlay import OverlayPanel, offered_layers
+from carts_viewer.panels.overlay import OverlayPanel
 from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.people import PeoplePanel
 from carts_viewer.panels.project import HistoryPanel, SavedPanel
@@ -96,7 +96,7 @@ class Layout:
         with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, storage, emit))
         with right.add_tab("Help"):
-            HelpPanel(page, offered_layers(session), self.joints.perturb, emit)
+            HelpPanel(page, self.joints.perturb, emit)
         explain(page)
         right.dock_right()
         right.set_width(_WIDTH)

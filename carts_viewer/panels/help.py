@@ -7,7 +7,6 @@ import viser
 from carts_core.resources import static_dir
 from carts_viewer import intents
 from carts_viewer.keys import Shortcut, key_table, shortcuts
-from carts_viewer.layers import Layer
 from carts_viewer.panels.inputs import Emit
 from carts_viewer.transport.page import OWN_KEYS
 from carts_viewer.transport.tab_page import TabPage
@@ -16,10 +15,10 @@ from carts_viewer.transport.tab_page import TabPage
 class HelpPanel:
     """Registers the shortcuts and explains everything in a few words."""
 
-    def __init__(self, page: TabPage, layers: list[Layer], perturb: Callable[[], intents.Intent], emit: Emit) -> None:
+    def __init__(self, page: TabPage, perturb: Callable[[], intents.Intent], emit: Emit) -> None:
         gui = page.gui
         own = {}
-        for shortcut in shortcuts(layers):
+        for shortcut in shortcuts():
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
             # viser shows the keys that it listens to itself.
             described = shortcut.key if hotkey is None else None
@@ -29,7 +28,7 @@ class HelpPanel:
                 own[shortcut.hotkey] = shortcut.action
         page.on_pressed(lambda key: emit(own[key]) if key in own else None)
         text = (static_dir() / "help.md").read_text(encoding="utf-8")
-        gui.add_markdown(text.replace("{shortcuts}", key_table(layers)))
+        gui.add_markdown(text.replace("{shortcuts}", key_table()))
 
 
 def _listen(

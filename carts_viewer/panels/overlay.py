@@ -26,13 +26,11 @@ class OverlayPanel:
 
     def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.gui
-        sequence = session.sequence
         self._waits, self._session = waits, session
-        self._arms = [arm.name for arm in sequence.scene.arms]
-        self._classes = part_classes(sequence.scene.arms)
-        options = offered_layers(session)
+        self._arms = [arm.name for arm in session.scene.arms]
+        self._classes = part_classes(session.scene.arms)
         with gui.add_folder("Overlay"):
-            self._layer = gui.add_dropdown("Layer", [str(layer) for layer in options], initial_value=str(state.layer))
+            self._layer = gui.add_dropdown("Layer", [str(layer) for layer in Layer], initial_value=str(state.layer))
             self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
             self._legend = gui.add_html("")
             self._against = gui.add_dropdown(
@@ -46,9 +44,6 @@ class OverlayPanel:
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
-        options = tuple(str(layer) for layer in offered_layers(self._session))
-        if options != self._layer.options:
-            self._layer.options = options
         write(self._layer, str(state.layer))
         if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))
@@ -85,12 +80,3 @@ class OverlayPanel:
         swatches = [swatch(label_color(n), name) for n, name in enumerate(names, start=1) if n in there]
         count = 0 if points is None else len(points.points)
         return " ".join([*swatches, *([counted(count, "keypoint")] if count else [])]) or "This mask is empty."
-
-
-def offered_layers(session: Session) -> list[Layer]:
-    """The layers that make sense for a sequence: without masks there is nothing to compare with."""
-    sequence = session.sequence
-    cameras = [camera.name for camera in sequence.scene.cameras]
-    imported = session.editor.view.get(Key.imported_labels()) is not None
-    truth = imported or any(sequence.has_masks(camera, domain) for camera in cameras for domain in sequence.domains)
-    return [layer for layer in Layer if truth or layer is not Layer.TRUTH]

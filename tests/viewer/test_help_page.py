@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import expect
+from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_viewer.app import ViewerApp
@@ -12,6 +13,21 @@ from carts_viewer.panels.hints import HINTS, explain
 pytestmark = pytest.mark.browser
 
 SCROLLED = "[...document.querySelectorAll('.mantine-ScrollArea-viewport')].map((one) => one.scrollTop)"
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_every_number_key_chooses_the_layer_that_the_sheet_of_keys_says(
+    masks: bool, open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    tab = open_tab(open_viewer(masks=masks, width=160, height=120))
+    tab.page.keyboard.press("?")
+    rows = tab.page.locator(".carts-sheet tr").filter(has_text="Overlay: ").all_inner_texts()
+    tab.page.keyboard.press("Escape")
+    assert [row.split()[0] for row in rows] == list("123456789")
+    for key, _, *name in (row.split() for row in rows):
+        tab.page.keyboard.press(key)
+        eventually(lambda: str(tab.state.layer).lower(), lambda layer, name=name: layer == " ".join(name))
+        expect(tab.page.locator(f"[id='{tab.app.page.element_id(tab.find('Layer'))}']")).to_have_value(tab.state.layer)
 
 
 def test_every_control_says_what_it_does_when_the_pointer_rests_on_it(

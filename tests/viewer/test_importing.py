@@ -18,7 +18,6 @@ from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.imported import with_imported
 from carts_viewer.layers import Layer, imported, label_color
-from carts_viewer.panels.overlay import offered_layers
 from carts_viewer.people import People
 from carts_viewer.running import OptimizerFactory
 from carts_viewer.session import Session
@@ -68,12 +67,10 @@ def test_an_import_is_one_step_shown_at_once_and_undone(plain: Desk) -> None:
 def test_without_masks_of_its_own_a_recording_is_compared_with_the_imported_ones(plain: Desk) -> None:
     plain.controller.score()
     assert plain.state.scores is not None and plain.state.scores.dice is None
-    assert Layer.TRUTH not in offered_layers(plain.session)
     mask = bring_in(plain)
     plain.controller.score()
     rendered = plain.renderer.mask(plain.state.pose.scene, "left")
     assert plain.state.scores.dice == pytest.approx(dice(rendered, mask))
-    assert Layer.TRUTH in offered_layers(plain.session)
     figures = plain.saved.figures(0)
     assert figures is not None and figures.dice == plain.state.scores.dice
     plain.do(intents.Undo())
