@@ -1,27 +1,22 @@
 """Fewer triangles for a mesh, within a bound on how far its surface moves.
 
-It runs in a process of its own, so that it can be stopped after a time, and by Ctrl-C: the library that does it neither
-looks at signals nor ends in good time on every mesh. 300,000 triangles at random take it longer than ten minutes.
+It runs in a child process with bounded processor time: the library that does it neither looks at signals nor ends in
+good time on every mesh. 300,000 triangles at random take it longer than ten minutes.
 """
-
-import io
-import math
-import os
-import resource
-import signal
-import subprocess
-import sys
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..files.decoding import DecodingLimitError, Limits, called
+from ..files.reading import GIB
+
+LIBRARIES = {"fewest": ("fast_simplification", "scipy.spatial")}
+"""Imported before the memory of a child process is counted."""
 _SECONDS = 12.0
 """Of computing, not of waiting for a processor."""
 _SECONDS_PER_FACE = 1e-4
 """Some five times what meshes of instruments need."""
-_PATIENCE = 20
-"""Seconds of waiting for a second of computing."""
-_MEMORY = 2 * 2**30
+_MEMORY = 2 * GIB
 _FEWER = 0.6
 """Triangles of a trial, relative to those of the one before."""
 _FEWEST = 8
@@ -52,23 +47,12 @@ def decimated(
     Raises:
         DecimationError: it takes too long or too much memory, or fails.
     """
-    given = io.BytesIO()
-    seconds = _SECONDS + _SECONDS_PER_FACE * len(faces)
-    np.savez(given, vertices=vertices, faces=faces, tolerance=tolerance, seconds=seconds)
-    patience = seconds * _PATIENCE
-    # The file alone: importing its package would take longer than most meshes.
-    command = [sys.executable, "-P", __file__, str(os.getpid())]
+    limits = Limits(_SECONDS + _SECONDS_PER_FACE * len(faces), _MEMORY)
     try:
-        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=patience, check=True)
-        with np.load(io.BytesIO(done.stdout), allow_pickle=False) as result:
-            return result["vertices"], result["faces"], float(result["deviation"])
-    except subprocess.TimeoutExpired as error:
-        raise DecimationError(f"it was not simplified within {patience:.0f} s") from error
-    except subprocess.CalledProcessError as error:
-        if -error.returncode in (signal.SIGXCPU, signal.SIGKILL):
-            raise DecimationError(f"it was not simplified within {seconds:.0f} s of computing") from error
-        raise DecimationError("it cannot be simplified") from error
-    except (OSError, ValueError, KeyError) as error:
+        return called(fewest, vertices, faces, tolerance, limits=limits)
+    except DecodingLimitError as error:
+        raise DecimationError(f"it was not simplified within {limits.seconds:.0f} s: {error}") from error
+    except (OSError, ValueError) as error:
         raise DecimationError("it cannot be simplified") from error
 
 
@@ -163,8 +147,11 @@ def _to_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> Float[np.n
     return np.linalg.norm(points - a - share[:, None] * along, axis=1)
 
 
-def _fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """The mesh of the last trial that keeps within the tolerance, each of fewer triangles than the one before."""
+def fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Vertices, triangles and deviation [m] of the mesh with the fewest triangles within a tolerance [m].
+
+    Trials have fewer and fewer triangles; the last one within the tolerance counts.
+    """
     import fast_simplification  # noqa: PLC0415 - only the process that decimates needs it
 
     kept = vertices, faces, 0.0
@@ -181,21 +168,3 @@ def _fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[
         kept = points, triangles, moved
         count = min(count, len(triangles)) * _FEWER
     return kept
-
-
-def _main() -> None:
-    from carts_core.stopping import end_with_parent  # noqa: PLC0415 - relative imports need the package
-
-    end_with_parent(int(sys.argv[1]), signal.SIGKILL)
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as given:
-        seconds = math.ceil(float(given["seconds"]))
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
-        vertices, faces, moved = _fewest(given["vertices"], given["faces"], float(given["tolerance"]))
-    result = io.BytesIO()
-    np.savez(result, vertices=vertices, faces=faces, deviation=moved)
-    sys.stdout.buffer.write(result.getvalue())
-
-
-if __name__ == "__main__":
-    _main()

@@ -13,12 +13,13 @@ from xml.etree import ElementTree
 
 from ..errors import RobotError
 from ..extras import needs_extra
-from ..files.reading import CALIBRATION, MESH, ROBOT, open_regular, parse_yaml, read_text
+from ..files.decoding import decoded
+from ..files.reading import CALIBRATION, MESH, open_regular, parse_yaml, read_text
 from ..wording import counted
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI
 from .psm_urdf import carrier
-from .xacro_guard import guarded_xacro
+from .xacro_guard import expanded
 
 PACKAGE = "dvrk_model"
 _PREFIX = "PSM1_"
@@ -127,16 +128,11 @@ def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
 
 def _expanded(model: Path, chosen: Instrument) -> str:
     needs_extra("xacrodoc", "import")
-    from xacrodoc import XacroDoc, packages  # noqa: PLC0415
-
     arm = model / "urdf" / chosen.generation / "PSM1.urdf.xacro"
-    packages.update_package_cache({PACKAGE: str(model.resolve())})
     options = {"instrument": chosen.number, "show_rcm": "false", "is_virtual": "true"}
     try:
-        with guarded_xacro():
-            text = read_text(arm, ROBOT)
-            return XacroDoc.from_string(text, subargs=options, resolve_packages=False).to_urdf_string()
-    except Exception as error:  # xacro raises whatever the macros' expressions raise
+        return decoded(expanded, arm, {PACKAGE: str(model.resolve())}, options)
+    except (OSError, ValueError, RobotError) as error:
         raise RobotError(
             f"{arm} cannot be expanded for instrument {chosen.number} ({error}). Check out dvrk_model again, whole."
         ) from error

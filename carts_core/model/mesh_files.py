@@ -1,32 +1,25 @@
 """Where the mesh that a URDF names lies, beside the URDF or inside a ROS package, and what is read of it."""
 
-import io
-import os
 import re
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import trimesh
-from trimesh.resolvers import FilePathResolver
 
+from ..decoders.meshes import mesh_parts
 from ..errors import RobotError
-from ..files.image_size import size_problem
-from ..files.reading import IMAGE, MESH, is_regular, open_regular, read_bytes
+from ..files.decoding import Limits, called
+from ..files.reading import MESH, is_regular, open_regular
 from ..wording import shown
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
-MOST_FACES = 1_000_000
-"""Triangles of one mesh file before it is simplified."""
-MOST_PARTS = 1_000
-"""Instances of meshes in one file."""
 FARTHEST = 100.0
 """Largest coordinate of a mesh after scaling [m]; instruments and robots are far smaller."""
 _HEAD = 2**16
 """Bytes of a COLLADA file in which its unit and up axis are looked for."""
 _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")
 _UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)\s*</up_axis>")
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 _PACKAGE_LEVELS = 6
 """How many folders above the URDF's own a ROS package is looked for in."""
@@ -69,28 +62,8 @@ def collada_asset(path: Path) -> tuple[float, str]:
     return metres if 0 < metres < np.inf else 1.0, "" if axis is None else axis[1].decode()
 
 
-class _BesideTheMesh(FilePathResolver):
-    """Materials and textures that a mesh names: regular files below its folder, of a bounded size."""
-
-    def get(self, name: str) -> bytes:
-        """The content of a file.
-
-        Raises:
-            OSError, ValueError: it is missing, outside the folder, or not one that is read.
-        """
-        for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
-            path = Path(self.absolute(candidate))
-            if is_regular(path):
-                image = path.suffix.lower() in _IMAGES
-                content = read_bytes(path, IMAGE if image else MESH)
-                if image and (problem := size_problem(content)) is not None:
-                    raise ValueError(f"{path} {problem}")
-                return content
-        raise FileNotFoundError(name)
-
-
-def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[trimesh.Trimesh]:
-    """The triangle meshes of a file, those of COLLADA files scaled by their unit.
+def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.Trimesh, np.ndarray | None]]:
+    """The triangle meshes of a file with their colours; those of COLLADA files scaled by their unit.
 
     The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> is for coordinates as they are stored.
 
@@ -108,28 +81,24 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[trimesh.Trimesh
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise RobotError(f"mesh {path} is of an unknown kind, {shown(path.suffix)}. {allowed}")
+    limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF keeps its numbers in a file beside it.
     try:
-        content = io.BytesIO(read_bytes(path, MESH))
-        loaded = trimesh.load_scene(content, file_type=kind, resolver=_BesideTheMesh(str(path)))
-        if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MOST_FACES:
-            raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
-        if len(loaded.graph.nodes_geometry) > MOST_PARTS:
-            raise RobotError(f"mesh {path} has more than {MOST_PARTS:,} parts. Export it as one mesh.")
-        meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        parts = called(mesh_parts, path, kind, limits=limits)
     except RobotError:
         raise
-    except Exception as error:  # trimesh raises whatever its format readers raise
+    except (OSError, ValueError) as error:
         raise RobotError(f"mesh {path} cannot be read ({error}). {allowed}") from error
     scale = scale * collada_asset(path)[0]
-    if not meshes:
+    if not parts:
         raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
-    for mesh in meshes:
+    meshes = []
+    for vertices, faces, color in parts:
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
         check_mesh(mesh, f"mesh {path}", FARTHEST / min(np.abs(scale)))
         if (scale != 1.0).any():
             mesh.apply_transform(np.diag([*scale, 1.0]))
             check_mesh(mesh, f"mesh {path}, scaled,")
-    if sum(len(mesh.faces) for mesh in meshes) > MOST_FACES:
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+        meshes.append((mesh, color))
     return meshes
 
 

@@ -11,10 +11,11 @@ import trimesh
 import yourdfpy
 from jaxtyping import Float, Int
 
+from ..decoders.meshes import MOST_FACES, mesh_color
 from ..errors import RobotError
 from ..wording import shown
 from .decimation import DecimationError, decimated
-from .mesh_files import MOST_FACES, check_mesh, mesh_path, read_mesh
+from .mesh_files import check_mesh, mesh_path, read_mesh
 
 SHARP_EDGE = np.deg2rad(38.0)
 """Faces that meet at a larger angle [rad] do not share a smooth normal."""
@@ -70,11 +71,12 @@ def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[
     if opacity < _OPAQUE or visual.geometry is None:
         return []
     parts: list[tuple[trimesh.Trimesh, np.ndarray]] = []
-    for mesh in _geometry(visual.geometry, folder):
+    for mesh, own in _geometry(visual.geometry, folder):
         if visual.origin is not None:
             mesh.apply_transform(visual.origin)
             check_mesh(mesh, "a mesh at its <origin>")
-        parts.append((mesh, color if color is not None else _mesh_color(mesh)))
+        chosen = next((each for each in (color, own) if each is not None), _DEFAULT_COLOR)
+        parts.append((mesh, chosen))
     return parts
 
 
@@ -88,25 +90,22 @@ def _urdf_color(visual: yourdfpy.Visual, materials: dict) -> tuple[np.ndarray | 
     return rgba[:3], float(rgba[3])
 
 
-def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[trimesh.Trimesh]:
+def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[tuple[trimesh.Trimesh, np.ndarray | None]]:
+    """Meshes, and their colours."""
+    shape = None
     if geometry.box is not None:
-        return [trimesh.creation.box(extents=geometry.box.size)]
-    if geometry.cylinder is not None:
-        return [trimesh.creation.cylinder(radius=geometry.cylinder.radius, height=geometry.cylinder.length)]
-    if geometry.sphere is not None:
-        return [trimesh.creation.icosphere(radius=geometry.sphere.radius)]
+        shape = trimesh.creation.box(extents=geometry.box.size)
+    elif geometry.cylinder is not None:
+        shape = trimesh.creation.cylinder(radius=geometry.cylinder.radius, height=geometry.cylinder.length)
+    elif geometry.sphere is not None:
+        shape = trimesh.creation.icosphere(radius=geometry.sphere.radius)
+    if shape is not None:
+        return [(shape, mesh_color(shape))]
     if geometry.mesh is None:
         return []
     scale = np.ones(3) if geometry.mesh.scale is None else np.ones(3) * np.asarray(geometry.mesh.scale)
     named = f"the URDF in {folder} names it as {shown(geometry.mesh.filename)}"
     return read_mesh(mesh_path(folder, geometry.mesh.filename), scale, named)
-
-
-def _mesh_color(mesh: trimesh.Trimesh) -> np.ndarray:
-    visual = mesh.visual
-    material = getattr(visual, "material", None)
-    rgba = getattr(material, "main_color", None) if material is not None else getattr(visual, "main_color", None)
-    return _DEFAULT_COLOR if rgba is None else np.asarray(rgba, dtype=float)[:3] / 255.0
 
 
 def simplify(

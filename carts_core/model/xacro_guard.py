@@ -8,11 +8,10 @@ import ast
 import math
 import operator
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
-from unittest import mock
+from xml.dom import minidom
 
 from ..errors import RobotError
 from ..files.reading import CALIBRATION, ROBOT, parse_yaml, read_text
@@ -22,8 +21,8 @@ _LONGEST = 100_000
 _LARGEST = 2.0**63
 """Largest whole number."""
 _LONGEST_EXPRESSION = 2_000
-_MOST_ELEMENTS = 10_000
-"""Most elements that a model may expand to, over all runs of xacro; dVRK's have some hundreds."""
+LIBRARIES = {"expanded": ("xacro", "xacrodoc")}
+"""Imported before the memory of a child process is counted."""
 _DECLARES = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
 
 _BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
@@ -61,27 +60,29 @@ _OF_TEXTS = ("lower", "upper", "strip")
 _MESSAGES = ("message", "warning", "error")
 
 
-@contextmanager
-def guarded_xacro() -> Iterator[None]:
-    """While entered, xacro runs no code of a model, reads regular files of a bounded size, and comes to an end."""
-    import xacro  # noqa: PLC0415 - an extra
-    from xacro import substitution_args  # noqa: PLC0415
+def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) -> str:
+    """The URDF of a model; for a child process, since xacro is changed to use the expressions of this module.
 
-    parse, call, calls = xacro.parse, xacro.handle_macro_call, 0
+    Args:
+        path: of the model.
+        packages: folders of ROS packages by name.
+        arguments: of the model.
+
+    Raises:
+        Exception: it cannot be expanded; the class is that of xacro, or of an expression.
+    """
+    import xacro  # noqa: PLC0415 - an extra
+    import xacrodoc  # noqa: PLC0415
+    from xacro import substitution_args  # noqa: PLC0415
 
     def parse_file(content: Any, filename: str | None = None) -> Any:
         if content is None:
             content = read_text(Path(xacro.root_dir or "", filename or ""), ROBOT)
-        if isinstance(content, str) and _DECLARES.search(content):
+        if not isinstance(content, str):
+            return content  # It is parsed already.
+        if _DECLARES.search(content):
             raise RobotError(f"{filename or 'the model'} declares a document type or entities, which no model needs")
-        return parse(content)
-
-    def counted_call(*arguments: Any) -> Any:
-        nonlocal calls
-        calls += 1
-        if calls > _MOST_ELEMENTS:
-            raise RobotError(f"the model expands to more than {_MOST_ELEMENTS:,} elements")
-        return call(*arguments)
+        return minidom.parseString(content)
 
     def refused(text: str, context: Any) -> str:
         raise RobotError(f"$(eval {text}) is not evaluated; write ${{...}}")
@@ -89,15 +90,11 @@ def guarded_xacro() -> Iterator[None]:
     def evaluate(text: str, symbols: Mapping[str, Any], local: Any = None) -> Any:
         return Expression(symbols, xacro.abs_filename_spec).value(text)
 
-    with ExitStack() as patched:
-        for module, name, function in (
-            (xacro, "safe_eval", evaluate),
-            (xacro, "parse", parse_file),
-            (xacro, "handle_macro_call", counted_call),
-            (substitution_args, "_eval", refused),
-        ):
-            patched.enter_context(mock.patch.object(module, name, function))
-        yield
+    changed: Any = xacro
+    changed.safe_eval, changed.parse, substitution_args._eval = evaluate, parse_file, refused
+    xacrodoc.packages.update_package_cache(packages)
+    model = xacrodoc.XacroDoc.from_string(read_text(path, ROBOT), subargs=arguments, resolve_packages=False)
+    return model.to_urdf_string()
 
 
 class Expression:

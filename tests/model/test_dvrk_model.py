@@ -10,9 +10,9 @@ from dvrk_tree import XACRO, write_model
 
 from carts_core import extras
 from carts_core.cli.command_line import BAD_INPUT, main
+from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import CartsError, RobotError
 from carts_core.model.dvrk_model import dvrk_urdf, list_instruments
-from carts_core.model.mesh_files import MOST_FACES
 from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward
 from carts_core.model.robot import Robot
 

@@ -116,7 +116,7 @@ def test_decimation_that_takes_too_long_is_stopped(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(decimation, "_SECONDS", 1.0)
     monkeypatch.setattr(decimation, "_SECONDS_PER_FACE", 0.0)
     start = time.monotonic()
-    with pytest.raises(DecimationError, match="was not simplified within 1 s"):
+    with pytest.raises(DecimationError, match="not simplified within 1 s"):
         decimated(vertices, faces, 0.1)
     assert time.monotonic() - start < 20.0
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from carts_core.cli.command_line import main
+from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import RobotError, SequenceError
 from carts_core.model.dvrk_model import dvrk_urdf
 from carts_core.model.instruments import INSTRUMENTS, builtin_urdf
 from carts_core.model.instruments.builtin import instrument_of
 from carts_core.model.keypoints import keypoints
-from carts_core.model.mesh_files import MOST_FACES
 from carts_core.model.parts import PARTS, link_parts
 from carts_core.model.psm_kinematics import forward
 from carts_core.model.robot import Robot

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from tiny import tiny_scene
 
+from carts_core.decoders.meshes import MOST_FACES
 from carts_core.model.keypoints import MOST_KEYPOINTS, keypoints, project_keypoints
-from carts_core.model.mesh_files import MOST_FACES
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm
 

@@ -8,9 +8,9 @@ import torch
 import trimesh
 import yourdfpy
 
+from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import RobotError
 from carts_core.model.decimation import deviation
-from carts_core.model.mesh_files import MOST_FACES
 from carts_core.model.robot import Robot
 from carts_core.resources import shipped_robot
 

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 
 from carts_core.errors import RobotError
-from carts_core.model.xacro_guard import Expression, guarded_xacro
+from carts_core.files.decoding import decoded
+from carts_core.model.xacro_guard import Expression, expanded
 
 XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="x">'
 SYMBOLS = {"PI": 3.5, "tip": "093", "table": {"400093": {"tip": "093"}}, "f": len, "type": type}
 ESCAPES = {
     "comprehension": "[[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == '_wrap_close'][0]"
-    ".__init__.__globals__['system']('touch PWNED') for _ in [1]]",
+    ".__init__.__globals__['system']('touch FOLDER/PWNED') for _ in [1]]",
     "lambda": "(lambda: ().__class__)()",
     "attribute": "().__class__.__base__",
     "type": "python.vars(python.type)['__subclasses__'](python.type(1))",
@@ -56,11 +57,9 @@ def test_other_expressions_are_refused(name: str) -> None:
         Expression(SYMBOLS, str).value(ESCAPES[name])
 
 
-def expanded(text: str) -> str:
-    from xacrodoc import XacroDoc  # noqa: PLC0415
-
-    with guarded_xacro():
-        return XacroDoc.from_string(f"{XACRO}{text}</robot>", resolve_packages=False).to_urdf_string()
+def expand(text: str) -> str:
+    Path("model.xacro").write_text(f"{XACRO}{text}</robot>".replace("FOLDER", os.getcwd()))
+    return decoded(expanded, Path("model.xacro").absolute(), {}, {})
 
 
 def bomb(levels: int) -> str:
@@ -74,14 +73,14 @@ def bomb(levels: int) -> str:
 
 HOSTILE = {
     "expression": f'<link name="${{{ESCAPES["comprehension"]}}}"/>',
-    "eval": "<xacro:arg name='a' default=\"$(eval open('PWNED', 'w'))\"/><link name='$(arg a)'/>",
+    "eval": "<xacro:arg name='a' default=\"$(eval open('FOLDER/PWNED', 'w'))\"/><link name='$(arg a)'/>",
     "property": '<xacro:property name="p" value="${python.type}"/><link name="${p}"/>',
-    "pipe": '<xacro:include filename="pipe"/>',
+    "pipe": '<xacro:include filename="FOLDER/pipe"/>',
     "device": '<xacro:include filename="/dev/zero"/>',
-    "table that is a pipe": "<xacro:property name='t' value=\"${xacro.load_yaml('pipe')}\"/><link name='${t}'/>",
-    "table with code": "<link name=\"${xacro.load_yaml('table.yaml')}\"/>",
-    "entities": '<xacro:include filename="entities.xacro"/>',
-    "itself": '<xacro:include filename="itself.xacro"/>',
+    "table that is a pipe": "<xacro:property name='t' value=\"${xacro.load_yaml('FOLDER/pipe')}\"/><link name='${t}'/>",
+    "table with code": "<link name=\"${xacro.load_yaml('FOLDER/table.yaml')}\"/>",
+    "entities": '<xacro:include filename="FOLDER/entities.xacro"/>',
+    "itself": '<xacro:include filename="FOLDER/itself.xacro"/>',
     "bomb": bomb(40),
 }
 
@@ -93,10 +92,10 @@ def test_a_hostile_model_is_refused_and_does_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
-    Path("table.yaml").write_text('a: !!python/object/apply:os.system ["touch PWNED"]\n')
+    Path("table.yaml").write_text(f'a: !!python/object/apply:os.system ["touch {tmp_path}/PWNED"]\n')
     Path("entities.xacro").write_text(f'<!DOCTYPE r [<!ENTITY a "{"x" * 99}">]>{XACRO}&a;</robot>')
-    Path("itself.xacro").write_text(f'{XACRO}<xacro:include filename="itself.xacro"/></robot>')
+    Path("itself.xacro").write_text(f'{XACRO}<xacro:include filename="{tmp_path}/itself.xacro"/></robot>')
     # What xacro makes of an error is an exception of its own; `dvrk_urdf` makes a `RobotError` of any.
     with pytest.raises(Exception, match=r"."):
-        expanded(HOSTILE[name])
+        expand(HOSTILE[name])
     assert not Path("PWNED").exists()

@@ -1,0 +1,74 @@
+"""Triangle meshes of files that trimesh reads."""
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from trimesh.resolvers import FilePathResolver
+
+from ..errors import RobotError
+from ..files.image_size import size_problem
+from ..files.reading import IMAGE, MESH, is_regular, read_bytes
+
+MOST_FACES = 1_000_000
+"""Triangles of one mesh file before it is simplified."""
+MOST_PARTS = 1_000
+"""Instances of meshes in one file."""
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+
+
+class _BesideTheMesh(FilePathResolver):
+    """Materials and textures that a mesh names: regular files below its folder, of a bounded size."""
+
+    def get(self, name: str) -> bytes:
+        """The content of a file.
+
+        Raises:
+            OSError, ValueError: it is missing, outside the folder, or not one that is read.
+        """
+        for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
+            path = Path(self.absolute(candidate))
+            if is_regular(path):
+                image = path.suffix.lower() in _IMAGES
+                content = read_bytes(path, IMAGE if image else MESH)
+                if image and (problem := size_problem(content)) is not None:
+                    raise ValueError(f"{path} {problem}")
+                return content
+        raise FileNotFoundError(name)
+
+
+def mesh_parts(
+    path: Path, kind: str
+) -> list[tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "3"] | None]]:
+    """Vertices, triangles and colour, None without one, of each mesh in a file.
+
+    Args:
+        path: the file.
+        kind: as trimesh calls it, say "stl".
+
+    Raises:
+        OSError: it cannot be read.
+        RobotError: it has too many triangles or parts.
+        Exception: it is damaged; the class is that of the reader.
+    """
+    content = io.BytesIO(read_bytes(path, MESH))
+    loaded = trimesh.load_scene(content, file_type=kind, resolver=_BesideTheMesh(str(path)))
+    if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MOST_FACES:
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+    if len(loaded.graph.nodes_geometry) > MOST_PARTS:
+        raise RobotError(f"mesh {path} has more than {MOST_PARTS:,} parts. Export it as one mesh.")
+    meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if sum(len(mesh.faces) for mesh in meshes) > MOST_FACES:
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+    return [(np.asarray(mesh.vertices), np.asarray(mesh.faces), mesh_color(mesh)) for mesh in meshes]
+
+
+def mesh_color(mesh: trimesh.Trimesh) -> Float[np.ndarray, "3"] | None:
+    """The main colour of a mesh's material, RGB in [0, 1]; None without one."""
+    visual = mesh.visual
+    material = getattr(visual, "material", None)
+    rgba = getattr(material, "main_color", None) if material is not None else getattr(visual, "main_color", None)
+    return None if rgba is None else np.asarray(rgba, dtype=float)[:3] / 255.0
