@@ -8,6 +8,7 @@ from carts_core.errors import CartsError
 from carts_core.evaluation.calibration import moved_frames
 from carts_core.model.scene import Scene
 from carts_core.optimization.calibration import CalibrationOptimizer
+from carts_core.optimization.counterfactual import Backgrounds
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -94,7 +95,12 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     before = session.editor.view
     scene = scene_at(session.scene, session.measured(state.frame))
     optimizer = CalibrationOptimizer(
-        scene, frames, optimizers.predictor(target), free=replace(free, joints=False), ignore=ignored
+        scene,
+        frames,
+        optimizers.predictor(target),
+        free=replace(free, joints=False),
+        ignore=ignored,
+        backgrounds=Backgrounds.of(sequence, cameras, state.domain),
     )
     most = CALIBRATION_SETTINGS.iterations
     while (iterate := optimizer.step()) is not None:
@@ -103,7 +109,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     result = optimizer.result()
     for change in result.unknowns:
         unit = "°" if change.unit == "deg" else f" {change.unit}"
-        line = f"{change.name}: {change.change:+.3f} ± {change.deviation_between_frames:.3f}{unit}"
+        line = f"{change.name}: {change.change:+.3f} ± {change.standard_deviation:.3f}{unit}"
         yield Progress(most, most, "Comparing", line)
     found = result.assessment
     verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}".strip()

@@ -22,8 +22,9 @@ def clicked(
     noise: float = 2.0,
     seed: int = 0,
     names: tuple[str, ...] = NAMES,
+    side: float | None = None,
 ) -> list[ImagePoint]:
-    """Points of all arms [px], in the order in which a person would click them."""
+    """Points of all arms [px], in the order in which a person would click them; edges of shafts on one side or any."""
     random = np.random.default_rng(seed)
     frames, points = tuple(frames), []
     for camera in cameras:
@@ -33,7 +34,7 @@ def clicked(
                 Ts = link_transforms(arm, measured[arm.name][frame][None])[0]
                 T_camera_base = scene.camera(camera).T_camera_world @ arm.T_world_base
                 for name in names:
-                    place = _seen(known[name], Ts, T_camera_base, side=random.choice([-1.0, 1.0]))
+                    place = _seen(known[name], Ts, T_camera_base, side or random.choice([-1.0, 1.0]))
                     fx, fy, cx, cy = scene.camera(camera).intrinsics
                     pixel = np.array([fx * place[0] / place[2] + cx, fy * place[1] / place[2] + cy])
                     u, v = pixel + noise * random.standard_normal(2)

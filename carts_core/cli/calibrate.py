@@ -54,7 +54,7 @@ class Calibrate:
         """Calibrate; on Ctrl-C or an error nothing is written."""
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
         from ..files import MARKER, published, write_text
-        from ..optimization import CalibrationOptimizer
+        from ..optimization import Backgrounds, CalibrationOptimizer
         from ..recording import Sequence
         from .hints import calibration_hint, print_hints
 
@@ -67,8 +67,11 @@ class Calibrate:
         observer.check(sequence, indices, cameras, [self.domain])
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
-            known = observer.warnings(sequence, indices[0], self.domain, tuple(cameras), background=False)
-            print_hints(console, *known)
+            domain = self.domain or sequence.domains[0]
+            backgrounds = None if observer.masked else Backgrounds.of(sequence, cameras, domain)
+            known = backgrounds is not None and backgrounds.covers(sequence.scene.with_cameras(cameras))
+            hints = observer.warnings(sequence, indices[0], self.domain, tuple(cameras), background=known)
+            print_hints(console, *(backgrounds.problems if backgrounds else ()), *hints)
             optimizer = CalibrationOptimizer(
                 sequence.scene,
                 frames,
@@ -78,6 +81,7 @@ class Calibrate:
                 joint_prior_deg=self.joint_prior_deg,
                 ignore=[observer.ignore(index) for index in indices],
                 cameras=cameras,
+                backgrounds=backgrounds,
             )
             result = _optimized(optimizer, console)
             residuals = frame_residuals(sequence, frames, result)

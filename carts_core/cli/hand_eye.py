@@ -11,7 +11,10 @@ from ..console import Terminal
 from .selection import SequencePath, output_folder
 
 if TYPE_CHECKING:
-    from ..optimization.hand_eye import HandEyeResult
+    from collections.abc import Sequence as Points
+
+    from ..optimization.hand_eye import HandEyeResult, ImagePoint
+    from ..recording import Sequence
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class HandEye:
     focal_length: bool = False
     """Find the focal lengths, too. Needs points at several depths; see the deviation that is said."""
     free_cameras: tuple[str, ...] = ()
-    """Cameras whose pose relative to the first one is not known."""
+    """Cameras whose pose relative to the others is not known."""
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
 
@@ -63,11 +66,11 @@ class HandEye:
             write_text(folder / "sequence.toml", text)
             write_text(folder / "hand_eye.json", json.dumps(result_json(sequence, points, result), indent=1))
             write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
-        _print(console, result)
+        _print(console, sequence, points, result)
         console.print(f"wrote {output}. Refine it over the recording: carts calibrate {output}/sequence.toml")
 
 
-def _print(console: Console, result: "HandEyeResult") -> None:
+def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]", result: "HandEyeResult") -> None:
     used = len(result.distances) - len(result.contradicting)
     console.print(f"{used} points agree to {result.error:.1f} px")
     for (arm, camera), deviation in result.deviations.items():
@@ -81,4 +84,6 @@ def _print(console: Console, result: "HandEyeResult") -> None:
     for (arm, camera), more in result.missing.items():
         console.print(f"{arm} before {camera} stays as it was: {more} more points are needed")
     for index in result.contradicting:
-        console.print(f"row {index + 2} contradicts the others: {result.distances[index]:.0f} px off")
+        point = points[index]
+        where = f"{point.arm} {point.landmark} in frame {sequence.frame_ids[point.frame]}, camera {point.camera}"
+        console.print(f"row {index + 2} ({where}) contradicts the others: {result.distances[index]:.0f} px off")

@@ -84,7 +84,7 @@ def _unknowns_figure(result: CalibrationResult) -> "Figure":
         panel.errorbar(
             [unknown.change for unknown in shown],
             [unknown.name for unknown in shown],
-            xerr=[2 * unknown.deviation_between_frames for unknown in shown],
+            xerr=[2 * unknown.standard_deviation for unknown in shown],
             fmt="o",
             capsize=3,
         )
@@ -129,21 +129,23 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
         "",
         "## Unknowns",
         "",
-        "Base frames turn and shift in their own axes, cameras in theirs. The standard deviation *of the curvature*",
-        "takes pixels for independent and is too small; that *between frames* counts how much the frames contradict",
-        "each other. An unknown whose deviation of the curvature is close to the prior's was not seen and stays where",
-        "it was.",
+        "Base frames turn and shift in their own axes, cameras in theirs. The *standard deviation* allows for errors",
+        "that frames share (of outlines, and 1 % of intrinsics that are held) and for how much the frames contradict",
+        "each other, which *between frames* is alone. That *of the curvature* takes pixels for independent and is too",
+        "small. An unknown whose deviation of the curvature is close to the prior's was not seen and stays where it",
+        "was.",
         "",
         "![unknowns](unknowns.png)",
         "",
-        "Bars are two standard deviations between frames.",
+        "Bars are two standard deviations.",
         "",
-        "| unknown | change | of the curvature | between frames | prior | unit |",
-        "|---|---|---|---|---|---|",
+        "| unknown | change | standard deviation | between frames | of the curvature | prior | unit |",
+        "|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {in_markdown(unknown.name)} | {unknown.change:.3f} | {unknown.deviation:.3f} | "
-        f"{unknown.deviation_between_frames:.3f} | {unknown.prior_deviation:.3f} | {unknown.unit} |"
+        f"| {in_markdown(unknown.name)} | {unknown.change:.3f} | {unknown.standard_deviation:.3f} | "
+        f"{'-' if unknown.deviation_between_frames is None else f'{unknown.deviation_between_frames:.3f}'} | "
+        f"{unknown.deviation:.3f} | {unknown.prior_deviation:.3f} | {unknown.unit} |"
         for unknown in result.unknowns
     ]
     dice_columns = [f"Dice {in_markdown(camera)} {label}" for camera in cameras for label in ("before", "after")]

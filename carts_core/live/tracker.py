@@ -31,8 +31,6 @@ from .resemblance import CHANGED, Picture, change, small_picture
 
 _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""
-_CONTRADICTS = 9.0
-"""A correction three deviations off what was expected, on average, contradicts it."""
 _LOOKED = 1.0
 """How often it is seen whether an arm that is out of view is elsewhere in the image [s]."""
 
@@ -250,8 +248,7 @@ class LiveTracker:
             return measurement.loss <= self.live.bad_loss
         if self._bad(measurement):
             return False
-        contradiction = measurement.information.mahalanobis(attempt.expected)
-        return self._filtered is not None and contradiction <= _CONTRADICTS
+        return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
 
     def _bad(self, measurement: Measurement) -> bool:
         usual = statistics.median(self._losses) if self._losses else math.inf

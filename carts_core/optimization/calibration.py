@@ -1,33 +1,47 @@
 """Hand-eye calibration: base frames and cameras that many frames share, one iterate at a time."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.stats import norm as gaussian
+from scipy.stats import t as student
 
 from ..errors import SettingsError
 from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..recording.background import spread
-from ..settings import CALIBRATION, CALIBRATION_SETTINGS, FreeParameters, SolverSettings, SurfaceSolver, surface_solver
+from ..settings import (
+    CALIBRATION,
+    CALIBRATION_SETTINGS,
+    FreeParameters,
+    SequenceSettings,
+    SolverSettings,
+    surface_solver,
+)
 from ..settings.stages import Descend
 from .calibrated_scene import calibrated_scene
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
+from .counterfactual import Backgrounds
 from .familiarity import familiarity
 from .fit import Fit, Point, StopReason
 from .frame import Progress
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
-from .variables import Variables
 from .verdict import Assessment, Verdict
 from .verdict_of_many import assess_calibration, without_knowledge, worse_in
 
 _TRIED = 4
 """Most frames in which the network is tried on a rendering of the arms."""
+
+_HELD_INTRINSICS = 0.01
+"""Expected error of focal lengths and principal points that are held, as a share of the focal length [1]. It widens
+deviations and moves nothing: they are consider parameters (Schmidt, Application of state-space methods to navigation
+problems, 1966)."""
 
 _STANDS = 1e-3
 """Mounts whose transforms differ by less are at the same place [rad, m]."""
@@ -60,10 +74,13 @@ class UnknownChange:
     unit: str
     """deg, mm, px or %, of all the other values."""
     change: float
+    standard_deviation: float
+    """Of the unknown, for all errors that are allowed for: those of the frames, an error that all outlines share,
+    intrinsics that are held, and what an optimization that ends early leaves."""
     deviation: float
-    """Standard deviation from the curvature, with pixels taken for independent."""
-    deviation_between_frames: float
-    """The same from how much the frames contradict each other, which also knows errors that pixels share."""
+    """The part that follows from the curvature, with pixels taken for independent."""
+    deviation_between_frames: float | None
+    """The part that follows from how much the frames contradict each other: a jackknife; None with one frame."""
     prior_deviation: float
     """Before any image was used; an unknown whose `deviation` is close to this was not determined."""
 
@@ -100,6 +117,9 @@ class CalibrationOptimizer:
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
         cameras: names of the cameras that take part, all by default.
+        backgrounds: of these cameras, where they are known, as of `FrameOptimizer`.
+        known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], as of
+            `HandEyeResult`, where it is known better than the settings expect.
 
     Raises:
         SettingsError: no frame, nothing of the calibration is free, another solver, or an image does not fit.
@@ -117,6 +137,8 @@ class CalibrationOptimizer:
         joint_prior_deg: float = 0.1,
         ignore: Ignored | None = None,
         cameras: Sequence[str] | None = None,
+        backgrounds: Backgrounds | None = None,
+        known_base_frames: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> None:
         self.settings = settings = surface_solver(settings, "a calibration")
         if not frames:
@@ -129,8 +151,17 @@ class CalibrationOptimizer:
         self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)
         self._frames, self._predictor = frames, predictor_of(networks)
         self._problem = CalibrationProblem(
-            self._scene, frames, self._predictor, self.free, settings, joint_prior_deg, ignore
+            self._scene,
+            frames,
+            self._predictor,
+            self.free,
+            settings,
+            joint_prior_deg,
+            ignore,
+            backgrounds,
+            known_base_frames,
         )
+        self._known = known_base_frames or {}
         self.variables = self._problem.variables
         self._fit = Fit(self._problem, torch.zeros_like(self.variables.lower), settings.iterations)
         self._points = self._judged(run_stages(settings.stages, self._fit))
@@ -221,13 +252,53 @@ class CalibrationOptimizer:
         evaluation = self._problem.evaluate(offsets, self._problem.present)
         return CalibrationResult(
             scene=self.best.scene,
-            unknowns=_changes(self.variables, offsets, evaluation, self.settings),
+            unknowns=self._changes(offsets, evaluation),
             frame_losses_before=self._problem.frame_losses(torch.zeros_like(offsets)),
             frame_losses_after=self._problem.frame_losses(offsets),
             frame_weights=evaluation.frame_weights.numpy().copy(),
             stop_reason=self.stop_reason or StopReason.CANCELLED,
             assessment=self.assessment,
         )
+
+    def _changes(self, offsets: torch.Tensor, evaluation: CalibrationEvaluation) -> tuple[UnknownChange, ...]:
+        """What became of each unknown, with deviations for all errors that are allowed for."""
+        assert evaluation.hessian is not None and evaluation.outline is not None
+        covariance = torch.linalg.inv(evaluation.hessian.double().cpu())
+        alone = covariance.diagonal().sqrt()
+        between = _between_frames(evaluation)
+        # Neighbouring pixels share their errors. With one frame nothing else says by how much.
+        share = SequenceSettings.measurement_noise / self.settings.noise
+        frames = share * alone if between is None else between
+        shifts = [covariance @ evaluation.outline[:, None], covariance @ evaluation.gradient.double().cpu()[:, None]]
+        if not self.free.intrinsics:
+            shifts.append(_HELD_INTRINSICS * covariance @ self._problem.curvature_with_intrinsics(offsets))
+        total = (frames.square() + torch.cat(shifts, 1).square().sum(1)).sqrt()
+        settings = self.settings
+        prior = self.variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
+        changes = []
+        for index, (name, unit, scale) in enumerate(self.variables.units()):
+            change, deviation, one = (scale * float(values[index]) for values in (offsets.cpu(), total, alone))
+            other = None if between is None else scale * float(between[index])
+            changes.append(UnknownChange(name, unit, change, deviation, one, other, scale * float(prior[index])))
+        return tuple(changes)
+
+
+def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, " n"] | None:
+    """Standard deviations from leaving out each frame in turn, by the quadratic model; None with one frame.
+
+    The jackknife over clusters, here frames, whose pixels share their errors (CR3: MacKinnon, Nielsen and Webb, Fast
+    and reliable jackknife and bootstrap methods for cluster-robust inference, 2023), widened as Student's t with as
+    many degrees of freedom as frames but one is wider than a Gaussian (Bell and McCaffrey, Bias reduction in standard
+    errors for linear regression with multi-stage samples, 2002).
+    """
+    gradients, curvatures = evaluation.frame_gradients, evaluation.frame_curvatures
+    assert gradients is not None and curvatures is not None and evaluation.hessian is not None
+    count = len(gradients)
+    if count < 2:
+        return None
+    left = torch.linalg.solve(evaluation.hessian.double().cpu() - curvatures, gradients[..., None])[..., 0]
+    wider = float(student.ppf(gaussian.cdf(1.0), count - 1))
+    return wider * (left.square().sum(0) * (count - 1) / count).sqrt()
 
 
 def _some_camera_moves(frames: Sequence[Frame]) -> bool:
@@ -250,25 +321,3 @@ def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
     if not (every_base and free.extrinsics) or set(names) & set(free.locked_cameras):
         return free
     return replace(free, locked_cameras=(*free.locked_cameras, names[0]))
-
-
-def _changes(
-    variables: Variables,
-    offsets: torch.Tensor,
-    evaluation: CalibrationEvaluation,
-    settings: SurfaceSolver,
-) -> tuple[UnknownChange, ...]:
-    assert evaluation.hessian is not None and evaluation.frame_gradients is not None
-    covariance = torch.linalg.inv(evaluation.hessian.double().cpu())
-    # The sandwich estimator with frames as clusters: pixels of one frame share their errors, frames do not.
-    pulled = covariance @ evaluation.frame_gradients.T
-    between = pulled.square().sum(1).sqrt()
-    alone, prior = (
-        covariance.diagonal().sqrt(),
-        variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu(),
-    )
-    changes = []
-    for index, (name, unit, scale) in enumerate(variables.units()):
-        values = (offsets[index].cpu(), alone[index], between[index], prior[index])
-        changes.append(UnknownChange(name, unit, *(scale * float(value) for value in values)))
-    return tuple(changes)

@@ -19,10 +19,12 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
+from .counterfactual import Backgrounds
 from .elimination import Eliminated, eliminate
 from .evaluation import Evaluation
 from .evidence import Evidence
 from .factors import Prior
+from .factors.surface import SurfaceFactor
 from .frame_problem import FrameProblem
 from .predictor import SurfacePredictor
 from .silhouettes import search_silhouettes
@@ -48,6 +50,10 @@ class CalibrationEvaluation(Evaluation):
     """How far each frame counts, in [0, 1]."""
     frame_gradients: Float[Tensor, "frames n"] | None
     """Each frame's part of the gradient, without the prior."""
+    frame_curvatures: Float[Tensor, "frames n n"] | None
+    """Each frame's part of the curvature, without the prior."""
+    outline: Float[Tensor, " n"] | None
+    """What the gradient is off by for one standard deviation of an error that all outlines share."""
 
 
 class _FramePart:
@@ -81,6 +87,26 @@ class _FramePart:
         """Evaluate this frame."""
         return self.problem.evaluate(torch.cat([own, shared]), stage, gradient=gradient)
 
+    def curvature_with_intrinsics(
+        self, shared: Float[Tensor, " n"], stage: Descend, free: FreeParameters
+    ) -> Float[Tensor, "n k"]:
+        """Mixed second derivatives of the shared unknowns and of the intrinsics of all cameras, which are held."""
+        problem, own = self.problem, len(self.own)
+        known = problem.variables
+        every = Variables(problem.scene, known.start, replace(free, intrinsics=True), problem.settings.length_scale)
+        columns = torch.tensor([every.names.index(name) for name in known.names])
+        offsets = torch.zeros_like(every.lower)
+        offsets[columns] = torch.cat([self.own, shared])
+        factor = SurfaceFactor(
+            problem.scene, every, problem.observation, problem.settings, blur=stage.blur, robust=stage.robust
+        )
+        model = factor.linearize(offsets)
+        hessian = model.hessian.clone()
+        hessian[:own, :own] += problem.prior.precision[:own, :own]
+        held = [index for index in range(own, len(every)) if index not in set(columns.tolist())]
+        curvature = eliminate(model.gradient, hessian, own).curvature
+        return curvature[columns[own:] - own][:, torch.tensor(held) - own]
+
 
 class CalibrationProblem:
     """Sum of the frames' factors as a function of the calibration alone. Implements `Problem`.
@@ -93,6 +119,9 @@ class CalibrationProblem:
         settings: noise, and the prior on the calibration.
         joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` turns it into metres.
         ignore: per frame, pixels that show an occluder.
+        backgrounds: of the cameras, where they are known; see `FrameProblem`.
+        known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], where it is
+            known better than `settings` expects.
 
     Attributes:
         variables: the calibration.
@@ -112,6 +141,8 @@ class CalibrationProblem:
         settings: SurfaceSolver,
         joint_prior_deg: float,
         ignore: Ignored | None = None,
+        backgrounds: Backgrounds | None = None,
+        known_base_frames: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> None:
         starts = [scene.state(frame.measured, predictor.device, frame.mounts) for frame in frames]
         self.variables = Variables(scene, starts[0], replace(free, joints=False), settings.length_scale)
@@ -130,10 +161,13 @@ class CalibrationProblem:
                 settings,
                 ignore[index] if ignore else None,
                 prior=Prior.around_start(precision),
+                backgrounds=backgrounds,
                 live=False,
             )
             self._parts.append(_FramePart(problem, own))
-        self.prior = self.variables.prior(settings)
+        self.prior = _with_base_frames(self.variables, settings, known_base_frames)
+        self._given_prior = bool(known_base_frames)
+        self._free = free
         self._weights = torch.ones(len(frames), dtype=torch.float64)
         self._losses: Tensor | None = None
         self.stage = -1
@@ -165,7 +199,12 @@ class CalibrationProblem:
             for evaluation, part in zip(evaluations, self._parts, strict=True)
             if evaluation.hessian is not None
         ]
-        combined = self._combined(offsets, evaluations, models)
+        outlines = [
+            eliminate(evaluation.common, evaluation.hessian, len(part.own)).gradient
+            for evaluation, part in zip(evaluations, self._parts, strict=True)
+            if evaluation.hessian is not None and evaluation.common is not None
+        ]
+        combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
         # What is lowest so far is where the solver steps from, so there the frames' own unknowns step from too.
         if models and combined.value < self._lowest:
@@ -209,6 +248,8 @@ class CalibrationProblem:
 
         deviation = self.variables.spread(stage.joints_deg, stage.frames_deg, distance)
         found, _ = search_silhouettes(distances, deviation, self.variables.clamp, stage)
+        if self._given_prior:
+            return found
         # What was searched is known no better than that; what was not, as before.
         wide = torch.where(deviation > 0, deviation, self.prior.marginal_precision.rsqrt().to(deviation))
         self.prior = replace(Prior.around_start(wide.to(found) ** -2), mean=found)
@@ -224,17 +265,25 @@ class CalibrationProblem:
         parts = zip(self._some(_ASSESSED), losses, strict=True)
         return [part.problem.evidence(part.at(offsets), loss) for part, loss in parts]
 
+    def curvature_with_intrinsics(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, "n k"]:
+        """Mixed second derivatives of the calibration and of intrinsics that are held, as of the present stage."""
+        assert self.present is not None
+        found = [part.curvature_with_intrinsics(offsets, self.present, self._free) for part in self._parts]
+        return torch.einsum("f,fnk->nk", self._weights, torch.stack(found))
+
     def _combined(
-        self, offsets: Tensor, evaluations: list[Evaluation], models: list[Eliminated]
+        self, offsets: Tensor, evaluations: list[Evaluation], models: list[Eliminated], outlines: list[Tensor]
     ) -> CalibrationEvaluation:
         weights = self._weights
         prior = self.prior.linearize(offsets)
         values = torch.tensor([evaluation.value for evaluation in evaluations], dtype=torch.float64)
         losses = torch.tensor([evaluation.loss for evaluation in evaluations], dtype=torch.float64)
-        slope, hessian, gradients = torch.zeros_like(offsets), None, None
+        slope, hessian, gradients, curvatures, outline = torch.zeros_like(offsets), None, None, None, None
         if models:
             gradients = weights[:, None] * torch.stack([model.gradient for model in models])
-            total = torch.einsum("f,fij->ij", weights, torch.stack([model.curvature for model in models]))
+            curvatures = weights[:, None, None] * torch.stack([model.curvature for model in models])
+            outline = weights @ torch.stack(outlines)
+            total = curvatures.sum(0)
             slope = prior.gradient + gradients.sum(0).to(offsets)
             hessian = prior.hessian.double() + total.to(offsets.device)
         maps = vars(evaluations[0])
@@ -249,8 +298,26 @@ class CalibrationProblem:
                 "frame_losses": losses,
                 "frame_weights": weights,
                 "frame_gradients": gradients,
+                "frame_curvatures": curvatures,
+                "outline": outline,
             }
         )
+
+
+def _with_base_frames(
+    variables: Variables, settings: SurfaceSolver, known: Mapping[str, Float[np.ndarray, "6 6"]] | None
+) -> Prior:
+    """The prior of the settings, with the covariances of base frames that are known."""
+    prior = variables.prior(settings)
+    precision, scales = prior.precision.clone(), variables.scales
+    for arm, covariance in (known or {}).items():
+        rows = [index for index, name in enumerate(variables.names) if name.startswith(f"{arm}/base/")]
+        if rows:
+            here = torch.tensor(rows, device=precision.device)
+            scale = scales[here]
+            inverse = torch.from_numpy(np.linalg.inv(covariance)).to(precision)
+            precision[here[:, None], here] = scale[:, None] * inverse * scale
+    return replace(prior, precision=precision)
 
 
 def frame_weights(losses: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:

@@ -53,13 +53,33 @@ class Information:
         return Information(self.precision + other.precision, self.vector + other.vector)
 
     def mahalanobis(self, expected: Gaussian) -> float:
-        """Squared Mahalanobis distance from what was expected, mean over the unknowns [1]; about 1 if all is well."""
-        n = len(self.vector)
-        residual = self.vector - self.precision @ expected.mean
-        difference = np.linalg.solve(self.precision + np.eye(n), residual)
-        whitened = np.eye(n) + expected.covariance @ self.precision
-        return float(residual @ np.linalg.solve(whitened, difference)) / n
+        """Squared Mahalanobis distance from what was expected, mean over the directions that were measured [1].
 
+        It is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
+        Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
+        about 1 if all is well, however many directions the image does not show, and 0 where it shows none.
+        """
+        residual = self.vector - self.precision @ expected.mean
+        # r (L + L S L)^-1 r, with the pseudoinverse of L, which may be singular, and an S that may be 0.
+        values, directions = np.linalg.eigh(self.precision)
+        measured = directions[:, values > _MEASURED]
+        if not measured.shape[1]:
+            return 0.0
+        L = measured.T @ self.precision @ measured
+        spread = np.linalg.inv(L) + measured.T @ expected.covariance @ measured
+        difference = np.linalg.solve(L, measured.T @ residual)
+        return float(difference @ np.linalg.solve(spread, difference)) / measured.shape[1]
+
+    def contradicts(self, expected: Gaussian) -> bool:
+        """Whether the correction is three standard deviations off what was expected, on average."""
+        return self.mahalanobis(expected) > _CONTRADICTS
+
+
+_CONTRADICTS = 9.0
+"""Mean squared Mahalanobis distance of a contradiction [1]."""
+
+_MEASURED = 10.0
+"""Precision of a direction below which it was not measured [1/rad^2]: 18 degrees, more than is ever expected."""
 
 _EXACT = 1e14
 """Precision of what is known for certain [1/rad^2]."""

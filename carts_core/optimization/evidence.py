@@ -42,7 +42,8 @@ class Evidence(ArmEvidence):
     changed: float | None
     """Share of the rendered arms that differs from the mean background; None where that is not known [1]."""
     still_in_view: float = 1.0
-    """Of the arms in view at the start, the smallest share that one of them still has of its area then [1]."""
+    """Of the arms in view at the start, the smallest share that one of them still has of its area then [1]; what
+    another arm hides is in view."""
     elsewhere: float = 0.0
     """Where an arm is out of view: what is predicted far from the others and differs from the mean background, as a
     share of the images [1]."""
@@ -88,7 +89,7 @@ def evidence(
         loss=loss,
         predicted=_share(alone, rendered),
         changed=_share_of_telling(rendered, change),
-        still_in_view=_still_in_view(images.renderer.segment(start), labels, len(end.joint_positions)),
+        still_in_view=_still_in_view(images, (images.renderer.segment(start), start), (labels, end)),
         elsewhere=_elsewhere(images, labels, len(end.joint_positions), predictor),
         masked=predictor.masked,
     )
@@ -121,7 +122,7 @@ def _places(
     """Weights of the pixels at and around each arm that is in view, as the only arm there; all pixels if `whole`."""
     labels = window.of(torch.from_numpy(arm_ids).to(weight.device))[:, None]
     arms = [labels == arm for arm in range(count)]
-    shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * images.renderer.width * images.renderer.height]
+    shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * arm_ids.size]
     if whole or len(shown) < 2:
         silhouette = (labels >= 0).to(weight)
         return [weight if whole else _around(silhouette, images.scale) * weight]
@@ -162,13 +163,13 @@ def _share_of_telling(rendered: Tensor, change: tuple[Tensor, Tensor] | None) ->
     return _share(change[1], rendered * change[0])
 
 
-def _still_in_view(before: Int[np.ndarray, "cameras h w"], after: Int[np.ndarray, "cameras h w"], arms: int) -> float:
+def _still_in_view(
+    images: FrameImages, before: tuple[np.ndarray, SceneState], after: tuple[np.ndarray, SceneState]
+) -> float:
     """See `Evidence.still_in_view`."""
-    shares = [1.0]
-    for arm in range(arms):
-        if (was := int((before == arm).sum())) >= OUT_OF_VIEW * before.size:
-            shares.append(int((after == arm).sum()) / was)
-    return min(shares)
+    seen = [int((before[0] == arm).sum()) for arm in range(len(before[1].joint_positions))]
+    shown = [arm for arm, area in enumerate(seen) if area >= OUT_OF_VIEW * before[0].size]
+    return min([1.0, *(images.still_in_view(arm, before, after) for arm in shown)])
 
 
 def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:

@@ -1,19 +1,22 @@
 """The images of a frame in a size in which they are compared."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..imaging.haze import certainty, dehazed, transmission
-from ..model.scene import Scene
+from ..model.scene import Scene, SceneState
 from ..rendering import Renderer
 from .counterfactual import Backgrounds, Change, without_background
 from .inputs import pixel_weights, stacked_images, working_size
 from .predictor import FramePredictor
+
+HAS_LEFT = 0.3
+"""Share of its area at the start below which an arm has left the image [1]."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,40 @@ class FrameImages:
     """What differs from the empty background; None where that is not known."""
     renderer: Renderer
     """Of the whole image."""
+
+    def area_alone(self, state: SceneState, arm: int) -> int:
+        """Pixels that an arm covers in all images where no other arm hides it.
+
+        Args:
+            state: of the scene.
+            arm: its position in the scene.
+        """
+        whole = self.renderer.scene
+        scene = whole.with_arms([whole.arms[arm].name])
+        renderer = Renderer(scene, width=self.size[0], height=self.size[1], device=self.renderer.device)
+        alone = replace(
+            state,
+            joint_positions=(state.joint_positions[arm],),
+            T_world_base=state.T_world_base[..., arm : arm + 1, :, :],
+        )
+        return int((renderer.segment(alone) >= 0).sum())
+
+    def still_in_view(
+        self,
+        arm: int,
+        before: tuple[Int[np.ndarray, "cameras h w"], SceneState],
+        after: tuple[Int[np.ndarray, "cameras h w"], SceneState],
+    ) -> float:
+        """Share of an arm's area at the start that it still has [1]; what another arm hides is in view.
+
+        Args:
+            arm: its position in the scene.
+            before, after: arm of each pixel and state, at the start and now.
+        """
+        share = int((after[0] == arm).sum()) / max(int((before[0] == arm).sum()), 1)
+        if share >= HAS_LEFT or len(self.renderer.scene.arms) < 2:
+            return share
+        return self.area_alone(after[1], arm) / max(self.area_alone(before[1], arm), 1)
 
     @property
     def replaced(self) -> bool:

@@ -6,26 +6,26 @@ from torch import Tensor
 
 from ..settings.stages import FINEST, Given, Observe, PreferStart, RandomRestart, first_descend
 from ..threads import total
+from .frame_images import HAS_LEFT
 from .frame_problem import FrameProblem
 
 _SUPPORT = 0.5
 """Share of an arm's silhouette that has to be observed as an arm, or the arm is lost [1]."""
 
-_LEFT = 0.3
-"""Share of the silhouette at the start that an arm has to keep, or it is lost [1]."""
-
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
     """Whether an arm that was in sight at the start has left the image, or stands where no arm was observed."""
-    seen, renderer = problem.observation, problem.observation.images.renderer
-    start = renderer.segment(problem.variables.state(problem.start))
-    found = seen.window.of(torch.from_numpy(renderer.segment(problem.variables.state(offsets))))
-    found = found.to(seen.maps.device)
+    seen, images = problem.observation, problem.observation.images
+    before, after = (problem.variables.state(point) for point in (problem.start, offsets))
+    start, end = (images.renderer.segment(state) for state in (before, after))
+    found = seen.window.of(torch.from_numpy(end)).to(seen.maps.device)
     coverage = seen.coverage
     for arm in range(len(problem.scene.arms)):
         here = found == arm
-        area, before = int(here.sum()), int((start == arm).sum())
-        if before and (area < _LEFT * before or total(coverage[here]) < _SUPPORT * area):
+        if not (start == arm).any():
+            continue
+        left = images.still_in_view(arm, (start, before), (end, after)) < HAS_LEFT
+        if left or total(coverage[here]) < _SUPPORT * int(here.sum()):
             return True
     return False
 

@@ -29,9 +29,6 @@ from .variables import Variables
 from .verdict_of_many import SequenceAssessment
 from .visiting_order import visiting_gaps
 
-_CONTRADICTS = 9.0
-"""A correction three deviations off what was expected, on average, contradicts it."""
-
 
 class SequenceOptimizer:
     """Corrects the frames of a sequence one after another.
@@ -221,7 +218,7 @@ class SequenceOptimizer:
             measurement = self._keyframe(frame, variables, expected)
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
-            if self._visits and measurement.information.mahalanobis(expected) > _CONTRADICTS:
+            if self._visits and measurement.information.contradicts(expected):
                 # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
                 if lost:
                     start, measurement = Origin.CARRIED, measurement.left_out()
@@ -276,8 +273,7 @@ class SequenceOptimizer:
         for index, smoothed in self._smoother.smoothed().items():
             visit = self._visits[index]
             certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
-            distance = visit.measurement.information.mahalanobis(certain)
-            if visit.start is Origin.CARRIED or distance > _CONTRADICTS:
+            if visit.start is Origin.CARRIED or visit.measurement.information.contradicts(certain):
                 chosen.append((index, remove_measurement(smoothed, visit.measurement.information)))
         return chosen
 
@@ -287,7 +283,7 @@ class SequenceOptimizer:
         earlier = self._visits[index]
         measurement = self._solver.warm(frame, variables, expected, expected.mean)
         start = Origin.WARM
-        if measurement.information.mahalanobis(expected) > _CONTRADICTS:
+        if measurement.information.contradicts(expected):
             start, measurement = Origin.CARRIED, measurement.left_out()
         measurement = replace(measurement, iterations=earlier.measurement.iterations + measurement.iterations)
         seconds = earlier.seconds + time.perf_counter() - began

@@ -7,6 +7,7 @@ from enum import Enum
 
 from .evidence import OUT_OF_VIEW, Evidence
 from .failure import log_odds_of_failure
+from .frame_images import HAS_LEFT
 from .observability import Uncertainty
 
 
@@ -77,9 +78,6 @@ agreement below which a prediction says nothing of the fit [1]."""
 _LOOKS_LIKE_ONE = 5e-3
 """Share of the images from which what looks like an arm may be the one that is out of view [1]."""
 
-_LEFT = 0.3
-"""Share of its area at the start below which an arm has left the image [1]."""
-
 _MOST, _MORE = 0.5, 2.0
 """Share of the images, and multiple of what arms cover as measured, from which a fit follows no mask of arms [1]."""
 
@@ -109,7 +107,7 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
         "Check that the image shows them (not black, not covered) and that it belongs to these kinematics.",
     ),
     (
-        lambda found: found.still_in_view < _LEFT,
+        lambda found: found.still_in_view < HAS_LEFT,
         "An arm that was in view at the start has left the image.",
         "See that the image, or the mask that is fitted, shows all arms; set the arm roughly by hand and run again, or "
         "check T_camera_world and T_world_base.",

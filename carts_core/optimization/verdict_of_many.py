@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from jaxtyping import Float
+from scipy.stats import t as student
 
 from .evidence import Evidence
 from .familiarity import RECOGNIZED, UNKNOWN_ROBOT_REMEDY, Familiarity
@@ -14,8 +16,12 @@ _MANY, _MOST = 0.1, 0.5
 """Share of frames not to be relied on from which a sequence is doubtful, and share of failed ones from which it has
 failed [1]."""
 
-_CLEARLY = 2.0
-"""Standard errors of a mean difference beyond which it is none of chance."""
+_LEVEL = 0.05
+"""Probability that any of the measures is called worse where all differences are chance [1]."""
+
+_SCATTER, _SCATTER_FREEDOM = 0.01, 4
+"""Usual deviation of a measure's change from frame to frame, and how many degrees of freedom it counts as [1]: with few
+frames their own scatter is hardly known, and with one frame not at all."""
 
 _BETTER_HIGHER = ("agreement", "unconditioned", "overlap_with_change")
 _BETTER_LOWER = ("residual", "loss")
@@ -104,19 +110,30 @@ def median_evidence(frames: Sequence[Evidence]) -> Evidence:
 
 
 def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]:
-    """What measures say that frames fit worse than before, beyond chance; their names.
+    """Names of the measures that say that frames fit worse than before, beyond chance.
+
+    One-sided moderated t-tests (Smyth, Linear models and empirical Bayes methods for assessing differential expression,
+    2004) with Holm's correction for several tests (A simple sequentially rejective multiple test procedure, 1979).
 
     Args:
         before, after: of the same frames, in the same order.
     """
-    found = []
+    chances = {}
     for names, sign in ((_BETTER_HIGHER, -1.0), (_BETTER_LOWER, 1.0)):
         for name in names:
             pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(before, after, strict=True)]
-            if any(None in pair for pair in pairs):
-                continue
-            rise = sign * np.array([new - old for old, new in pairs])
-            error = rise.std(ddof=1) / np.sqrt(len(rise)) if len(rise) > 1 else 0.0
-            if rise.mean() > max(_CLEARLY * error, 1e-6):
-                found.append(name)
+            if not any(None in pair for pair in pairs):
+                chances[name] = _chance(sign * np.array([new - old for old, new in pairs]))
+    found: list[str] = []
+    for name, chance in sorted(chances.items(), key=lambda item: item[1]):
+        if chance * (len(chances) - len(found)) > _LEVEL:
+            break
+        found.append(name)
     return found
+
+
+def _chance(rises: Float[np.ndarray, " frames"]) -> float:
+    """Probability of a mean rise that large where there is none [1]."""
+    freedom = len(rises) - 1 + _SCATTER_FREEDOM
+    squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
+    return float(student.sf(rises.mean() / np.sqrt(squares / freedom / len(rises)), freedom))

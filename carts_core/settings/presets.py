@@ -104,7 +104,7 @@ CALIBRATION: tuple[Stage, ...] = (
     Descend(blur=3.0),
     Descend(blur=1.6),
     Observe(),
-    FINEST,
+    replace(FINEST, steps=12, tolerance=1e-4),
 )
 """Many frames that share base frames and cameras."""
 

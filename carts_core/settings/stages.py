@@ -87,6 +87,7 @@ class RandomRestart:
         require(0 <= self.if_loss <= 10, "RandomRestart.if_loss", self.if_loss, "0 to 10")
         require(1 <= self.candidates <= 10_000, "RandomRestart.candidates", self.candidates, "1 to 10000")
         require(0 < self.deviation <= 10, "RandomRestart.deviation", self.deviation, "above 0, at most 10")
+        require(0.1 <= self.scale <= 8, "RandomRestart.scale", self.scale, "0.1 to 8")
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,7 @@ class SilhouetteSearch:
         require(20 <= self.candidates <= 10_000, "SilhouetteSearch.candidates", self.candidates, "20 to 10000")
         require(0 < self.joints_deg <= 90, "SilhouetteSearch.joints_deg", self.joints_deg, "above 0, at most 90 deg")
         require(0 < self.frames_deg <= 90, "SilhouetteSearch.frames_deg", self.frames_deg, "above 0, at most 90 deg")
+        require(0 <= self.enough <= 1000, "SilhouetteSearch.enough", self.enough, "0 to 1000 px")
         require(0.1 <= self.scale <= 8, "SilhouetteSearch.scale", self.scale, "0.1 to 8")
 
 

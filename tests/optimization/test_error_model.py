@@ -91,16 +91,17 @@ def test_after_an_endless_gap_nothing_is_known() -> None:
     assert np.allclose(forgotten.mean, 0)
 
 
-def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_and_large_elsewhere() -> None:
+@pytest.mark.parametrize("rank", [1, 2, 3])
+def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_however_much_is_seen(rank: int) -> None:
     rng = np.random.default_rng(4)
     expected = Gaussian(np.zeros(N), np.diag(CONSTANT**2))
-    precision = information(1, 3).precision
-    deviation = np.linalg.cholesky(expected.covariance + np.linalg.inv(precision))
-    draws = (deviation @ rng.standard_normal(N) for _ in range(400))
+    precision = information(1, rank).precision
+    spread = np.linalg.cholesky(expected.covariance + np.linalg.pinv(precision, rcond=1e-9))
+    draws = (spread @ rng.standard_normal(N) for _ in range(800))
     values = [Information(precision, precision @ draw).mahalanobis(expected) for draw in draws]
     assert np.mean(values) == pytest.approx(1.0, abs=0.15)
-    far = Information(precision, precision @ np.full(N, 0.5))
-    assert far.mahalanobis(expected) > 50
+    far = Information(precision, precision @ np.full(N, 0.9))
+    assert far.mahalanobis(expected) > 50 and far.contradicts(expected)
     assert Information.nothing(N).mahalanobis(expected) == 0
 
 

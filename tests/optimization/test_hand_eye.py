@@ -121,6 +121,20 @@ def test_a_camera_whose_pose_is_not_known_is_found_too(scene: Scene, measured: d
     assert np.array_equal(result.scene.cameras[0].T_camera_world, np.eye(4))
 
 
+@pytest.mark.parametrize(("free", "stays"), [(("left", "right"), "right"), (("left",), "right"), (("right",), "left")])
+def test_a_known_camera_keeps_its_pose_or_the_one_with_most_points(
+    scene: Scene, measured: dict[str, np.ndarray], free: tuple[str, ...], stays: str
+) -> None:
+    one = scene.with_arms(["PSM1"])
+    points = clicked(one, measured, range(2), ["left"], noise=0.0)
+    points += clicked(one, measured, range(3), ["right"], noise=0.0)
+    start = unknown(one, cameras=True)
+    result = solve_hand_eye(start, measured, points, HandEyeSettings(free_cameras=free))
+    assert np.array_equal(result.scene.camera(stays).T_camera_world, np.eye(4))
+    left, right = (camera.T_camera_world for camera in result.scene.cameras)
+    assert np.abs(right @ np.linalg.inv(left) - scene.cameras[1].T_camera_world).max() < 1e-6
+
+
 def test_points_of_both_cameras_of_a_known_pair_count_together(scene: Scene, measured: dict[str, np.ndarray]) -> None:
     alone = solve_hand_eye(unknown(scene), measured, clicked(scene, measured, range(3), ["left"]))
     both = solve_hand_eye(unknown(scene), measured, clicked(scene, measured, range(3), ["left", "right"]))

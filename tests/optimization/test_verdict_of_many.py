@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from evidence import CONVINCING
 
@@ -75,6 +76,24 @@ def test_what_is_worse_beyond_chance_is_named() -> None:
     assert worse_in(before, lower) == ["agreement"] and worse_in(lower, before) == []
     uneven = [replace(f, residual=f.residual + (0.3 if i == 0 else -0.05)) for i, f in enumerate(before)]
     assert worse_in(before, uneven) == []
+
+
+@pytest.mark.parametrize(("drop", "wanted"), [(1e-5, []), (0.005, []), (0.1, ["agreement"])])
+def test_one_frame_is_worse_by_more_than_frames_usually_differ(drop: float, wanted: list[str]) -> None:
+    assert worse_in([RIGHT], [replace(RIGHT, agreement=RIGHT.agreement - drop)]) == wanted
+
+
+def test_five_measures_together_are_called_worse_by_chance_once_in_twenty() -> None:
+    random, names = np.random.default_rng(0), ("agreement", "unconditioned", "overlap_with_change", "residual", "loss")
+    known, wrong = replace(CONVINCING), 0
+    for _ in range(400):
+        changes = 0.02 * random.standard_normal((20, len(names)))
+        after = [
+            replace(known, **{name: getattr(known, name) + step for name, step in zip(names, row, strict=True)})
+            for row in changes
+        ]
+        wrong += bool(worse_in([known] * len(after), after))
+    assert wrong / 400 < 0.07
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,8 @@ def test_single_settings_need_no_file() -> None:
         ("[solver]\nprior_deg = 'wide'", r"\[solver\]\.prior_deg is 'wide'; it must be a value such as 2\.5"),
         ("[solver]\nprior_deg = 1e9", "prior_deg is .*; allowed is 0.001 to 360 deg"),
         ("[solver]\nprior_deg = nan", "prior_deg is nan; allowed is"),
+        ("[[solver.stages]]\nstage = 'SilhouetteSearch'\nenough = -1.0", "enough is -1.0; allowed is 0 to 1000 px"),
+        ("[[solver.stages]]\nstage = 'RandomRestart'\nscale = 0.0\nthen = []", "scale is 0.0; allowed is 0.1 to 8"),
         ("[[solver.stages]]\nstage = 'Dance'", "has the stage 'Dance'; allowed is Observe, Descend"),
         ("[[solver.stages]]\nstage = 'Descend'", "needs a blur"),
         ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no 'speed'; it has blur"),

@@ -22,7 +22,13 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
     Neither masks nor true joint positions are looked at.
     """
     chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
-    optimizer = CalibrationOptimizer(recording.scene, chosen, extractor, cameras=[camera])
+    optimizer = CalibrationOptimizer(
+        recording.scene,
+        chosen,
+        extractor,
+        cameras=[camera],
+        backgrounds=Backgrounds.of(recording, [camera], "regular"),
+    )
     for _ in optimizer:
         pass
     return optimizer.result().scene

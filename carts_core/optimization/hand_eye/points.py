@@ -46,21 +46,32 @@ class View:
     pixels: Float[np.ndarray, "points 2"]
 
     @property
+    def has_edges(self) -> bool:
+        """Whether some are edges of a shaft."""
+        return any(landmark.kind is LandmarkKind.EDGE for landmark in self.landmarks)
+
+    @property
     def is_point(self) -> np.ndarray:
         """Which of them are points instead of lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
 
     def distances(
-        self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"]
+        self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
     ) -> Float[np.ndarray, "points 2"]:
-        """How far the landmarks are from where they were found [px]; of lines, the second number is 0."""
+        """How far the landmarks are from where they were found [px]; of lines, the second number is 0.
+
+        Args:
+            T_camera_base: pose of the arm.
+            intrinsics: fx, fy, cx, cy [px].
+            side: of the shaft that all its edges were found on, 1 or -1; 0 takes the nearer side for each.
+        """
         starts = self.starts @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
         ends = self.ends @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
         seen = intrinsics[:2] * starts[:, :2] / np.maximum(starts[:, 2:], NEAREST) + intrinsics[2:]
         found = seen - self.pixels
         for row, landmark in enumerate(self.landmarks):
             if landmark.kind is not LandmarkKind.POINT:
-                distance = _line_distance(starts[row], ends[row], self.pixels[row], intrinsics, landmark)
+                distance = _line_distance(starts[row], ends[row], self.pixels[row], intrinsics, landmark, side)
                 found[row] = distance, 0.0
         return found
 
@@ -115,7 +126,7 @@ def _view(
 
 
 def _line_distance(
-    start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark
+    start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark, side: int
 ) -> float:
     """From the ray through a pixel to a cylinder's axis, less its radius [px at the depth where they are closest]."""
     ray = np.array([*((pixel - intrinsics[2:]) / intrinsics[:2]), 1.0])
@@ -127,5 +138,6 @@ def _line_distance(
     along = float(np.dot(np.cross(ray, start), across)) / length**2
     depth = max(float((start - along * axis)[2]), NEAREST)
     away = float(start @ across) / length
-    away = abs(away) - landmark.radius if landmark.kind is LandmarkKind.EDGE else away
+    if landmark.kind is LandmarkKind.EDGE:
+        away = (side * away if side else abs(away)) - landmark.radius
     return away * float(intrinsics[:2].mean()) / depth

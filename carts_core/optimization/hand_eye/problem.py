@@ -1,6 +1,6 @@
 """Poses of arms and cameras around a beginning, as a vector that a solver can change."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -57,9 +57,8 @@ class HandEyeProblem:
             )
 
     def _find_beginning(self, views: list[View], free: set[int]) -> None:
-        """Base frames by the camera with most points, then cameras whose pose is not known."""
-        anchors = [view.camera for view in views if view.is_point.sum() >= FEWEST_POINTS]
-        self._anchor = min(anchors, default=-1)
+        """Base frames by the view with most points, then cameras whose pose is not known."""
+        self._anchor = _anchor(views, free)
         unknown = free - {self._anchor}
         # Cameras whose pose is known first: then the others have base frames to be placed by.
         for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
@@ -123,14 +122,22 @@ class HandEyeProblem:
             intrinsics[camera, :2] *= np.exp(change)
         return bases, cameras, intrinsics
 
-    def distances(self, values: np.ndarray) -> list[np.ndarray]:
-        """How far the landmarks of each view are from where they were found [px]."""
-        bases, cameras, intrinsics = self.poses(values)
-        return [view.distances(cameras[view.camera] @ bases[view.arm], intrinsics[view.camera]) for view in self.views]
+    def distances(self, values: np.ndarray, sides: Sequence[int] | None = None) -> list[np.ndarray]:
+        """How far the landmarks of each view are from where they were found [px].
 
-    def residuals(self, values: np.ndarray) -> np.ndarray:
-        """Distances over their expected error [m]."""
-        return np.concatenate(self.distances(values)).ravel() / self.settings.pixel_error
+        Args:
+            values: of the unknowns.
+            sides: of each view, the side of the shaft that its edges are on; the nearer one by default.
+        """
+        bases, cameras, intrinsics = self.poses(values)
+        return [
+            view.distances(cameras[view.camera] @ bases[view.arm], intrinsics[view.camera], side)
+            for view, side in zip(self.views, sides or [0] * len(self.views), strict=True)
+        ]
+
+    def residuals(self, values: np.ndarray, sides: Sequence[int] | None = None) -> np.ndarray:
+        """Distances over their expected error [1]."""
+        return np.concatenate(self.distances(values, sides)).ravel() / self.settings.pixel_error
 
 
 def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
@@ -146,6 +153,16 @@ def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
 def place_of(T: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Where T puts a point."""
     return T[:3, :3] @ point + T[:3, 3]
+
+
+def _anchor(views: list[View], free: set[int]) -> int:
+    """The camera that keeps its pose: a known one with most points, one of the free ones if none is known, -1 if no
+    camera has enough."""
+    points: dict[int, int] = {}
+    for view in views:
+        if (count := int(view.is_point.sum())) >= FEWEST_POINTS:
+            points[view.camera] = points.get(view.camera, 0) + count
+    return max(points, key=lambda camera: (camera not in free, points[camera], -camera), default=-1)
 
 
 def _too_few(scene: Scene, missing: Mapping[tuple[int, int], int]) -> str:

@@ -14,7 +14,7 @@ class HandEyeSettings:
     focal_length: bool = False
     """Solve for the focal lengths of all cameras that have points, too."""
     free_cameras: tuple[str, ...] = ()
-    """Cameras whose pose relative to the first one is not known."""
+    """Cameras whose pose relative to the others is not known."""
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.pixel_error <= 100:
