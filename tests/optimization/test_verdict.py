@@ -6,15 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from evidence import CONVINCING
+from tiny import tiny_scene
 
 from carts_core.cli.hints import verdict_hints
 from carts_core.evaluation import evaluate
+from carts_core.model.robot import Robot
+from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, SurfaceSolver, Verdict
+from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, MaskPredictor, SurfaceSolver, Verdict
+from carts_core.optimization.evidence import evidence
+from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.observability import Uncertainty
 from carts_core.optimization.verdict import assess
 from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
 
 CONTRADICTED = replace(
     CONVINCING,
@@ -137,3 +144,27 @@ def test_hints_name_frames_reasons_and_what_to_try() -> None:
     (hint,) = verdict_hints("left", {"001": failed, "002": assess(CONVINCING), "003": failed, "004": None})
     assert hint == f"left: failed in 2 of 4 frames (001, 003). {failed.reason} {failed.remedy}"
     assert verdict_hints("left", {"002": assess(CONVINCING)}) == []
+
+
+def test_an_arm_behind_another_one_is_in_view_and_one_outside_the_image_has_left(
+    shipped_psm: Robot, tiny_sequence: Callable[..., Path]
+) -> None:
+    tiny = tiny_scene(shipped_psm, 3, ("left",), 320, 240)
+    camera, arm = tiny.scene.cameras[0], tiny.scene.arms[0]
+    scene = replace(tiny.scene, arms=(arm, replace(arm, name="PSM2")))
+    joints = {name: tiny.truth[0] for name in ("PSM1", "PSM2")}
+
+    def beside(sideways: float, behind: float) -> SceneState:
+        """The second arm beside and behind the first one, as the camera sees it [m]."""
+        T_world_base = np.stack([arm.T_world_base, arm.T_world_base])
+        T_world_base[1, :3, 3] += camera.T_camera_world[:3, :3].T @ [sideways, 0.0, behind]
+        return replace(scene.state(joints), T_world_base=torch.from_numpy(T_world_base).float())
+
+    mask = Renderer(scene).segment(beside(0.0, 0.004))[0] >= 0
+    frame = replace(Sequence.open(tiny_sequence(frames=1, width=320, height=240)).frame(0), masks={"left": mask})
+    predictor = MaskPredictor().for_frame(frame, ["left"])
+    images = FrameImages.of(scene, frame.images, {}, scale=1.0, working_width=320, dehaze=0.0, predictor=predictor)
+    start = beside(0.02, 0.004)
+    hidden, gone = (evidence(images, start, end, predictor, 0.01) for end in (beside(0.0, 0.004), beside(0.2, 0.004)))
+    assert hidden.still_in_view > 0.7 and "left the image" not in assess(hidden).reason
+    assert gone.still_in_view < 0.3 and "left the image" in assess(gone).reason

@@ -13,7 +13,7 @@ from .sources import Recording
 
 CROSSING = "crossing arms"
 """Name of the domain."""
-_HIDDEN = 0.15, 0.7
+_HIDDEN = 0.15, 0.9
 """Share of an arm that the other one hides [1]."""
 _SHOWN = 0.02, 0.25
 """Share of the image that each arm covers [1]."""

@@ -1,8 +1,10 @@
 """Every run of a benchmark, in the order in which it is done."""
 
 from collections.abc import Sequence as Items
+from itertools import product
 
 from ...settings import DOMAINS
+from .crossing import CROSSING
 from .methods import MAIN, METHODS, RENDERING
 from .occlusion import OCCLUSION
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Run, Scope
@@ -74,6 +76,9 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int, baselines: Items[st
         domains, ours, papers, hard = ("regular",), scope.real_errors_deg, scope.real_errors_deg, ()
     runs += [Run(source.name, domain, frame, "ours", error) for error in ours for domain in domains]
     runs += [Run(source.name, "regular", frame, "paper", error) for error in papers]
+    if source.name == SYNTHETIC:
+        crossing = product(scope.crossing_errors_deg, ("ours", "acs"))
+        runs += [Run(source.name, CROSSING, frame, method, error) for error, method in crossing]
     wrong = wrong_inputs(source.length, len(source.cameras), built_in=source.name == SYNTHETIC)
     runs += [Run(source.name, kind, frame, "ours") for kind in wrong]
     for error in (None, *hard):

@@ -17,6 +17,7 @@ from ...settings import DescentSolver
 from ...wording import counted
 from ..baselines.networks import TrainedBaseline
 from .baseline import segment_rendered, segment_with
+from .crossing import CROSSING, crossed
 from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
 from .measurement import Measurement
@@ -138,12 +139,13 @@ class SourceBench:
         recording, renderer = self._open()
         method, camera = METHODS[run.method], self._source.camera
         cameras = self._source.cameras if method.every_camera else (camera,)
-        covered, wrong = run.domain == OCCLUSION, run.domain in WRONG
-        frame = (
-            misled(recording, run.domain, run.frame, camera)
-            if wrong
-            else recording.frame(run.frame, None if covered else run.domain, cameras)
-        )
+        covered, wrong, crossing = run.domain == OCCLUSION, run.domain in WRONG, run.domain == CROSSING
+        if wrong:
+            frame = misled(recording, run.domain, run.frame, camera)
+        elif crossing:
+            frame = crossed(recording, run.frame, camera)
+        else:
+            frame = recording.frame(run.frame, None if covered else run.domain, cameras)
         truth = self._truth(frame)
         if covered:
             frame, truth = self._covered(frame, truth)
@@ -154,7 +156,7 @@ class SourceBench:
         if method.settings is None:
             return segment(run, frame.images[camera], extractor, truth)
         settings = method.settings(scope.steps(run))
-        domain = "regular" if covered or wrong else run.domain
+        domain = "regular" if covered or wrong or crossing else run.domain
         if method.masks_given:
             networks, backgrounds = MaskPredictor(), Backgrounds({})
         else:

@@ -22,7 +22,7 @@ class Run:
     source: str
     """`synthetic`, `real`, `rooms` and a camera, or `family` and an instrument."""
     domain: str
-    """One of the synthetic domains, `occlusion`, a room, or one of `wrong_inputs.WRONG`."""
+    """One of the synthetic domains, `occlusion`, `crossing arms`, a room, or one of `wrong_inputs.WRONG`."""
     frame: int
     """Position in the sequence."""
     method: str
@@ -58,6 +58,8 @@ class Scope:
     """The same on real frames, both methods, in the regular domain, from the measured joint positions [deg]."""
     hard_errors_deg: tuple[float, ...]
     """The same on synthetic frames with occluders, and with all cameras at once [deg]."""
+    crossing_errors_deg: tuple[float, ...]
+    """The same on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
     consecutive: int
     """Frames of the beginning of each sequence that are corrected together, at most."""
     consecutive_domains: tuple[str, ...]
@@ -106,6 +108,7 @@ QUICK = Scope(
     further_errors_deg=(),
     real_errors_deg=(),
     hard_errors_deg=(2.0,),
+    crossing_errors_deg=(2.0,),
     consecutive=6,
     consecutive_domains=("regular",),
     consecutive_errors_deg=(2.0,),
@@ -127,6 +130,7 @@ FULL = Scope(
     further_errors_deg=(1.0, 2.0, 3.0, 5.0),
     real_errors_deg=(1.0, 2.0, 3.0),
     hard_errors_deg=(2.0,),
+    crossing_errors_deg=(1.0, 2.0, 3.0),
     consecutive=30,
     consecutive_domains=DOMAINS,
     consecutive_errors_deg=(1.0, 2.0, 3.0),

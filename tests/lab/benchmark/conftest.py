@@ -23,6 +23,7 @@ TINY = Scope(
     paper_errors_deg=(2.0,),
     further_errors_deg=(),
     real_errors_deg=(),
+    crossing_errors_deg=(),
     hard_errors_deg=(2.0,),
     consecutive=2,
     consecutive_domains=("regular",),

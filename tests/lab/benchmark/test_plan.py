@@ -47,6 +47,13 @@ def test_the_full_scope_has_every_error_in_every_domain() -> None:
             assert Run("synthetic", domain, 0, "ours", float(degrees)) in runs
 
 
+def test_arms_that_cross_are_measured_beside_acs_from_the_same_starts() -> None:
+    runs = plan(FULL, BOTH)
+    for degrees, method in ((1.0, "ours"), (1.0, "acs"), (3.0, "ours"), (3.0, "acs")):
+        assert Run("synthetic", "crossing arms", 2, method, degrees) in runs
+    assert not any(run.domain == "crossing arms" for run in runs if run.source == "real")
+
+
 def test_frames_on_which_not_all_methods_are_evaluated_come_late_and_know_the_default_solver_alone() -> None:
     runs = plan(FULL, BOTH)
     further = [
