@@ -43,8 +43,8 @@ class Bench:
         from importlib.metadata import version
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
-        from ..lab.benchmark.fingerprints import code_fingerprint
         from ..lab.benchmark.hand_eye import known_hand_eye, measure_hand_eye
+        from ..lab.benchmark.measurement import code_fingerprint
         from ..lab.benchmark.sources import (
             family_sources,
             real_source,
@@ -52,7 +52,7 @@ class Bench:
             synthetic_room_source,
             synthetic_source,
         )
-        from ..lab.benchmark.stages import known_stages, measure_stages
+        from ..lab.benchmark.timing import known_stages, measure_stages
 
         console = Terminal()
         scope = QUICK if self.quick else FULL

@@ -13,8 +13,8 @@ READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt", "fromfi
 ALLOWED = {
     "files": "decides what may be read",
     "project": "reads its own database, lock and log",
-    "lab/benchmark/fingerprints.py": "reads the source of the package",
-    "lab/benchmark/machine.py": "reads the machine's description",
+    "lab/benchmark/measurement.py": "reads the source of the package",
+    "lab/benchmark/timing.py": "reads the machine's description",
     "lab/synthesis": "reads what it wrote",
     "cli/frame_folder.py": "reads what an earlier run of the same command wrote",
     "cli/result_records.py": "reads what an earlier run of the same command wrote",

@@ -9,8 +9,7 @@ import torch
 
 from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
-from carts_core.lab.benchmark.another_room import AnotherRoom
-from carts_core.lab.benchmark.rooms import made_rooms
+from carts_core.lab.benchmark.rooms import AnotherRoom, made_rooms
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor

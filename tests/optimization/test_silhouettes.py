@@ -8,7 +8,7 @@ import pytest
 import roma
 import torch
 
-from carts_core.lab.benchmark.seven_joint_arm import looking_at, write_arm
+from carts_core.lab.benchmark.hand_eye import looking_at, write_arm
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene

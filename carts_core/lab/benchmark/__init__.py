@@ -1,6 +1,7 @@
 """The benchmark: the paper's tables and figures on our data, and what the default solver is meant to reach."""
 
 from .measurement import Measurement as Measurement
+from .measurement import ResultsFile as ResultsFile
 from .measurement import Score as Score
 from .plan import plan as plan
 from .report import Facts as Facts
@@ -17,6 +18,5 @@ from .sources import real_source as real_source
 from .sources import room_sources as room_sources
 from .sources import synthetic_room_source as synthetic_room_source
 from .sources import synthetic_source as synthetic_source
-from .store import ResultsFile as ResultsFile
-from .target import Target as Target
+from .targets import Target as Target
 from .targets import targets as targets

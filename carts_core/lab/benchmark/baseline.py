@@ -15,9 +15,9 @@ from ...recording import Frame
 from ...rendering import Renderer
 from ..baselines.networks import TrainedBaseline
 from .frame import Truth
-from .machine import machine
 from .measurement import Measurement
 from .scope import Run
+from .timing import machine
 
 
 def segment_with(

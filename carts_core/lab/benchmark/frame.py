@@ -25,15 +25,11 @@ from ...optimization import (
 from ...optimization.observability import Uncertainty
 from ...recording import Frame
 from ...rendering import Renderer
-from .machine import machine
-from .measurement import BEST_OF, Measurement, Score
+from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score
 from .methods import METHODS
 from .scope import Run
+from .timing import machine
 
-TOLERANCE = 2.0
-"""Of the normalized surface distance [px]."""
-WIDE_TOLERANCE = 5.0
-"""Of a second one [px]."""
 _SEED = 0
 """Of the signs of errors made on purpose."""
 

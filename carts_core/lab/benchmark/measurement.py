@@ -1,10 +1,73 @@
-"""What a run measured, and its line in the results file."""
+"""Measurements of a run, and the results file with one JSON line per run.
 
+A line counts only for the settings, weights, images and code that it was measured with (its fingerprint).
+"""
+
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from .scope import Run
+from ... import fingerprints
+from ...errors import CartsError
+from ...files import OutputPath, append_line
+from ...files.reading import TABLE, read_bytes
+from ...networks.extractor import FeatureExtractor
+from ...settings.serialization import to_plain
+from .methods import METHODS
+from .scope import Run, Scope
+
+TOLERANCE = 2.0
+"""Of the normalized surface distance [px]."""
+WIDE_TOLERANCE = 5.0
+"""Of a second one [px]."""
+_MEASURED = (
+    "*.py",
+    "imaging/**/*.py",
+    "model/**/*.py",
+    "recording/*.py",
+    "evaluation/**/*.py",
+    "networks/**/*.py",
+    "optimization/**/*.py",
+    "rendering/**/*.py",
+    "settings/optimization.py",
+    "settings/presets.py",
+    "settings/stages.py",
+    "lab/baselines/networks.py",
+    "lab/benchmark/baseline.py",
+    "lab/benchmark/frame.py",
+    "lab/benchmark/occlusion.py",
+    "lab/benchmark/temporal.py",
+    "lab/benchmark/together.py",
+    "lab/benchmark/wrong_inputs.py",
+)
+
+
+def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
+    """SHA-256 over modules of the package; by default those that decide what a method returns, and how it is scored."""
+    return fingerprints.code_fingerprint(patterns)
+
+
+def run_fingerprint(
+    run: Run, scope: Scope, extractor: FeatureExtractor, source: str, baseline: str | None = None
+) -> str:
+    """SHA-256 over everything that a run's result depends on, but the machine.
+
+    Args:
+        run: the run.
+        scope: with the number of steps in the paper's setting.
+        extractor: the network and its device.
+        source: fingerprint of the images and kinematics.
+        baseline: of the weights of a baseline, where the run is one's.
+    """
+    method = METHODS[run.method]
+    settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
+    company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
+    parts = (settings, company, extractor.fingerprint, str(extractor.device), source, TOLERANCE, code_fingerprint())
+    parts += (baseline,) if baseline is not None else ()
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+
 
 BEST_OF = (30, 50)
 """Steps after which the best iterate has a row of its own in the tables."""
@@ -18,7 +81,7 @@ class Score:
     """None for a method without one, and where losses do not compare from one iterate to the next."""
     dice: float
     nsd: float
-    """Normalized surface distance within `frame.TOLERANCE`."""
+    """Normalized surface distance within `TOLERANCE`."""
     joint_mae_deg: float | None
     """Over measured revolute joints; None without true joint positions."""
     visible_joint_mae_deg: float | None
@@ -29,7 +92,7 @@ class Score:
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
     nsd_wide: float | None = None
-    """The same as `nsd` within `frame.WIDE_TOLERANCE`; None on the way from start to end, but for what the optimizer
+    """The same as `nsd` within `WIDE_TOLERANCE`; None on the way from start to end, but for what the optimizer
     held for the best at the end, or after so many steps as `BEST_OF` says."""
 
 
@@ -135,3 +198,54 @@ def _round(value: float | None) -> float | None:
 
 def _rounded(values: dict[str, float | None]) -> dict[str, float | None]:
     return {name: _round(value) for name, value in values.items()}
+
+
+class ResultsFile:
+    """Measurements on disk. A run that is killed loses at most the line that it was writing.
+
+    Args:
+        path: the file; it need not exist.
+
+    Raises:
+        CartsError: the file cannot be read.
+    """
+
+    def __init__(self, path: OutputPath) -> None:
+        self.path = path
+        self._known: dict[tuple[Run, str], Measurement] = {}
+        self.unreadable = 0
+        """Lines that are not measurements: torn, or of another version."""
+        try:
+            lines = read_bytes(path.path, TABLE).splitlines() if path.path.exists() else []
+        except OSError as error:
+            raise CartsError(
+                f"{path} cannot be read ({error.strerror or error}). Name another output folder."
+            ) from error
+        for line in lines:
+            try:
+                entry = json.loads(line)
+                measurement = Measurement.from_json(entry)
+                self._known[measurement.run, entry["fingerprint"]] = measurement
+            except (KeyError, TypeError, ValueError):
+                self.unreadable += 1
+
+    def find(self, run: Run, fingerprint: str) -> Measurement | None:
+        """The measurement of a run under exactly these settings, weights and code; None if it is not there."""
+        return self._known.get((run, fingerprint))
+
+    def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
+        """Add a measurement and see it on disk.
+
+        Args:
+            measurement: what was measured.
+            fingerprint: of all that it depends on; see `fingerprints`.
+            also: further facts for the line, for whoever reads the file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        entry = measurement.to_json()
+        line = json.dumps({"fingerprint": fingerprint, **also, **entry}, separators=(",", ":"))
+        append_line(self.path, line.encode())
+        # As it will be read again, so that a report does not depend on when it is written.
+        self._known[measurement.run, fingerprint] = Measurement.from_json(entry)

@@ -18,14 +18,12 @@ from ...wording import counted
 from ..baselines.networks import TrainedBaseline
 from .baseline import segment_rendered, segment_with
 from .crossing import CROSSING, crossed
-from .fingerprints import code_fingerprint, run_fingerprint
 from .frame import Truth, optimize, segment
-from .measurement import Measurement
+from .measurement import Measurement, ResultsFile, code_fingerprint, run_fingerprint
 from .methods import METHODS, RENDERING
 from .occlusion import OCCLUSION, occlude
 from .scope import Run, Scope
 from .sources import Recording, Source
-from .store import ResultsFile
 from .temporal import correct_forwards
 from .together import calibrated_scene, correct_together
 from .wrong_inputs import OTHER_INSTRUMENT, WRONG, misled, with_other_instruments

@@ -1,16 +1,17 @@
-"""Selecting measurements, and means and deviations over them."""
+"""Measurements of a benchmark: selection, means and deviations, pairs of methods, and labels of tables."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...settings import DOMAINS
+from . import paper
 from .measurement import Measurement, Score
 from .methods import MAIN
 from .occlusion import OCCLUSION
 from .rooms import Half
-from .scope import FAMILY, ROOMS
+from .scope import FAMILY, PAPERS_STEPS, ROOMS
 
 ANY = object()
 """Matches every error at the start."""
@@ -106,3 +107,132 @@ def scores(measurements: Iterable[Measurement], iterations: int | None = None) -
     """What each method returned, or its best of the first so many steps."""
     found = (entry.final if iterations is None else entry.best_of(iterations) for entry in measurements)
     return [score for score in found if score is not None]
+
+
+DOMAIN_LABELS = {
+    "regular": "regular",
+    "low_brightness": "low brightness",
+    "bleeding": "bleeding",
+    "smoke": "smoke",
+    "background_change": "background change",
+    "simulated_smoke": "simulated smoke",
+    OCCLUSION: "occlusion",
+}
+SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
+"""Of the methods that are followed through iterations and errors."""
+NOTHING = "–"
+"""In place of a number that is not there."""
+
+
+def begun(error_deg: float | None) -> str:
+    """Where a run started."""
+    return "as measured" if error_deg is None else f"{error_deg:g}°"
+
+
+def spread_text(spread: Spread | None, scale: float = 100.0, digits: int = 1) -> str:
+    """Mean ± standard deviation, Dice and NSD in percent by default; of a single frame there is no deviation."""
+    if spread is None:
+        return NOTHING
+    if spread.count == 1:
+        return f"{scale * spread.mean:.{digits}f}"
+    return f"{scale * spread.mean:.{digits}f} ± {scale * spread.deviation:.{digits}f}"
+
+
+def paper_note(value: paper.Value | None, column: str | None, digits: int = 1) -> str:
+    """The paper's number and the column where it stands there."""
+    if value is None:
+        return ""
+    return f"{column} {value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+
+
+GAINED = 0.01
+"""Dice that the paper's setting has to gain, or there is nothing to be faster at."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How long both take to the Dice that the paper's setting ends with."""
+
+    source: str
+    error_deg: float | None
+    gained: bool
+    """Whether the paper's setting gained enough to compare."""
+    papers: float
+    """Until the best iterate of the paper's setting first has the Dice of its best of `PAPERS_STEPS` [s]."""
+    ours: float | None
+    """Until ours has it [s]; None if it never does."""
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster ours is; 0 if it never gets there."""
+        return self.papers / self.ours if self.ours else 0.0
+
+
+def pairs(data: Measurements) -> list[Pair]:
+    """All pairs of runs, also those in which the paper's setting gained nothing."""
+    ours = {(m.run.source, m.run.domain, m.run.frame, m.run.error_deg): m for m in data.of(method="ours")}
+    found = []
+    for theirs in data.of(method="paper"):
+        run, best = theirs.run, theirs.best_of(PAPERS_STEPS)
+        other = ours.get((run.source, run.domain, run.frame, run.error_deg))
+        if other is None or best is None or theirs.start is None:
+            continue
+        papers = seconds_to(theirs, best.dice)
+        assert papers is not None
+        gained = best.dice >= theirs.start.dice + GAINED
+        found.append(Pair(run.source, run.error_deg, gained, papers, seconds_to(other, best.dice)))
+    return found
+
+
+def seconds_to(measurement: Measurement, dice: float) -> float | None:
+    """Seconds until the best iterate first had this Dice [s]; None if it never had."""
+    for now, best in zip(measurement.trace, measurement.best_so_far(), strict=True):
+        if best.dice >= dice:
+            return now.seconds
+    return None
+
+
+@dataclass(frozen=True)
+class Target:
+    """One line of the table."""
+
+    what: str
+    target: str
+    reached: str
+    met: bool | None
+    """None where it is open: nothing was measured, or nothing that misses it, but not all that it asks for."""
+    reference: str
+    basis: str
+    """What it was computed from."""
+
+
+def make_target(
+    what: str,
+    least_or_most: float,
+    value: float | None,
+    basis: str,
+    *,
+    at_least: bool,
+    text: Callable[[float], str],
+    reference: str = "",
+    complete: bool = True,
+) -> Target:
+    """A target with its verdict.
+
+    Args:
+        what: for people.
+        least_or_most: the bound.
+        value: what was reached; None where nothing was measured.
+        basis: what it was computed from.
+        at_least: whether the bound is the smallest value that meets it, or the largest.
+        text: writes a value.
+        reference: what others reached.
+        complete: whether everything was measured that the target asks for; otherwise it cannot be met, only missed.
+    """
+    bound = f"at {'least' if at_least else 'most'} {text(least_or_most)}"
+    if value is None:
+        return Target(what, bound, "not measured", None, reference, basis)
+    met = value >= least_or_most if at_least else value <= least_or_most
+    near = not met and text(value) == text(least_or_most)
+    reached = f"just {'below' if at_least else 'above'} {text(value)}" if near else text(value)
+    return Target(what, bound, reached, met if complete or not met else None, reference, basis)

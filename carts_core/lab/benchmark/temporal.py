@@ -10,10 +10,10 @@ from ...optimization import Backgrounds, FrameOptimizer
 from ...rendering import Renderer
 from ...settings import DescentSolver
 from .frame import Truth, start_of
-from .machine import machine
 from .measurement import Measurement
 from .scope import Run
 from .sources import Recording
+from .timing import machine
 
 STEPS = 10
 """Of each frame but the first. TC-CaRTS (arXiv 2212.00072) is said to need far fewer than CaRTS's 30."""

@@ -1,21 +1,49 @@
-"""Times of the parts of an optimization, each the median of repeated runs in one process."""
+"""Times of the parts of an optimization on the shipped sequence, medians in one process, and the machine."""
 
+import json
+import os
+import platform
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...evaluation import start_positions
-from ...model.scene import SceneState
+from ...files import OutputPath, write_text
+from ...files.reading import VALUES, parse_json, read_bytes
+from ...model.scene import Scene, SceneState
 from ...networks import FeatureExtractor
 from ...optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
+from ...optimization.inputs import working_size
 from ...recording import Sequence
 from ...rendering import Renderer, visibility_torch
 from ...rendering.geometry import link_transforms, vertices_in_camera
 from ...rendering.rasterizer import rasterize
+from ...resources import sample_sequence
+from ...settings.stages import Observe
 from ...wording import counted
+from .measurement import code_fingerprint
+
+_CUDA = "cuda: "
+
+
+def machine(device: torch.device) -> str:
+    """Processor, cores, threads, and the graphics card that networks and solver run on, if they do."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        model = names[0] if names else model
+    card = f", {_CUDA}{torch.cuda.get_device_name(device)}" if device.type == "cuda" else ""
+    return f"{model}, {counted(os.cpu_count() or 1, 'core')}, torch threads: {torch.get_num_threads()}{card}"
+
+
+def on_gpu(text: str) -> bool:
+    """Whether `machine` wrote that a graphics card was used."""
+    return _CUDA in text
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
@@ -85,3 +113,57 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
             lambda: list(optimizer(SurfaceSolver())), 5
         ),
     }
+
+
+_RUNS = 10
+
+
+def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
+    """Figures that this machine and this code have written to `path`; none if there are no such."""
+    try:
+        stored = parse_json(read_bytes(path.path, VALUES))
+        return stored["ms"] if stored["of"] == _of(extractor) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
+    """Measure all stages, on the CPU, and write them to `path`, unless they are there."""
+    if known_stages(path, extractor):
+        return
+    sequence = Sequence.open(sample_sequence())
+    figures = {
+        **render_figures(sequence, _RUNS),
+        **network_figures(sequence.scene, extractor),
+        **optimizer_figures(sequence, _RUNS),
+    }
+    write_text(path, json.dumps({"of": _of(extractor), "ms": figures}, indent=1))
+
+
+def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:
+    """Times of the networks on whole images of the sizes that the optimizer compares by default [ms]."""
+    settings = SurfaceSolver()
+    scale = max(stage.scale for stage in settings.stages if isinstance(stage, Observe))
+    width, height = working_size(scene, settings.working_width, extractor.stride)
+    wide, high = working_size(scene, round(settings.working_width * scale), extractor.stride)
+    image = torch.rand(1, 3, height, width, device=extractor.device)
+
+    def forward() -> None:
+        with torch.no_grad():
+            extractor.features(image)
+
+    def both() -> None:
+        extractor.features(image.requires_grad_()).sum().backward()
+
+    large = torch.rand(1, 3, high, wide, device=extractor.device)
+    given = torch.rand(1, 6, high, wide, device=extractor.device)
+
+    return {
+        f"surface network forward, {wide}x{high}": milliseconds(lambda: extractor.surface(large, given), _RUNS),
+        f"feature network forward, {width}x{height}": milliseconds(forward, _RUNS),
+        f"feature network forward and backward, {width}x{height}": milliseconds(both, _RUNS),
+    }
+
+
+def _of(extractor: FeatureExtractor) -> list[str]:
+    return [machine(extractor.device), extractor.fingerprint, code_fingerprint()]

@@ -10,10 +10,10 @@ from ...recording import Frame
 from ...recording.background import spread
 from ...rendering import Renderer
 from .frame import Truth, start_of
-from .machine import machine
 from .measurement import Measurement
 from .scope import Run
 from .sources import Recording
+from .timing import machine
 
 
 def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:

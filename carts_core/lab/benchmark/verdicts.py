@@ -10,9 +10,7 @@ from ...html import Cell, Table
 from ...wording import counted
 from .measurement import Measurement
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC
-from .statistics import Measurements
-from .tables import NOTHING
-from .target import Target, make_target
+from .statistics import NOTHING, Measurements, Target, make_target
 from .wrong_inputs import WRONG
 
 RIGHT = 0.9

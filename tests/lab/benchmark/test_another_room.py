@@ -9,8 +9,7 @@ import pytest
 
 from carts_core.errors import SettingsError
 from carts_core.lab.benchmark import QUICK, plan, room_sources
-from carts_core.lab.benchmark.another_room import AnotherRoom, pasted
-from carts_core.lab.benchmark.rooms import Room, made_rooms, photographs
+from carts_core.lab.benchmark.rooms import AnotherRoom, Room, made_rooms, pasted, photographs
 from carts_core.recording import Sequence
 
 SIZE = {"width": 160, "height": 120}

@@ -26,9 +26,9 @@ from carts_core.lab.benchmark import (
     synthetic_room_source,
     write_report,
 )
-from carts_core.lab.benchmark.further_tables import sequence_table
 from carts_core.lab.benchmark.runner import SourceBench
 from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.benchmark.tables import sequence_table
 from carts_core.lab.benchmark.wrong_inputs import NO_ARM, OTHER_INSTRUMENT, WRONG
 
 QUIET = Console(quiet=True)
@@ -224,7 +224,7 @@ def test_measurements_of_other_settings_weights_or_code_are_not_used(
     other.extractor.sha256 = "0" * 64
     changed = Benchmark(other.scope, other.sources.values(), other.extractor, other.results, other.runs)
     assert not set(changed.runs.values()) & set(reference.values())
-    monkeypatch.setattr("carts_core.lab.benchmark.fingerprints.code_fingerprint", lambda: "edited")
+    monkeypatch.setattr("carts_core.lab.benchmark.measurement.code_fingerprint", lambda: "edited")
     assert not set(tiny_benchmark().runs.values()) & set(reference.values())
 
 

@@ -10,10 +10,7 @@ import pytest
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.lab.benchmark import QUICK, real_source, sources
-from carts_core.lab.benchmark import backdrop as backdrop_module
-from carts_core.lab.benchmark.backdrop import backdrop
-from carts_core.lab.benchmark.counterfactual import Counterfactual
-from carts_core.lab.benchmark.real_surface import DISTANCE, RealSurface
+from carts_core.lab.benchmark.counterfactual import DISTANCE, Counterfactual, RealSurface, backdrop
 from carts_core.lab.synthesis import DOMAINS, path_tracer
 from carts_core.lab.synthesis.scene import Tissue
 from carts_core.recording import Sequence
@@ -113,7 +110,7 @@ def test_without_mitsuba_the_error_says_how_to_get_it(tmp_path: Path, monkeypatc
     flat = Tissue(np.zeros((8, 8), np.float32), np.ones((8, 8, 3), np.float32), np.ones((8, 8), np.float32))
     monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    monkeypatch.setattr(backdrop_module, "grow_tissue", lambda kind, *size_and_rng: flat)
+    monkeypatch.setattr("carts_core.lab.benchmark.counterfactual.grow_tissue", lambda kind, *size_and_rng: flat)
     path_tracer._mitsuba.cache_clear()
     try:
         with pytest.raises(CartsError, match=r"pip install 'carts\[synthesis\]'"):

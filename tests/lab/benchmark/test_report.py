@@ -10,12 +10,20 @@ from handmade import make_measurement
 
 from carts_core.files import output_path
 from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_report
-from carts_core.lab.benchmark.accuracy_tables import error_tables, iteration_tables, main_tables
-from carts_core.lab.benchmark.accuracy_targets import accuracy_targets
-from carts_core.lab.benchmark.further_tables import calibration_table, camera_table, occlusion_table, sequence_table
 from carts_core.lab.benchmark.hand_eye import HandEyeRun
-from carts_core.lab.benchmark.speed_tables import pair_table, worse_table
 from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.benchmark.tables import (
+    calibration_table,
+    camera_table,
+    error_tables,
+    iteration_tables,
+    main_tables,
+    occlusion_table,
+    pair_table,
+    sequence_table,
+    worse_table,
+)
+from carts_core.lab.benchmark.targets import accuracy_targets
 from carts_core.lab.synthesis import DOMAINS
 
 HAND_EYE = [HandEyeRun("masks, 15 degrees and 10 cm", 0, 0.05, 0.001, "good")]
