@@ -4,8 +4,12 @@ import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from carts_core.model.mesh_cache import cache_dir, read
+from carts_core.project.place import data_dir
 
 TUNED = "from carts_core.process import tune_process; tune_process(keep_memory=True)"
 
@@ -49,3 +53,36 @@ def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")} | given
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert int(ran.stdout) == (expected or max(1, min((os.cpu_count() or 2) - 1, 4)))
+
+
+UNWRITABLE = """
+import numba.core.caching as caching
+caching.CacheImpl._locator_classes = []  # As where neither the installation nor the home folder can be written to.
+import carts_core.rendering, carts_core.imaging.edges_numba
+from carts_core.compiled import compiled
+
+@compiled
+def twice(value):
+    return 2 * value
+
+print(twice(21))
+"""
+
+
+def test_kernels_are_compiled_without_a_cache_where_none_can_be_written_and_one_line_says_so() -> None:
+    found = subprocess.run([sys.executable, "-c", UNWRITABLE], capture_output=True, text=True, check=True)
+    assert found.stdout == "42\n"
+    (line,) = found.stderr.splitlines()
+    assert line.startswith("note: compiled functions cannot be kept") and "NUMBA_CACHE_DIR" in line
+
+
+def test_the_caches_have_a_place_for_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HOME", "CARTS_CACHE", "XDG_CACHE_HOME", "CARTS_DATA", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def nobody(number: int) -> None:
+        raise KeyError(number)
+
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    assert cache_dir() == Path("/.cache/carts") and data_dir() == Path("/.local/share/carts")
+    assert read("no such key") is None

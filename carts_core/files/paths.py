@@ -15,6 +15,14 @@ _REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Separators of paths, control characters, ends of lines, and halves of characters, which no encoding has."""
 
 
+def home() -> Path:
+    """The user's home folder; the root folder, which is not written to, of users that have none."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        return Path("/")
+
+
 def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
     """Why a text cannot be the name of a file, in words that follow "is 'TEXT', "; None if it can.
 

@@ -1,11 +1,12 @@
 """Where the edge beside each pixel of an outline is: the compiled kernel for the CPU."""
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..compiled import compiled
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+
+@compiled
 def _nearest(gradient, camera, position, normal, samples, expected, sampling, distance, found):
     height, width, channels = gradient.shape[1:]
     half, last = channels // 2, len(samples) - 1

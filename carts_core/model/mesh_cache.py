@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import OutputError
 from ..files import output_path, output_stream
 from ..files.locks import one_after_another
+from ..files.paths import home
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
 from .meshes import Decimation, LinkMesh
 
@@ -23,7 +24,7 @@ def cache_dir() -> Path:
     """Folder of the cache: `$CARTS_CACHE`, else `$XDG_CACHE_HOME/carts`, else `~/.cache/carts`."""
     if configured := os.environ.get("CARTS_CACHE"):
         return Path(configured)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "carts"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home() / ".cache") / "carts"
 
 
 def fingerprint(files: Iterable[Path], *settings: object) -> str:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from ..files.paths import home
 from ..files.reading import is_regular
 from ..resources import sample_data_dir
 
@@ -20,7 +21,7 @@ def data_dir() -> Path:
     """Folder of the user's own data: `$CARTS_DATA`, else `$XDG_DATA_HOME/carts`, else `~/.local/share/carts`."""
     if configured := os.environ.get("CARTS_DATA"):
         return Path(configured)
-    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "carts"
+    return Path(os.environ.get("XDG_DATA_HOME") or home() / ".local" / "share") / "carts"
 
 
 def default_path(sequence_file: Path) -> Path:

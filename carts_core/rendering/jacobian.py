@@ -2,19 +2,19 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..compiled import compiled
 from ..model.surface import NORMALS
 from .points import VisiblePoints
 
 _HALF = np.float32(0.5)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, width, height, velocity, turning):
     """Fill velocity [2, rows, columns] and turning [3, rows, columns] of one view where one link is seen."""
     for k in range(begin, end):
@@ -32,7 +32,7 @@ def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, widt
             turning[axis, row, column] = dT[axis, 0] * n[0] + dT[axis, 1] * n[1] + dT[axis, 2] * n[2]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _carry(maps, near, speed, down, right, out):
     """Add to `out` what the neighbours that many pixels down and right bring at that speed; see `motion.py`."""
     channels, rows, columns = maps.shape
@@ -51,7 +51,7 @@ def _carry(maps, near, speed, down, right, out):
                 out[channel, below, beside] += moved
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def fill_jacobian(unknowns, runs, pixel, point, position, normal, dTs, dKs, Ks, maps, near, left, top, first, out):
     """Fill the derivative of a block of surface maps by some unknowns; see `jacobian.map_jacobian`.
 

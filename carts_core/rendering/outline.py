@@ -7,19 +7,19 @@ motion of the visible surface point there is sufficient.
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from ..compiled import compiled
 from ..threads import one_thread
 from .jacobian import Tangents
 from .points import VisiblePoints
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def keep_outline(face_ids, inverse_depth, nearness, border):
     """`face_ids` of the pixels that have something much further away beside, above or below them; -1 elsewhere.
 
@@ -45,7 +45,7 @@ def keep_outline(face_ids, inverse_depth, nearness, border):
     return kept
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def place_outline(inverse_depth, pixel, kernels, nearness, position, normal):
     """Fill position and normal [2, K] of outline pixels.
 
@@ -77,7 +77,7 @@ def place_outline(inverse_depth, pixel, kernels, nearness, position, normal):
         position[1, k] = row + shift * normal[1, k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
     """Fill how fast points move along a direction in the image [px per unit of each unknown].
 

@@ -8,12 +8,12 @@ light and camera.
 from dataclasses import dataclass
 from itertools import accumulate
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..compiled import compiled
 from ..model.scene import Light
 from .geometry import SceneGeometry
 
@@ -50,7 +50,7 @@ def phong(
     return (color * lit + highlight).clamp(max=1.0)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _gather(
     face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, barycentric, normals, starts, pixels, faces, out
 ):
@@ -89,14 +89,14 @@ def _gather(
                     out[axis, k] /= np.sqrt(max(squared, 1e-24))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _affine(coefficients, point):
     """A barycentric coordinate of a point, in [0, 1]."""
     value = coefficients[0] * point[0] + coefficients[1] * point[1] + coefficients[2] * point[2] + coefficients[3]
     return min(max(value, 0.0), 1.0)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _count(face_ids, face_links, links, counts):
     views, height, width = face_ids.shape
     for view in range(views):

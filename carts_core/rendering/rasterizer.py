@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from ..compiled import compiled
 
 BACKGROUND = -1
 """Face index of a pixel that sees no triangle."""
@@ -20,7 +21,7 @@ _WIDE = 8
 """Width of a bounding box [px] from which on it pays to find where each of its rows enters and leaves the triangle."""
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _first_and_last(value, slope, first, last):
     """Those of steps 0 to `last` at which `value + slope * step` may be positive; one too many on either side."""
     if slope > 0.0:
@@ -32,7 +33,7 @@ def _first_and_last(value, slope, first, last):
     return first, last
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
     """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z), seen from behind if two-sided."""
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
@@ -73,7 +74,7 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_
                 face_ids[y, x] = face
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z):
     """Cut a triangle off at the near plane (Sutherland-Hodgman); the number of corners that are left, 0, 3 or 4."""
     count = 0
@@ -94,7 +95,7 @@ def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, cl
     return count
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width, height):
     """Whether the near plane may open each closed surface where the camera sees it: by the bounds of the cut."""
     u, v, inverse_near = np.empty(4), np.empty(4), np.empty(4)
@@ -113,7 +114,7 @@ def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width,
     return (low[:, 0] <= width) & (high[:, 0] >= 0.0) & (low[:, 1] <= height) & (high[:, 1] >= 0.0)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _rasterize(vertices, faces, surfaces, closed, fx, fy, cx, cy, face_ids, inverse_depth):
     count = vertices.shape[0]
     u, v, inverse_z = np.zeros(count), np.zeros(count), np.zeros(count)

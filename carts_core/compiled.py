@@ -1,0 +1,33 @@
+"""Compilation of kernels with numba."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+_SAID = "CARTS_COMPILED_UNCACHED"
+"""Variable of the environment by which child processes know that it was said."""
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """`function` compiled by numba, and kept on disk between processes.
+
+    Where neither its folder nor the user's cache can be written to, it is compiled anew in each process, which takes
+    some seconds; a line on the standard error says so once.
+    """
+    options: dict[str, Any] = {"nogil": True, "fastmath": False, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError as error:
+        if "cannot cache" not in str(error):
+            raise
+    if _SAID not in os.environ:
+        os.environ[_SAID] = "1"
+        print(
+            "note: compiled functions cannot be kept, as neither the installation nor the home folder can be written "
+            "to; each start takes some seconds longer. Set NUMBA_CACHE_DIR to a folder of yours.",
+            file=sys.stderr,
+        )
+    return numba.njit(**options)(function)
