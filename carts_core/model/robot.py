@@ -19,7 +19,7 @@ from . import mesh_cache
 from .instruments import robot_file
 from .kinematics import Kinematics, exact_right_angles
 from .mesh_files import collada_asset, mesh_path
-from .meshes import Decimation, LinkMesh, build_link_meshes, load_visual
+from .meshes import MOST_KEPT, Decimation, LinkMesh, build_link_meshes, load_visual
 from .urdf_check import parsed_urdf
 
 INSTRUMENT_TOLERANCE = 2e-4
@@ -123,6 +123,8 @@ class Robot:
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
         remarks = _remarks(_mesh_files(model, urdf))
+        if decimation.before > MOST_KEPT * max_faces:
+            remarks = (*remarks, f"{decimation}.")
         return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation, remarks)
 
     def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:

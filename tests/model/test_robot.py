@@ -292,3 +292,28 @@ def test_meshes_of_collada_are_scaled_by_their_unit_and_the_up_axis_is_said(
     said = " ".join(robot.remarks)
     assert ("scaled by the unit of the COLLADA file" in said) == (unit != "m")
     assert (f"up axis {axis} of the COLLADA file is not applied" in said) == (axis == "Y_UP")
+
+
+def screws(count: int, sections: int) -> trimesh.Trimesh:
+    """A part of many small round pieces, which a tight tolerance leaves with nearly all of their triangles."""
+    rng = np.random.default_rng(4)
+    places = rng.uniform((-0.03, -0.02, -0.01), (0.03, 0.02, 0.01), (count, 3))
+    pieces = [trimesh.creation.cylinder(0.0015, 0.004, sections=sections).apply_translation(at) for at in places]
+    return trimesh.util.concatenate(pieces)
+
+
+def test_meshes_with_far_too_many_triangles_are_simplified_further_and_that_is_said(tmp_path: Path) -> None:
+    mesh = screws(30, 64)
+    mesh.export(tmp_path / "part.stl")
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="printed"><link name="base"/><link name="part"><visual><geometry><mesh filename="part.stl"/>'
+        '</geometry></visual></link><joint name="j" type="revolute"><parent link="base"/><child link="part"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    robot = Robot.load(tmp_path / "robot.urdf", max_faces=300, tolerance=1e-5)
+    found = robot.meshes[0]
+    assert len(mesh.faces) > 10 * 300 and len(found.faces) <= 5 * 300
+    measured = deviation(np.array(mesh.vertices), np.array(mesh.faces), found.vertices.astype(float), found.faces)
+    assert measured <= robot.decimation.deviation + 1e-6
+    assert 1e-5 < robot.decimation.deviation < 3e-3
+    assert robot.remarks == (f"{robot.decimation}.",) and "moves no surface by more than" in robot.remarks[0]
