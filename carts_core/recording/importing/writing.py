@@ -3,13 +3,14 @@
 import io
 import json
 import os
+import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...errors import SequenceError
+from ...errors import CartsError, SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
 from ...model.instruments import SCHEME, robot_file
 from .. import Sequence
@@ -40,13 +41,33 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
     """
     with TemporaryDirectory() as trial:
         _write(recording, Path(trial), Path(trial))
-        sequence = Sequence.open(Path(trial) / "sequence.toml")
-        sequence.frame(0)
-        sequence.frame(len(sequence) - 1)
+        try:
+            sequence = Sequence.open(Path(trial) / "sequence.toml")
+            sequence.frame(0)
+            sequence.frame(len(sequence) - 1)
+        except CartsError as error:
+            if trial not in str(error):
+                raise
+            raise SequenceError(_of_recording(str(error), trial, recording)) from error
     with published(folder, overwrite=overwrite) as draft:
         _write(recording, draft, folder.absolute())
         write_text(draft / MARKER, json.dumps({"format": "sequence", "source": recording.kind}))
     return folder / "sequence.toml"
+
+
+def _of_recording(text: str, trial: str, recording: FoundRecording) -> str:
+    """An error about the files of the trial, which are gone, as one about the recording."""
+    tables = {FRAMES: "", **{_table_of(arm): f" in the log of {arm.name}" for arm in recording.arms}}
+    for table, where in tables.items():
+
+        def place(match: re.Match[str], where: str = where) -> str:
+            row = int(match[1]) - 2
+            named = f"frame {recording.frame_ids[row]!r}" if not where and row < len(recording.frame_ids) else ""
+            return f"{recording.name}: {named or f'row {row + 1}{where}'}"
+
+        text = re.sub(rf"{re.escape(f'{trial}/{table}')},? line (\d+)", place, text)
+        text = text.replace(f"{trial}/{table}", f"{recording.name}{where}")
+    return text.replace(f"{trial}/sequence.toml", recording.name).replace(f"{trial}/", "")
 
 
 def _write(recording: FoundRecording, target: Path | OutputPath, place: Path) -> None:

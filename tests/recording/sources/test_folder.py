@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from carts_core.errors import CartsError
 from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
+from carts_core.recording.importing.writing import write_sequence
 from carts_core.settings.importing import ImportOptions
 
 FRAMES = 5
@@ -289,3 +291,22 @@ def test_the_default_output_has_the_whole_name_of_a_folder_with_a_dot(folder, tm
         folder = folder.rename(tmp_path / name)
         main(["import", str(folder)])
         assert Sequence.open(tmp_path / f"{name}_sequence/sequence.toml").name == name
+
+
+@pytest.mark.parametrize(
+    ("times", "change", "message"),
+    [
+        ([0.0, 0.1, 0.2, 0.15, 0.4], {}, r"Recording \{1\}: row 4 in the log of PSM1"),
+        (np.arange(FRAMES) / 10, {"frame_ids": ("a", "b", "b", "c", "d")}, r"Recording \{1\}"),
+        (np.arange(FRAMES) / 10, {"name": "a\x1bb"}, "name"),
+    ],
+)
+def test_errors_about_what_is_written_name_the_recording_and_not_a_temporary_file(
+    folder: Path, tmp_path: Path, times: list[float] | np.ndarray, change: dict, message: str
+):
+    found = find(folder)
+    arms = tuple(replace(arm, times=np.array(times)) for arm in found.arms)
+    recording = replace(found, arms=arms, frame_times=np.arange(FRAMES) / 10, **change)
+    with pytest.raises(CartsError, match=message) as error:
+        write_sequence(recording, tmp_path / "out")
+    assert "/tmp/tmp" not in str(error.value) and "sequence.toml" not in str(error.value)
