@@ -263,7 +263,8 @@ def _answer(request: bytes) -> bytes:
 
 def _described(error: Exception) -> list[Any]:
     """An error as the name of its kind and its arguments; those of libraries become a `ValueError`."""
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+    # Extension modules that cannot allocate may end without an exception, which is a `SystemError`.
+    if isinstance(error, MemoryError | SystemError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return ["memory"]
     if isinstance(error, CartsError):
         return [type(error).__name__, str(error)]

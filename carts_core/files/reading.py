@@ -192,6 +192,8 @@ def parse_yaml(text: str) -> Any:
         depth = 0
         for count, event in enumerate(yaml.parse(text, Loader=parser)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.DocumentStartEvent) and event.tags:
+                raise ValueError("it has %TAG directives, which are not read")
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"it has the alias *{event.anchor}, and aliases are not read; write the value out")
             if depth > LARGEST_DEPTH:

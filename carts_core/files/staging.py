@@ -79,7 +79,12 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
             if try_lock(descriptor):
                 mark = _Mark(output, key, os.fstat(descriptor).st_ino)
                 staging = Staging(parent, name, descriptor, mark)
-                _write_mark(staging)
+                try:
+                    _write_mark(staging)
+                except BaseException:  # Such as that of a full disk.
+                    staging.remove()
+                    staging.close()
+                    raise
                 return staging
             os.close(descriptor)
 

@@ -96,6 +96,7 @@ def test_a_child_is_used_from_thread_to_thread():
         (ALIASES, "alias"),
         (MERGES, "alias"),
         ("a: {<<: {b: 1}}", "merge"),
+        (f"%TAG ! tag:{'a' * 100_000}:\n---\n" + "- !c 1\n" * 1000, "%TAG"),
         (f"a: 0x{'f' * 300}", "64 bits"),
         (f"a: {'9' * 5000}", "limit"),
         ("!!bool x", "x"),

@@ -173,3 +173,17 @@ def test_what_was_killed_while_it_was_marked_is_tidied_up(tmp_path: Path) -> Non
     with published(tmp_path / "out") as path:
         write_text(path / MARKER, "new")
     assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_full_disk_leaves_no_staging_folder(tmp_path: Path) -> None:
+    program = """
+import resource, sys
+from pathlib import Path
+from carts_core.files import published
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+with published(Path(sys.argv[1])):
+    pass
+"""
+    done = subprocess.run([sys.executable, "-c", program, tmp_path / "a"], capture_output=True, text=True, check=False)
+    assert "OutputError" in done.stderr and "too large" in done.stderr
+    assert list(tmp_path.iterdir()) == []

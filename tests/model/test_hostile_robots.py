@@ -110,6 +110,18 @@ def test_a_mesh_that_names_a_device_as_its_material_is_not_followed(urdf: Path):
     assert len(Robot.load(urdf).meshes[0].faces) == 1
 
 
+def test_a_texture_that_is_refused_prints_nothing(urdf: Path, caplog: pytest.LogCaptureFixture, capfd):
+    (urdf.parent / "ball.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile large.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nproperty float s\nproperty float t\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n0.1 0 0 0 1\n0 0.1 0 1 1\n3 0 1 2\n"
+    )
+    (urdf.parent / "large.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0\1\0\0" * 2 + b"\x08\0\0\0\0")
+    urdf.write_text(urdf.read_text().replace("ball.stl", "ball.ply"))
+    assert len(Robot.load(urdf).meshes[0].faces) == 1
+    assert caplog.records == [] and capfd.readouterr() == ("", "")
+
+
 def test_decimation_that_takes_too_long_is_stopped(monkeypatch: pytest.MonkeyPatch):
     rng = np.random.default_rng(0)
     vertices, faces = rng.normal(size=(100_000, 3)), rng.integers(0, 100_000, (300_000, 3))

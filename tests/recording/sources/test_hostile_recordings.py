@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
+import recordings
 from recordings import BagKind, write_bag
 from scipy.io import savemat
 
@@ -19,6 +20,7 @@ from carts_core.files.decoding import decoded
 from carts_core.files.reading import MIB
 from carts_core.recording.image_sources import Bag
 from carts_core.recording.importing.foreign_tables import read_array, read_foreign_table
+from carts_core.recording.importing.importer import import_recording
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -151,3 +153,11 @@ def test_matlab_files_that_expand_without_end_or_are_damaged_are_refused(tmp_pat
     (tmp_path / "hdf.mat").write_bytes(b"MATLAB 7.3 MAT-file" + bytes(105) + b"\x00\x02IM" + bytes(600))
     with pytest.raises(ValueError, match="no MATLAB file"):
         decoded(read_matlab, tmp_path / "hdf.mat")
+
+
+def test_joints_beyond_all_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recordings, "joints_at", lambda time: np.full(6, 1e300))
+    bag = write_bag(tmp_path / "bag", BagKind(frames=4))
+    with pytest.raises(SequenceError):
+        import_recording(bag, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,148 @@
+"""Small files that grow when they are read: each is read in a process of its own, whose time and memory are measured.
+
+PYTHONPATH=tests python -m fuzz.growing --kinds yaml dae
+"""
+
+import argparse
+import json
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from carts_core.errors import CartsError
+from fuzz.growing_files import CASES, READERS, right_file, right_folder
+
+SECONDS = 5.0
+"""Of processor time, of the process and its children [s]."""
+MEMORY = 512 * 2**20
+"""Beyond that of the interpreter and what is imported in this process [bytes]."""
+INTERPRETER = 60 * 2**20
+"""Memory of a child process that has imported little [bytes]."""
+PATIENCE = 180
+"""[s]"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What reading a file took."""
+
+    kind: str
+    name: str
+    result: str
+    """`read`, `refused`, or what is wrong: `traceback`, `slow`, `memory`, `died`."""
+    size: int
+    """Of the file [bytes]."""
+    seconds: float
+    """[s]"""
+    memory: int
+    """[bytes]"""
+    detail: str = ""
+
+
+def measured(kind: str, name: str, make: Callable[[Path], Path]) -> Cost:
+    """The cost of a file: it is made in a fork, and read in another one, where libraries are imported already.
+
+    Args:
+        kind: of the file.
+        name: of the way in which it grows.
+        make: writes it into a folder that has a right file of each kind.
+    """
+    with tempfile.TemporaryDirectory(prefix="carts-growing-") as folder:
+        made = _forked(lambda: str(make(Path(folder))))
+        if made["result"] != "read":
+            raise RuntimeError(f"{kind} {name} was not made: {made['detail']}")
+        path = Path(made["value"])
+        size = path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in path.iterdir())
+        seen = _forked(lambda: repr(READERS[kind](path))[:200])
+    memory = seen["memory"]
+    result = seen["result"]
+    if result in ("read", "refused"):
+        result = "slow" if seen["seconds"] > SECONDS else "memory" if memory > MEMORY else result
+    return Cost(kind, name, result, size, seen["seconds"], memory, seen["detail"])
+
+
+def _forked(work: Callable[[], str]) -> dict:
+    """What became of some work in a child process, and what it took."""
+    here, there = os.pipe()
+    if (child := os.fork()) == 0:
+        os.close(here)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        signal.alarm(PATIENCE)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        start, value, detail = time.process_time(), "", ""
+        try:
+            value, result = work(), "read"
+        except CartsError as error:
+            result, detail = "refused", str(error)
+            if len(detail) > 5000:
+                result, detail = "traceback", f"a message of {len(detail)} characters"
+        except BaseException:
+            result, detail = "traceback", traceback.format_exc()[-1500:]
+        from carts_core.files import decoding  # noqa: PLC0415
+
+        decoding._end()  # Children count once they have been waited for.
+        own, children = (resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        seconds = time.process_time() - start + children.ru_utime + children.ru_stime
+        memory = 1024 * max(0, own.ru_maxrss - before) + max(0, 1024 * children.ru_maxrss - INTERPRETER)
+        answer = {"result": result, "value": value, "detail": detail, "seconds": seconds, "memory": memory}
+        os.write(there, msgspec.json.encode(answer)[:60_000])
+        os._exit(0)
+    os.close(there)
+    with os.fdopen(here, "rb") as pipe:
+        content = pipe.read()
+    _, status = os.waitpid(child, 0)
+    if not content:
+        usage = {"seconds": float(PATIENCE), "memory": 0, "value": "", "detail": f"status {status}"}
+        return {"result": "died", **usage}
+    return json.loads(content)
+
+
+def run(kinds: list[str], only: str = "") -> Iterator[Cost]:
+    """The costs of all files of some kinds, or of those with a part of a name."""
+    right_folder()
+    for kind in kinds:
+        yield measured(kind, "right", right_file(kind))
+        for name, make in CASES[kind].items():
+            if only in name:
+                yield measured(kind, name, make)
+
+
+def main() -> None:
+    """Measure files and print a table; status 1 if any is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kinds", nargs="*", default=list(CASES))
+    parser.add_argument("--only", default="")
+    arguments = parser.parse_args()
+    wrong = 0
+    costs: dict[str, list[Cost]] = {}
+    for cost in run(arguments.kinds, arguments.only):
+        costs.setdefault(cost.kind, []).append(cost)
+        good = cost.result in ("read", "refused")
+        wrong += not good
+        detail = cost.detail.strip() if not good else cost.detail.strip().split("\n")[-1][:160]
+        print(
+            f"{cost.kind:12} {cost.name:24} {cost.result:9} {cost.size / 1e6:8.3f} MB {cost.seconds:6.2f} s "
+            f"{cost.memory / 2**20:7.1f} MiB  {detail}",
+            flush=True,
+        )
+    print("| kind | files | most s | most MiB | wrong |\n|---|---|---|---|---|")
+    for kind, found in costs.items():
+        bad = sum(cost.result not in ("read", "refused") for cost in found)
+        crafted = found[1:] or found
+        most = max(cost.seconds for cost in crafted), max(cost.memory for cost in crafted) / 2**20
+        print(f"| {kind} | {len(found) - 1} | {most[0]:.1f} | {most[1]:.0f} | {bad} |")
+    print(f"{sum(len(found) - 1 for found in costs.values())} files, {wrong} wrong")
+    sys.exit(wrong > 0)
+
+
+if __name__ == "__main__":
+    main()
