@@ -5,17 +5,31 @@ steer a terminal, or turn the order of what follows, are shown as escapes.
 """
 
 import logging
+import math
 import re
+import time
 import unicodedata
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 T = TypeVar("T")
 
+_BETWEEN_LINES = 10.0
+"""Time between lines of progress in a file or a pipe [s]."""
 _KEPT = "\n\t"
 _HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Control, format and surrogate characters, and separators of lines and paragraphs."""
@@ -65,11 +79,33 @@ class Bar(Progress):
 
     def __init__(self, *columns: str | ProgressColumn, console: Console | None = None, **options: Any) -> None:
         super().__init__(*columns, console=console or Terminal(), **options)
+        self._lines = None if self.console.is_terminal or self.disable else Terminal(stderr=True)
+        self._printed = -math.inf
+
+    def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
+        """As in rich; in a file or a pipe, progress is lines on the standard error, the first one at once."""
+        task = super().add_task(description, *args, **fields)
+        self._printed = -math.inf
+        self._print(task)
+        return task
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """As in rich; see `add_task`."""
+        super().update(task_id, **changes)
+        self._print(task_id)
+
+    def _print(self, task_id: TaskID) -> None:
+        if self._lines is None or time.monotonic() < self._printed + _BETWEEN_LINES:
+            return
+        self._printed, task = time.monotonic(), self._tasks[task_id]
+        done = "" if task.total is None else f": {task.completed:g} of {task.total:g}"
+        self._lines.print(f"{task.description}{done}", soft_wrap=True)
 
     @classmethod
     def get_default_columns(cls) -> tuple[ProgressColumn, ...]:
-        """Description, bar, share and time."""
-        return PlainColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+        """A sign of life, description, bar, share and time."""
+        time_left = TimeRemainingColumn()
+        return SpinnerColumn(), PlainColumn("{task.description}"), BarColumn(), TaskProgressColumn(), time_left
 
 
 def track(

@@ -1,11 +1,16 @@
 """The `carts` command. Each subcommand is a dataclass whose fields are its options and whose `run` does the work."""
 
+import contextlib
+import io
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import reduce
 from importlib.metadata import version
-from typing import Annotated
+from operator import or_
+from typing import Annotated, Any
 
 import tyro
 
@@ -13,6 +18,7 @@ from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..imports import uncollected
 from ..stopping import PARENT, end_with_parent, exit_status, message, stopped_by_signals
+from ..wording import closest
 from .baseline import Baseline
 from .batch import Batch
 from .bench import Bench
@@ -41,26 +47,34 @@ _DESCRIPTION = (
 BAD_INPUT = 2
 """Exit status when a file or an option is not usable."""
 
-Command = (
-    Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[ImportMasks, tyro.conf.subcommand("import-masks")]
-    | Annotated[HandEye, tyro.conf.subcommand("hand-eye")]
-    | Annotated[TimeOffset, tyro.conf.subcommand("time-offset")]
-    | Annotated[Optimize, tyro.conf.subcommand("optimize")]
-    | Annotated[Live, tyro.conf.subcommand("live")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Batch, tyro.conf.subcommand("batch")]
-    | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
-    | Annotated[Robots, tyro.conf.subcommand("robots")]
-    | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Baseline, tyro.conf.subcommand("baseline")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-)
+COMMANDS: dict[str, type] = {
+    "view": View,
+    "import": Import,
+    "import-masks": ImportMasks,
+    "hand-eye": HandEye,
+    "time-offset": TimeOffset,
+    "optimize": Optimize,
+    "live": Live,
+    "evaluate": Evaluate,
+    "calibrate": Calibrate,
+    "render": Render,
+    "export": Export,
+    "batch": Batch,
+    "robot": RobotCommand,
+    "robots": Robots,
+    "synthesize": Synthesize,
+    "train": Train,
+    "baseline": Baseline,
+    "bench": Bench,
+}
+"""Subcommand -> its options and its work."""
+
+Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
+
+_AT_ONCE = (View, Live, RobotCommand, Robots)
+"""Commands that say at once what they do."""
+_INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
+"""In what tyro says, without its frame."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -78,10 +92,13 @@ def main(arguments: list[str] | None = None) -> None:
                 print_all_help(arguments)
                 return
             arguments = [argument for argument in arguments if argument != "--print-settings"]
-            command = tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+            command = _parsed(arguments)
             if print_settings:
                 print(_settings_of(command))
                 return
+        if not isinstance(command, _AT_ONCE):
+            # Importing what a command needs takes seconds on a busy machine.
+            Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with uncollected():
             from ..process import tune_process
 
@@ -95,6 +112,30 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt as stopped:
         Terminal(stderr=True).print(message(stopped), soft_wrap=True)
         sys.exit(exit_status(stopped))
+
+
+def _parsed(arguments: list[str]) -> Any:
+    """The command of a command line; help and errors of tyro end the program.
+
+    Raises:
+        SettingsError: there is no such command.
+    """
+    name, *options = arguments or [""]
+    if name and not name.startswith("-") and name not in COMMANDS:
+        meant = closest(name, COMMANDS)
+        raise SettingsError(f"there is no command {name!r}.{meant} The commands are: {', '.join(COMMANDS)}.")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            if name in COMMANDS:
+                # So that only options of this command are suggested for a misspelt one.
+                return tyro.cli(COMMANDS[name], prog=f"carts {name}", args=options)
+            return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+    except SystemExit:
+        print(said.getvalue(), end="", file=sys.stderr)
+        if found := _INVALID_CHOICE.search(" ".join(said.getvalue().replace("│", " ").split())):
+            print(closest(found["given"], re.findall("'([^']*)'", found["known"])).strip(), file=sys.stderr)
+        raise
 
 
 def print_all_help(arguments: list[str]) -> None:

@@ -16,6 +16,7 @@ from .observing import Observing
 from .selection import FromProject, Mode, Perturbation, Selection, SequencePath, check_writable
 from .solver_options import FreeInFrames, SolverOptions
 
+STANDARD_OUTPUT = Path("-")
 _WIDTH = 110
 """Characters of the table's lines in a file or a pipe."""
 
@@ -30,7 +31,8 @@ class Evaluate:
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
-    """Write the scores of all frames and their means to this file; folders on the way to it are made."""
+    """Write the scores of all frames and their means to this file, whose folders are made; `-` for the standard output,
+    with everything else on the standard error."""
     mode: Mode = "frame"
     """Optimize each frame alone, or all together, so that frames inform each other (docs: sequences)."""
     together: bool = False
@@ -43,9 +45,11 @@ class Evaluate:
     solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:
-        if self.json is not None and self.json.is_dir():
+        if self.json == STANDARD_OUTPUT:
+            pass
+        elif self.json is not None and self.json.is_dir():
             raise SettingsError(f"--json {self.json} is a folder. Name a file.")
-        if self.json is not None:
+        elif self.json is not None:
             check_writable(self.json.parent)
         if self.mode == "sequence":
             self.solving.check_surface("--mode sequence")
@@ -59,7 +63,7 @@ class Evaluate:
         from .hints import base_frame_hint, kept_start_hint, print_hints, verdict_line
         from .score_table import score_table
 
-        console = Terminal()
+        console = Terminal(stderr=self.json == STANDARD_OUTPUT)
         if not console.is_terminal:
             console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
         sequence = Sequence.open(self.sequence, progress=console.print)
@@ -105,5 +109,9 @@ class Evaluate:
         if self.json is not None:
             project = self.source.path(sequence.path)
             made_from = {} if project is None else {"project": str(project)}
-            write_text(self.json, json.dumps({**self.network.observed, **made_from, **to_json(scores)}, indent=1))
+            text = json.dumps({**self.network.observed, **made_from, **to_json(scores)}, indent=1)
+            if self.json == STANDARD_OUTPUT:
+                print(text)
+                return
+            write_text(self.json, text)
             console.print(f"wrote {self.json}")

@@ -19,9 +19,9 @@ _STYLES = {"found": "green", "guessed": "yellow", "missing": "magenta", "warning
 
 @dataclass(frozen=True)
 class Import:
-    """Write a sequence file for a recording, which stays where it is; docs/howto/import.md has the kinds."""
+    """Write a sequence file for a recording, which stays where it is; without SOURCE, list the kinds."""
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """File or folder of the recording."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder to make for sequence.toml and its tables; by default `NAME_sequence` here."""
@@ -32,9 +32,12 @@ class Import:
     def run(self) -> None:
         """Say what was found, and write the sequence file."""
         from ..recording.importing.found import recording_name
-        from ..recording.importing.importer import import_recording
+        from ..recording.importing.importer import import_recording, known_kinds
 
         console = Console()
+        if self.source is None:
+            console.print(f"carts import SOURCE reads:\n{known_kinds()}", markup=False, highlight=False, soft_wrap=True)
+            return
         folder = self.output or Path(f"{recording_name(self.source)}_sequence")
         path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
         print_report(console, recording)

@@ -52,7 +52,7 @@ class Familiarity:
             found.append(f"{where}: no arm is in view as measured. {place}")
         elif self.recognized < RECOGNIZED:
             found.append(
-                f"{where}: the network recognizes a rendering of these arms with an overlap of {self.recognized:.2f} "
+                f"{where}: the network recognizes a rendering of these arms with an overlap of {self.recognized:.3f} "
                 f"only ({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:

@@ -23,7 +23,7 @@ class ImportOptions:
     """Answers to what a recording does not say."""
 
     source: str | None = None
-    """Kind of source (`carts import` lists them); by default it is detected."""
+    """Kind of source (`carts import` alone lists them); by default it is detected."""
     images: Mapping[str, str] = field(default_factory=dict)
     """Camera -> its images: a folder, pattern or video, or a topic of the bag."""
     calibration: Mapping[str, Path] = field(default_factory=dict)

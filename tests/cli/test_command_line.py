@@ -293,7 +293,11 @@ def test_render_writes_a_picture_per_frame(sequence: str, tmp_path: Path, style:
         (["evaluate", "nowhere.toml"], "nowhere.toml"),
         (["evaluate", "SEQUENCE", "--domain", "fog"], "domain 'fog' is not in"),
         (["evaluate", "SEQUENCE", "--camera", "third"], "no camera is called 'third'. The cameras are: left"),
-        (["evaluate", "SEQUENCE", "--arms", "PSM9"], "no arm is called 'PSM9'"),
+        (
+            ["evaluate", "SEQUENCE", "--arms", "psm1"],
+            "no arm is called 'psm1'. The arms are: PSM1. Did you mean 'PSM1'?",
+        ),
+        (["evaluate", "SEQUENCE", "--camera", "lfet"], "Did you mean 'left'?"),
         (["evaluate", "SEQUENCE", "--frames", "7"], "--frames 7: there is no '7'"),
         (["evaluate", "SEQUENCE", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
     ],
@@ -305,6 +309,34 @@ def test_bad_input_ends_with_a_message_and_status_2(
         main([sequence if argument == "SEQUENCE" else argument for argument in arguments])
     assert stop.value.code == BAD_INPUT
     assert message in capsys.readouterr().err
+
+
+def test_scores_go_to_the_standard_output_alone_where_that_is_asked_for(
+    sequence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["evaluate", sequence, "--solver", "none", "--frames", "001", "--json", "-"])
+    printed = capsys.readouterr()
+    assert [score["frame"] for score in json.loads(printed.out)["frames"]] == ["001"]
+    assert "tiny: 1 frame, means" in printed.err
+
+
+def test_progress_is_said_at_once_where_the_output_is_a_pipe(sequence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["evaluate", sequence, "--solver", "none"])
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "carts evaluate: starting" and "optimizing: 0 of 3" in said
+
+
+def test_the_kinds_of_recordings_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["import"])
+    printed = capsys.readouterr().out
+    assert "dvrk: a session of the dVRK's recorder" in printed and "surgpose:" in printed
+
+
+def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--tyro-print-completion", "bash"])
+    printed = capsys.readouterr().out
+    assert stop.value.code in (0, None) and "import-masks" in printed and "--perturb-deg" in printed
 
 
 def test_a_device_that_does_not_exist_is_named(sequence: str, capsys: pytest.CaptureFixture[str]) -> None:

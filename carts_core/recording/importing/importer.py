@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ...errors import SequenceError
 from ...settings.importing import ImportOptions
-from ...wording import shown
+from ...wording import closest, shown
 from ..sources import SOURCES, Source
 from .found import FoundRecording
 from .placing import completed
@@ -20,6 +20,11 @@ _UNFINISHED = {
 """Ends of names of bags that need another program first."""
 
 
+def known_kinds() -> str:
+    """The kinds of recordings, in the order in which they are looked for, one a line."""
+    return "\n".join(f"  {source.name}: {source.label} ({source.looked_for})" for source in SOURCES)
+
+
 def detect(path: Path, name: str | None = None) -> Source:
     """The kind of a recording.
 
@@ -30,14 +35,15 @@ def detect(path: Path, name: str | None = None) -> Source:
     Raises:
         SequenceError: nothing is there, or it is of no known kind.
     """
-    kinds = "\n".join(f"  {source.name}: {source.label} ({source.looked_for})" for source in SOURCES)
+    kinds = known_kinds()
     if not path.exists():
         raise SequenceError(f"{path} is missing. Give the file or folder of a recording.")
     if name is not None:
         for source in SOURCES:
             if source.name == name:
                 return source
-        raise SequenceError(f"--source {name!r} is not known. Known are:\n{kinds}")
+        meant = closest(name, [source.name for source in SOURCES])
+        raise SequenceError(f"--source {name!r} is not known.{meant} Known are:\n{kinds}")
     for suffix, remedy in _UNFINISHED.items():
         if path.name.lower().endswith(suffix):
             raise SequenceError(f"{path} ends with {suffix}: {remedy}")
