@@ -48,7 +48,8 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
     if training.failed:
         raise CartsError(f"The network could not be adapted: {' '.join(lines[-3:]) or 'training ended early'}")
     kept = next((line for line in lines if line.startswith("kept, the best:")), lines[-1] if lines else "")
-    yield Progress(total, total, kept.partition(": ")[2] or kept)
+    refused = next((line for line in lines if line.startswith("not offered, since worse:")), None)
+    yield Progress(total, total, refused or kept.partition(": ")[2] or kept)
 
 
 class _Training:

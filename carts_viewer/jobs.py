@@ -141,7 +141,7 @@ def job_title(options: Options, frame_ids: Sequence[str]) -> str:
         case CalibrateOptions(frames=frames):
             return f"Calibrate on {frames} frames"
         case AdaptOptions(minutes=minutes):
-            return f"Adapt the network to this recording, {minutes} minutes at most"
+            return f"Adapt the network to this recording, {minutes} minutes of processor time at most"
         case intents.Export():
             label = FORMATS[options.format].label if options.format in FORMATS else options.format
             return f"Export {options.frames.lower()[:40]} as {label}" + (f", {between}" if between else "")

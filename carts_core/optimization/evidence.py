@@ -23,6 +23,9 @@ _SHOWN, _TELLING = 2e-3, 0.3
 """Share of the images from which an arm is judged by itself, and share of an arm where change has to tell something
 for its change to count [1]."""
 
+_PART_SHOWN = 60.0
+"""Pixels of a part from which it is judged by itself [px of the working image]."""
+
 OUT_OF_VIEW = 5e-4
 """Share of the images below which no arm is in view [1]."""
 
@@ -47,6 +50,9 @@ class Evidence(ArmEvidence):
     elsewhere: float = 0.0
     """Where an arm is out of view: what is predicted far from the others and differs from the mean background, as a
     share of the images [1]."""
+    parts_predicted: float = 1.0
+    """Of the wrists and of the jaws in view, the smaller share of what is rendered that is predicted as that part [1];
+    1 where hardly any of them is in view, and where masks are given."""
     masked: bool = False
     """Whether what is called predicted are given masks, which count in the whole image."""
 
@@ -67,10 +73,10 @@ def evidence(
     covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
     window = Window.around(covered.sum(1), margin, predictor.stride, images.size)
-    conditioned, alone = (
-        predictor.predict(images.images, given, window)[:, COVERAGE].sum(1, keepdim=True)
-        for given in (maps, torch.zeros_like(maps))
+    parts, parts_alone = (
+        predictor.predict(images.images, given, window)[:, COVERAGE] for given in (maps, torch.zeros_like(maps))
     )
+    conditioned, alone = parts.sum(1, keepdim=True), parts_alone.sum(1, keepdim=True)
     rendered, weight = window.of(covered), window.of(images.weight)
     labels = images.renderer.segment(end)
     change = None
@@ -82,6 +88,7 @@ def evidence(
     ]
     worst = max(found, key=lambda arm: log_odds_of_failure(loss, arm, predictor.masked))
     rendered = rendered * weight
+    parts_predicted = 1.0 if predictor.masked else _parts_predicted(window.of(maps[:, COVERAGE]) * weight, parts)
     return Evidence(
         **asdict(worst),
         area=total(covered) / covered.numel(),
@@ -91,8 +98,21 @@ def evidence(
         changed=_share_of_telling(rendered, change),
         still_in_view=_still_in_view(images, (images.renderer.segment(start), start), (labels, end)),
         elsewhere=_elsewhere(images, labels, len(end.joint_positions), predictor),
+        parts_predicted=parts_predicted,
         masked=predictor.masked,
     )
+
+
+def _parts_predicted(
+    rendered: Float[Tensor, "cameras parts h w"], predicted: Float[Tensor, "cameras parts h w"]
+) -> float:
+    """See `Evidence.parts_predicted`; the first part is the shaft."""
+    shares = [
+        _share(predicted[:, [part]].clamp(0.0, 1.0), rendered[:, [part]])
+        for part in range(1, rendered.shape[1])
+        if total(rendered[:, part]) >= _PART_SHOWN
+    ]
+    return min(shares, default=1.0)
 
 
 def _elsewhere(

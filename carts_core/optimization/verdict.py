@@ -60,6 +60,9 @@ def assess(found: Evidence) -> Assessment:
     if probability >= _POSSIBLE:
         reason = f"The {what} supports the fit only in part: " + _weakest(found)
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, probability, found)
+    if found.parts_predicted < _PART_UNSEEN:
+        reason = "The wrist or the jaws of an arm are not predicted where they were fitted, so only the shaft is."
+        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
     return Assessment(Verdict.GOOD, f"The {what} supports the fit.", "", probability, found)
 
 
@@ -74,6 +77,9 @@ _POSSIBLE, _LIKELY = 0.1, 0.5
 _UNSEEN, _AT_RANDOM = 0.05, 0.5
 """Share of an arm below which nothing of it is predicted, and
 agreement below which a prediction says nothing of the fit [1]."""
+
+_PART_UNSEEN = 0.2
+"""Share of the rendered wrists, or jaws, below which they are not predicted [1]."""
 
 _LOOKS_LIKE_ONE = 5e-3
 """Share of the images from which what looks like an arm may be the one that is out of view [1]."""

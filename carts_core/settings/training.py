@@ -226,7 +226,8 @@ class TrainingConfig:
     steps: int = 4000
     """Optimizer steps."""
     minutes: float | None = None
-    """Time for training [min]; a run that would take longer has fewer steps."""
+    """Processor time for training, per thread of the training process [min]; a run that would take longer has fewer
+    steps. On a busy machine a run takes longer and learns as much."""
     batch_size: int = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: int = 2
@@ -241,8 +242,6 @@ class TrainingConfig:
     """Decay per step of the running average of the weights, which is what is saved."""
     validation_every: int = 250
     """Steps between validations."""
-    validation_minutes: float | None = None
-    """Time between validations [min], in place of `validation_every`."""
     patience: int | None = None
     """Validations in a row without a gain after which a run ends, and whose weights are not kept."""
     validation_samples: int = 32
@@ -288,10 +287,6 @@ class TrainingConfig:
             )
         if self.minutes is not None and not self.minutes > 0:
             raise SettingsError(f"minutes is {self.minutes}; give a positive time, or leave it out.")
-        if self.validation_minutes is not None and not self.validation_minutes > 0:
-            raise SettingsError(
-                f"validation_minutes is {self.validation_minutes}; give a positive time, or leave it out."
-            )
         if self.patience is not None and self.patience < 1:
             raise SettingsError(f"patience is {self.patience}; give 1 or more, or leave it out.")
         if not 0 <= self.average < 1:

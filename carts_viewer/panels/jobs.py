@@ -54,7 +54,7 @@ class JobsPanel:
                 min=1,
                 max=LONGEST_TRAINING,
                 step=1,
-                hint="At most; it ends when it no longer gains",
+                hint="Processor time at most; it ends when it no longer gains",
             )
             adapt = gui.add_button(
                 "Adapt the network",

@@ -78,6 +78,12 @@ def test_a_mask_that_is_black_on_the_arms_or_shows_none_has_failed() -> None:
     assert empty.verdict is Verdict.FAILED and empty.reason.startswith("The given mask shows nothing")
 
 
+@pytest.mark.parametrize(("predicted", "wanted"), [(0.7, Verdict.GOOD), (0.05, Verdict.DOUBTFUL)])
+def test_a_fit_whose_wrist_or_jaws_are_not_predicted_is_not_good(predicted: float, wanted: Verdict) -> None:
+    found = assess(replace(CONVINCING, parts_predicted=predicted))
+    assert found.verdict is wanted and ("wrist or the jaws" in found.reason) == (wanted is Verdict.DOUBTFUL)
+
+
 def test_a_verdict_grows_worse_with_the_evidence() -> None:
     order = [Verdict.GOOD, Verdict.DOUBTFUL, Verdict.FAILED]
     names = ("loss", "residual", "agreement", "unconditioned", "predicted", "changed", "overlap_with_change")

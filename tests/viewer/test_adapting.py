@@ -27,7 +27,7 @@ from carts_viewer.running import OptimizerFactory
 
 SMALL = (
     "--steps 2 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
-    "--images.field-width 64"
+    "--images.field-width 64 --fits 1"
 ).split()
 OVER = 120.0
 """Time for a small run on a busy machine [s]."""

@@ -1,18 +1,24 @@
 """Adapting the shipped network to a recording: its robots, its cameras, its distances, its empty backgrounds."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from ...files import locked_folder, output_path, write_bytes
+from ...files import locked_folder, output_path, remove_file, write_bytes, write_text
+from ...files.reading import WEIGHTS, read_bytes
+from ...model.parts import PARTS
 from ...recording import Sequence
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
+from .judging import Progress, judge
+from .progress import TrainingResult
 
-MINUTES = 15.0
-"""Time of a run for which none is given [min]."""
+STEPS = 400
+"""Steps of a run for which neither steps nor time are given: a busy machine takes longer and learns as much."""
+_VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
 """Folder of a run with the empty backgrounds of the recording."""
 _FROM_RECORDING = 0.5
@@ -24,10 +30,28 @@ _SAMPLES = 48
 _PATIENCE = 5
 
 
+REFUSED = "refused.safetensors"
+"""Weights of a run that are not offered."""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What becomes of adapted weights."""
+
+    weights: Path | None
+    """To be used; None where something became worse."""
+    refused: Path | None
+    """Where weights are that are not offered."""
+    worse: list[str]
+    """What became worse."""
+    lines: list[str]
+    """Figures before and after, for people."""
+
+
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
     """The settings of a run that adapts the surface network to a recording, and its backgrounds in `output`.
 
-    Robots, start and time are those of `given` where they are not its defaults.
+    Robots, start, steps and time are those of `given` where they are not its defaults.
 
     Args:
         recording: sequence file; no image of it but the empty background is learnt from.
@@ -42,7 +66,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
     sequence = Sequence.open(recording)
     with locked_folder(output):
         found = _write_backgrounds(sequence, output)
-    default, samples = TrainingConfig(), given.validation_samples
+    default, samples, every = TrainingConfig(), given.validation_samples, given.validation_every
     robots = tuple(dict.fromkeys(arm.robot.urdf for arm in sequence.scene.arms))
     images = replace(
         given.images,
@@ -56,13 +80,12 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
         network="surface",
         robots=robots if given.robots == default.robots else given.robots,
         start=given.start or shipped_weights()[1],
-        steps=10**6 if given.steps == default.steps else given.steps,
-        minutes=given.minutes or MINUTES,
+        steps=given.steps if given.steps != default.steps else STEPS if given.minutes is None else 10**6,
         learning_rate=_LEARNING_RATE if given.learning_rate == default.learning_rate else given.learning_rate,
         warmup=_WARMUP,
         average=_AVERAGE,
         validation_samples=_SAMPLES if samples == default.validation_samples else samples,
-        validation_minutes=1.0,
+        validation_every=every if every != default.validation_every else _VALIDATION_EVERY,
         patience=_PATIENCE,
         images=images,
     )
@@ -84,5 +107,32 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
     """What a run has reached, for people; figures are those of the surface network's validation."""
     share = (1 - now["dice"]) / (1 - before["dice"]) if before["dice"] < 1 else np.nan
     dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, {share:.0%} of the error is left"
+    parts = ", ".join(f"{part} {before[f'dice_{part}']:.3f} -> {now[f'dice_{part}']:.3f}" for part in PARTS)
+    tips = f"tips {before['tip_error']:.1f} -> {now['tip_error']:.1f} px"
     normals = f"normals {before['normal_error_deg']:.1f} -> {now['normal_error_deg']:.1f} deg"
-    return f"made images of this recording: {dice}; {normals}"
+    return f"made images of this recording: {dice}; {parts}; {tips}; {normals}"
+
+
+def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
+    """Compare fits with the weights of the start and of a run; weights that are worse anywhere are put aside.
+
+    Args:
+        config: as from `adapted_to`.
+        result: of the run.
+        progress: called before every fit.
+        made, own: how many made images, and frames of the recording.
+    """
+    assert config.start is not None
+    aside = output_path(result.weights.parent, REFUSED)
+    if not result.weights.is_file():
+        return Offer(None, aside.path, ["the weights were refused before; see report/fits.json"], [])
+    judgement = judge(config, config.start, result.weights, made=made, own=own, progress=progress)
+    worse = judgement.worse()
+    report = {"worse": worse, "figures": judgement.lines(), "made": made, "own": own}
+    write_text(output_path(result.weights.parent, "report") / "fits.json", json.dumps(report, indent=1))
+    if not worse:
+        return Offer(result.weights, None, [], judgement.lines())
+    # The page and later commands look for weights under their usual name only.
+    write_bytes(aside, read_bytes(result.weights, WEIGHTS))
+    remove_file(output_path(result.weights.parent, result.weights.name))
+    return Offer(None, aside.path, worse, judgement.lines())

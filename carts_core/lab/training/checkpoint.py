@@ -26,6 +26,8 @@ class History:
     """Per validation: `step` and the figures of `Validation`."""
     seconds: float = 0.0
     """Wall time spent in training steps [s]."""
+    processor_seconds: float = 0.0
+    """Processor time of each thread of the training process there [s]."""
 
     @property
     def first(self) -> dict[str, float] | None:

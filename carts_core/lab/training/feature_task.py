@@ -56,6 +56,10 @@ class FeatureTask:
         """Figures of a folded network."""
         return validate(network, batch[0].float() / 255, batch[1])
 
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """See `Task`; the score says all."""
+        return False
+
     @torch.no_grad()
     def panels(self, network: FeatureNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
         """Example predictions of a folded network."""

@@ -1,6 +1,7 @@
 """The training report: curves, example predictions and a page that shows both."""
 
 import json
+import math
 from pathlib import Path
 
 import matplotlib
@@ -42,7 +43,7 @@ def _curves(history: History, columns: dict[str, str]) -> Figure:
         loss_axes.legend(fontsize=8)
     steps = [entry["step"] for entry in history.validations]
     for axes, (name, title) in zip(others, columns.items(), strict=True):
-        axes.plot(steps, [entry[name] for entry in history.validations], ".-")
+        axes.plot(steps, [entry.get(name, math.nan) for entry in history.validations], ".-")
         axes.set(title=f"validation: {title}", xlabel="step")
     for axes in (loss_axes, *others):
         axes.grid(alpha=0.3)
@@ -78,9 +79,9 @@ def _page(config: dict, history: History, columns: dict[str, str]) -> str:
         f"| step | {' | '.join(columns.values())} |",
         "|---" * (1 + len(columns)) + "|",
     ]
-    lines += [
-        f"| {entry['step']} | {' | '.join(f'{entry[name]:.4f}' for name in columns)} |" for entry in history.validations
-    ]
+    for entry in history.validations:
+        figures = " | ".join(f"{entry.get(name, math.nan):.4f}" for name in columns)
+        lines.append(f"| {entry['step']} | {figures} |")
     lines += [
         "",
         "Validation images are made like the training images, from random numbers that training never sees.",

@@ -1,5 +1,6 @@
 """Learning to see surfaces: what `SurfaceNetwork` is trained on, what it minimises, how well it does."""
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -19,6 +20,10 @@ from .objective import dilated, weighted_mean
 from .task import Batch, byte_tensor, flips
 from .validation import pooled_dice
 
+_PART_WORSE, _TIP_WORSE = 0.005, 0.2
+"""What counts as worse: a part's Dice lower by this much [1], tips farther off by this much [px]."""
+_LOST = 20.0
+"""Error of a tip that is not predicted, and the most that one counts [px]."""
 _SMOOTH = 0.2
 _AT_ONCE = 8
 
@@ -30,6 +35,8 @@ class SurfaceTask:
         "dice": "Dice of the arms",
         "dice_given": "Dice of the given kinematics",
         "part_accuracy": "pixels with the right part",
+        **{f"dice_{part}": f"Dice of the part {part}" for part in PARTS},
+        "tip_error": "error of tips [px]",
         "normal_error_deg": "error of normals [deg]",
     }
     score: ClassVar[str] = "dice"
@@ -83,12 +90,22 @@ class SurfaceTask:
         known = given[:, COVERAGE].sum(1) > 0.5
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
         cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
+        parts = {f"dice_{name}": _pooled_part(seen, surface, part) for part, name in enumerate(PARTS)}
         return {
+            **parts,
+            "tip_error": tip_error(seen, surface),
             "dice": pooled_dice(guess, true),
             "dice_given": pooled_dice(known, true),
             "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
             "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
         }
+
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """Whether a part is seen worse than at the start, or tips are farther off."""
+        # Runs of earlier versions have no such figures.
+        names = [name for name in (f"dice_{part}" for part in PARTS) if name in first]
+        parts = any(now[name] < first[name] - _PART_WORSE for name in names)
+        return parts or now["tip_error"] > first.get("tip_error", math.inf) + _TIP_WORSE
 
     @torch.no_grad()
     def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
@@ -108,6 +125,37 @@ class SurfaceTask:
                 ]
             )
         return rows
+
+
+def _pooled_part(seen: Tensor, surface: Tensor, part: int) -> float:
+    guess, true = (maps[:, COVERAGE][:, part] > 0.5 for maps in (seen, surface))
+    return pooled_dice(guess, true)
+
+
+def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n channels h w"]) -> float:
+    """Mean distance of predicted tips from true ones, over images that show the jaws [px].
+
+    The tip is the pixel of the jaws that is farthest from the middle of the shaft, or of what is seen of the arm.
+    """
+    errors = []
+    for ours, theirs in zip(seen[:, COVERAGE] > 0.5, surface[:, COVERAGE] > 0.5, strict=True):
+        middle = _middle(theirs)
+        if middle is None or (true := _farthest(theirs[-1], middle)) is None:
+            continue
+        found = _farthest(ours[-1], middle)
+        errors.append(_LOST if found is None else min(float((found - true).norm()), _LOST))
+    return float(np.mean(errors)) if errors else 0.0
+
+
+def _middle(parts: Tensor) -> Tensor | None:
+    """Middle of the shaft, or of the arm where no shaft is seen; None without any."""
+    pixels = (parts[0] if parts[0].any() else parts.any(0)).nonzero()
+    return pixels.float().mean(0) if len(pixels) else None
+
+
+def _farthest(mask: Tensor, middle: Tensor) -> Tensor | None:
+    pixels = mask.nonzero().float()
+    return pixels[(pixels - middle).norm(dim=1).argmax()] if len(pixels) else None
 
 
 def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:

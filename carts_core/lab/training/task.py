@@ -45,6 +45,10 @@ class Task(Protocol):
         """Figures of a folded network, by the names in `columns`."""
         ...
 
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """Whether a figure besides `score` has become worse than at the start, so that weights are not kept."""
+        ...
+
     def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
         """Example predictions of a folded network: per sample, titled pictures."""
         ...

@@ -35,7 +35,6 @@ _MAY_CHANGE = (
     "device",
     "validation_every",
     "checkpoint_every",
-    "validation_minutes",
     "patience",
 )
 
@@ -80,7 +79,7 @@ class _Run:
         self.step, self.history = 0, History()
         self._resume()
         self._saved = self.step
-        self._clock = self._validated = time.perf_counter()
+        self._clock, self._worked = time.perf_counter(), time.process_time()
 
     def _resume(self) -> None:
         checkpoint = load_checkpoint(self.output)
@@ -108,7 +107,7 @@ class _Run:
             with training_batches(self.config, self.step) as batches:
                 validation = self._train_on(batches, samples, validation, progress)
         if self.config.patience is not None:
-            validation = max(self.history.validations, key=lambda entry: entry[self.task.score])
+            validation = max(self.history.validations, key=self._score)
         elif validation is None:
             validation = self.task.validate(self._averaged().folded(), samples)
             self._save(validation)
@@ -127,8 +126,8 @@ class _Run:
     ) -> dict[str, float] | None:
         """Train to the end; gives the newest validation, which is the given one where there was no other."""
         sums: dict[str, float] = {}
-        count, self._clock = 0, time.perf_counter()
-        last = False
+        count, last = 0, False
+        self._clock, self._worked = time.perf_counter(), time.process_time()
         while not last:
             batch = next(batches)
             with finished_first():
@@ -143,11 +142,10 @@ class _Run:
             if last or count == _LOG_EVERY:
                 means = {name: value / count for name, value in sums.items()}
                 self.history.losses.append({"step": self.step, **means})
-                elapsed = time.perf_counter() - self._clock
-                self.history.seconds += elapsed
+                elapsed = self._take_time()
                 reached = means["loss"], elapsed / count, validation, self.history.first
                 progress(TrainingProgress(self.step, self._planned(), *reached))
-                sums, count, self._clock = {}, 0, time.perf_counter()
+                sums, count = {}, 0
             if last or self.step % self.config.checkpoint_every == 0:
                 self._checkpoint()
         return validation
@@ -155,7 +153,7 @@ class _Run:
     def save(self) -> None:
         """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""
         if self.step > self._saved:
-            self.history.seconds += time.perf_counter() - self._clock
+            self._take_time()
             self._checkpoint()
 
     def kept(self) -> str:
@@ -168,8 +166,20 @@ class _Run:
         """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
         if self.config.minutes is None or self.step == 0:
             return self.config.steps
-        seconds = self.history.seconds + time.perf_counter() - self._clock
-        return min(self.config.steps, max(self.step, int(self.step * 60 * self.config.minutes / seconds)))
+        seconds = self.history.processor_seconds + self._processor_seconds()
+        return min(self.config.steps, max(self.step, int(self.step * 60 * self.config.minutes / max(seconds, 1e-6))))
+
+    def _processor_seconds(self) -> float:
+        """Processor time of each thread since it was last added to the history [s]."""
+        return (time.process_time() - self._worked) / self.config.threads
+
+    def _take_time(self) -> float:
+        """Add the time since the last call to the history; wall time [s]."""
+        elapsed = time.perf_counter() - self._clock
+        self.history.seconds += elapsed
+        self.history.processor_seconds += self._processor_seconds()
+        self._clock, self._worked = time.perf_counter(), time.process_time()
+        return elapsed
 
     def _train_step(self, batch: Batch) -> dict[str, float]:
         for group in self.optimizer.param_groups:
@@ -191,23 +201,25 @@ class _Run:
         return network
 
     def _validation_due(self) -> bool:
-        if self.config.validation_minutes is None:
-            return self.step % self.config.validation_every == 0
-        return time.perf_counter() - self._validated >= 60 * self.config.validation_minutes
+        return self.step % self.config.validation_every == 0
+
+    def _score(self, entry: dict[str, float]) -> float:
+        """What a validation is judged by, higher is better; the least where a figure is worse than at the start."""
+        worse = self.history.first is not None and self.task.worse(entry, self.history.first)
+        return -math.inf if worse else entry[self.task.score]
 
     def _validate(self, samples: Batch) -> dict[str, float]:
         validation = self.task.validate(self._averaged().folded(), samples)
-        best = max((entry[self.task.score] for entry in self.history.validations), default=-math.inf)
+        best = max(map(self._score, self.history.validations), default=-math.inf)
         self.history.validations.append({"step": self.step, **validation})
-        if self.config.patience is None or validation[self.task.score] > best:
+        if self.config.patience is None or self._score(validation) > best:
             self._save(validation)
-        self._validated = time.perf_counter()
         return validation
 
     def _has_ended_gaining(self) -> bool:
         """Whether the newest validations, as many as `patience` says, are no better than one before them."""
         patience = self.config.patience
-        scores = [entry[self.task.score] for entry in self.history.validations]
+        scores = [self._score(entry) for entry in self.history.validations]
         if patience is None or len(scores) <= patience:
             return False
         return max(scores[-patience:]) <= max(scores[:-patience])

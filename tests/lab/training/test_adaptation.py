@@ -11,8 +11,10 @@ import torch
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SequenceError, SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
-from carts_core.lab.training.adaptation import BACKGROUNDS, adapted_to, gain
+from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, adapted_to, gain
 from carts_core.lab.training.checkpoint import load_checkpoint
+from carts_core.lab.training.judging import Judgement, MadeFits, OwnFits, edge_support, made_images
+from carts_core.lab.training.surface_task import SurfaceTask, tip_error
 from carts_core.lab.training.training import train
 from carts_core.lab.training.validation import dice, pooled_dice
 from carts_core.model.robot import Robot
@@ -87,7 +89,7 @@ def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
 def test_settings_come_from_the_recording_and_the_shipped_weights(tmp_path: Path):
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
     assert config.start == shipped_weights()[1]
-    assert config.minutes == 15.0
+    assert (config.steps, config.minutes) == (STEPS, None)
     assert [path.name for path in config.robots] == ["psm_lnd.urdf"]
     assert config.images.recording == sample_sequence().absolute()
     assert config.images.photographs == tmp_path / BACKGROUNDS
@@ -107,11 +109,14 @@ def test_options_that_are_given_are_kept(tmp_path: Path):
     assert (config.minutes, config.learning_rate, config.start) == (3.0, 1e-4, Path("other.safetensors"))
 
 
-def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(tmp_path: Path):
+def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(SurfaceTask, "worse", lambda *_: False)
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1))
     # At so small a rate only the batch statistics change.
     config = replace(config, learning_rate=1e-12, weight_decay=0.0, validation_samples=2, patience=2, average=0.0,
-                     validation_minutes=1e-4)  # fmt: skip
+                     validation_every=1)  # fmt: skip
     result = train(config, tmp_path)
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None
@@ -126,8 +131,114 @@ def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(tmp_path
 
 
 def test_what_is_left_of_the_error_is_said():
-    text = gain({"dice": 0.8, "normal_error_deg": 20.0}, {"dice": 0.9, "normal_error_deg": 10.0})
-    assert "Dice 0.800 -> 0.900, 50% of the error is left" in text
+    rest = {**dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7), "tip_error": 2.0}
+    text = gain({"dice": 0.8, "normal_error_deg": 20.0, **rest}, {"dice": 0.9, "normal_error_deg": 10.0, **rest})
+    assert "Dice 0.800 -> 0.900, 50% of the error is left" in text and "tips 2.0 -> 2.0 px" in text
+
+
+FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_deg": 20.0, "tip_error": 2.7}
+FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
+
+
+@pytest.mark.parametrize(
+    ("later", "kept"),
+    [
+        ({"dice": 0.9}, 1),
+        ({"dice": 0.9, "tip_error": 10.9}, 0),
+        ({"dice": 0.9, "dice_jaws": 0.6}, 0),
+        ({"dice": 0.9, "dice_wrist": 0.6}, 0),
+    ],
+)
+def test_weights_that_see_masks_better_and_parts_or_tips_worse_are_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, later: dict[str, float], kept: int
+):
+    figures = iter([FIGURES, {**FIGURES, **later}])
+    monkeypatch.setattr(SurfaceTask, "validate", lambda *_: next(figures))
+    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1, steps=1))
+    result = train(replace(config, validation_samples=1), tmp_path)
+    assert result.validation["step"] == kept
+    assert read_weights(result.weights).training["step"] == kept
+
+
+def test_a_busy_machine_takes_no_steps_from_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clock = iter(range(0, 10**9, 1000))
+    monkeypatch.setattr("carts_core.lab.training.training.time.perf_counter", lambda: float(next(clock)))
+    given = TrainingConfig(workers=0, threads=1, batch_size=1, steps=3, minutes=5.0)
+    config = replace(adapted_to(sample_sequence(), tmp_path, given), validation_samples=1)
+    train(config, tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None and checkpoint.step == 3
+    assert checkpoint.history.seconds > 60 * 5.0 > checkpoint.history.processor_seconds > 0.0
+
+
+def test_the_tip_is_the_end_of_the_jaws():
+    surface = torch.zeros(2, 6, 20, 30)
+    surface[:, 0, 8:12, 0:10] = 1.0
+    surface[:, 2, 9:11, 10:20] = 1.0
+    seen = surface.clone()
+    seen[0, 2, :, 17:] = 0.0
+    assert tip_error(surface, surface) == 0.0
+    assert tip_error(seen, surface) == pytest.approx(1.5, abs=0.3)
+    seen[1, 2] = 0.0
+    assert tip_error(seen, surface) == pytest.approx((3.0 + 20.0) / 2, abs=0.3)
+
+
+def _judgement(made: dict | None = None, own: dict | None = None, moved: float = 0.0) -> Judgement:
+    before, was = MadeFits(0.97, 0.95, 2.7), OwnFits(4, 2.0, 0.7, (np.array([[10.0, 10.0], [np.nan, np.nan]]),))
+    now = replace(was, tips=(was.tips[0] + moved,), **(own or {}))
+    return Judgement((before, replace(before, **(made or {}))), (was, now))
+
+
+@pytest.mark.parametrize(
+    ("judgement", "worse"),
+    [
+        (_judgement(), []),
+        (_judgement({"dice": 0.98, "tips": 2.0}, {"edges": 2.2}, moved=5.0), []),
+        (_judgement({"dice": 0.98, "tips": 10.9}), ["tips of made images (2.7 -> 10.9 px)"]),
+        (_judgement({"dice": 0.96}), ["masks of made images (Dice 0.970 -> 0.960)"]),
+        (_judgement({"parts": 0.9}), ["parts of made images (0.950 -> 0.900 of the pixels)"]),
+        (_judgement(own={"good": 3}), ["verdicts of the recording (4 -> 3 good)"]),
+        (_judgement(own={"parts": 0.1}), ["parts of the recording (0.700 -> 0.100 of the pixels)"]),
+        (_judgement(own={"edges": 1.5}), ["edges of the recording (2.00 -> 1.50)"]),
+        (_judgement(moved=5.0), ["tips of the recording (moved by 7.1 px without stronger edges)"]),
+    ],
+)
+def test_what_is_worse_is_named(judgement: Judgement, worse: list[str]):
+    assert judgement.worse() == worse
+
+
+@pytest.mark.parametrize("tips", [2.0, 10.9])
+def test_weights_are_offered_only_where_nothing_is_worse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tips: float
+):
+    monkeypatch.setattr("carts_core.lab.training.adaptation.judge", lambda *_, **__: _judgement({"tips": tips}))
+    small = "--steps 1 --batch-size 1 --workers 0 --threads 1 --validation-samples 1".split()
+    command = ["train", str(tmp_path / "run"), "--for", str(sample_sequence()), *small]
+    main(command)
+    said = " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "run" / "surface.safetensors").is_file() == (tips == 2.0)
+    assert (tmp_path / "run" / "refused.safetensors").is_file() == (tips == 10.9)
+    assert ("Use: carts optimize" in said) == (tips == 2.0)
+    assert ("not offered, since worse: tips of made images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
+
+
+def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
+    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
+    (first,), (again,) = (list(made_images(config, 1)) for _ in range(2))
+    assert first.frame.images["made"].shape == (240, 320, 3)
+    assert np.array_equal(first.frame.images["made"], again.frame.images["made"])
+    for arm in first.scene.arms:
+        assert first.frame.truth is not None
+        off = np.abs(first.frame.measured[arm.name] - first.frame.truth[arm.name])
+        assert off[0] == pytest.approx(np.deg2rad(2.0), abs=1e-3)
+
+
+def test_edges_are_stronger_where_the_outline_lies_on_them():
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[10:30, 20:40] = 200
+    parts = np.full((40, 60), -1)
+    parts[10:30, 20:40] = 0
+    assert edge_support(image, parts) > 2 * edge_support(image, np.roll(parts, 8, axis=1))
 
 
 def test_one_wrong_pixel_where_no_arm_is_hardly_changes_the_score():
