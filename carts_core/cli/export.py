@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..console import Bar, Terminal
+from ..console import Bar, Terminal, track
 from ..errors import SettingsError
 from ..settings import FormatName, Images, Parts
 from ..stopping import when_stopped
@@ -101,6 +101,6 @@ class Export:
         renderers = {camera: Renderer(corrected.scene, cameras=[camera]) for camera in cameras}
         frames = [
             project_frame(corrected, project, index, cameras, lambda pose, name: renderers[name].segment(pose)[0] >= 0)
-            for index in indices
+            for index in track(indices, "reading the project", console=console)
         ]
         return corrected, frames

@@ -1,5 +1,6 @@
 """Whether a network knows these arms and this kind of image, before anything is solved."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -52,8 +53,8 @@ class Familiarity:
             found.append(f"{where}: no arm is in view as measured. {place}")
         elif self.recognized < RECOGNIZED:
             found.append(
-                f"{where}: the network recognizes a rendering of these arms with an overlap of {self.recognized:.3f} "
-                f"only ({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
+                f"{where}: the network recognizes a rendering of these arms with an overlap of "
+                f"{math.floor(1000 * self.recognized) / 1000:.3f} only ({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(

@@ -44,6 +44,11 @@ def test_a_network_that_knows_nothing_is_told_of_with_remedies(shipped: Sequence
     assert found.warnings("left", background=True) == [robot]
 
 
+def test_an_overlap_just_below_what_is_usual_reads_as_less() -> None:
+    (said,) = Familiarity(0.9499, 0.0).warnings("left")
+    assert "an overlap of 0.949 only (0.95 or more is usual)" in said
+
+
 def test_no_arm_in_view_is_said_before_solving() -> None:
     (said,) = Familiarity(None, 0.0).warnings("left")
     assert "no arm is in view" in said and "T_camera_world" in said
