@@ -52,9 +52,11 @@ class Familiarity:
             place = "Check T_camera_world, T_world_base and the units of the joints."
             found.append(f"{where}: no arm is in view as measured. {place}")
         elif self.recognized < RECOGNIZED:
+            # Rounded down: what is below the usual overlap reads as less.
+            overlap = math.floor(1000 * self.recognized) / 1000
             found.append(
-                f"{where}: the network recognizes a rendering of these arms with an overlap of "
-                f"{math.floor(1000 * self.recognized) / 1000:.3f} only ({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
+                f"{where}: the network recognizes a rendering of these arms with an overlap of {overlap:.3f} only "
+                f"({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(
