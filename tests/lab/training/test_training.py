@@ -258,7 +258,8 @@ def test_settings_survive_json(tmp_path: Path):
 def test_a_surface_network_learns_and_reports(tmp_path: Path):
     result = train(small_config(network="surface", steps=30), tmp_path)
     assert result.weights.name == "surface.safetensors"
-    assert set(result.validation) == {"dice", "dice_given", "part_accuracy", "normal_error_deg"}
+    parts = {"dice_shaft", "dice_wrist", "dice_jaws", "tip_error"}
+    assert set(result.validation) == {"dice", "dice_given", "part_accuracy", "normal_error_deg", *parts}
     history = json.loads(json.dumps(load_checkpoint(tmp_path).history.losses))  # pyright: ignore
     assert history[-1]["loss"] < history[0]["loss"]
     assert read_weights(result.weights).network.kind == "surface"
