@@ -299,7 +299,9 @@ def screws(count: int, sections: int) -> trimesh.Trimesh:
     rng = np.random.default_rng(4)
     places = rng.uniform((-0.03, -0.02, -0.01), (0.03, 0.02, 0.01), (count, 3))
     pieces = [trimesh.creation.cylinder(0.0015, 0.004, sections=sections).apply_translation(at) for at in places]
-    return trimesh.util.concatenate(pieces)
+    joined = trimesh.util.concatenate(pieces)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 def test_meshes_with_far_too_many_triangles_are_simplified_further_and_that_is_said(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What people who tried the page stumbled over, in a real browser."""
 
+import re
 import threading
 from collections.abc import Callable
 
@@ -243,3 +244,12 @@ def test_a_note_covers_neither_the_names_of_the_pictures_nor_what_is_pressed(
         assert where is None or (where["y"] + where["height"] <= box["y"] or where["y"] >= box["y"] + box["height"]), (
             other.text_content()
         )
+
+
+def test_what_is_unusual_about_the_files_of_a_recording_is_under_sequence(
+    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+) -> None:
+    app = open_viewer(edit=lambda text: re.sub(r"K = \[\[[^,]*,", "K = [[20.0,", text))
+    page = open_tab(app).page
+    page.get_by_text("1 remark on the files").click()
+    expect(page.get_by_text("left: its calibration has focal lengths of 20 and")).to_be_visible()

@@ -19,6 +19,8 @@ from recordings import (
     write_images,
     write_video,
 )
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
@@ -232,3 +234,26 @@ def test_the_real_bag_says_itself_what_it_is(shared_dir):
     path = shared_dir / "data/dvrk_bag/pitch_exp_traj_01_test_cropped.bag"
     with pytest.raises(CartsError, match="no images were found"):
         find(path)
+
+
+def test_one_file_of_a_compressed_bag_asks_for_the_folder(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    text = store.types["std_msgs/msg/String"](data="hello")
+    with writer:
+        connection = writer.add_connection("/PSM1/tool_type", text.__msgtype__, typestore=store)
+        writer.write(connection, START, store.serialize_cdr(text, text.__msgtype__))
+    (file,) = (tmp_path / "bag").glob("*.db3*")
+    with pytest.raises(CartsError, match=r"one file of the ROS 2 bag .*Give the folder"):
+        find(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [("run.bag.active", "rosbag reindex"), ("run.mcap.zstd", "zstd -d"), ("run_0.db3.zstd", "Give the folder")],
+)
+def test_bags_that_need_another_program_first_say_which(tmp_path, name, remedy):
+    (tmp_path / name).write_bytes(b"\x28\xb5\x2f\xfd" + bytes(100))
+    with pytest.raises(CartsError, match=remedy):
+        find(tmp_path / name)
