@@ -3,7 +3,7 @@
 import json
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import remove_file, write_text
-from carts_core.files.reading import SETTINGS, VALUES, parse_json, read_text, typed
+from carts_core.files.reading import SETTINGS, VALUES, check_path, is_regular, parse_json, read_text, typed
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.place import data_dir
 from carts_core.settings.importing import ImportOptions
@@ -66,7 +66,10 @@ class Draft:
             plain = parse_json(text)
             if plain.pop("format") != _FORMAT:
                 raise ValueError("it is of another version")
-            return typed(plain, Draft)
+            draft = typed(plain, Draft)
+            for named in _texts([plain["source"], plain["options"]]):
+                check_path(named)
+            return draft
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
 
@@ -107,7 +110,13 @@ class DraftFile:
             SettingsError: it is damaged.
         """
         path = _path(self.key)
-        return Draft.from_json(read_text(path, VALUES)) if path.is_file() else Draft()
+        if not is_regular(path):
+            return Draft()
+        try:
+            text = read_text(path, VALUES)
+        except (OSError, ValueError) as error:
+            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and begin anew.") from error
+        return Draft.from_json(text)
 
     def write(self, draft: Draft) -> None:
         """Keep a draft; one without a source is not worth it."""
@@ -136,6 +145,14 @@ def delete_draft(key: str) -> None:
     """Forget a draft, if it is there."""
     if key in {draft.key for draft in drafts()}:
         remove_file(_path(key))
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in what JSON gave."""
+    if isinstance(value, str):
+        yield value
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _texts(part)
 
 
 def _plain(value: Any) -> Any:

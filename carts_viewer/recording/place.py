@@ -75,8 +75,13 @@ class RecordingPlace:
         """Bring the document up to date."""
         if self._draft.step is Step.HAND_EYE and self._enter_hand_eye():
             assert self._step is not None
-            self._step.show(self._draft, undoable=bool(self._undo))
-            return
+            try:
+                self._step.show(self._draft, undoable=bool(self._undo))
+                return
+            except (CartsError, LookupError, TypeError, ValueError) as error:
+                self._leave_hand_eye()
+                self._problem = f"The points or the calibration of this import do not fit the recording: {error}"
+                self._change(replace(self._draft, step=Step.CHECK, calibration=None))
         self._host.document.show(self._browsing() if self._browser is not None else self._checking())
 
     def choose(self, name: str, value: str) -> None:

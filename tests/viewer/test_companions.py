@@ -176,7 +176,8 @@ OPTIONS = {
     "base": {"PSM1": "base.json"},
     "axes": "opencv",
 }
-CALIBRATION = {"base_frames": {"PSM1": [[1.0, 0.0, 0.0, 0.0]] * 4}, "cameras": {}}
+POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 0.0, 0.0, 1.0]]
+CALIBRATION = {"arms": {"PSM1": POSE}, "cameras": {"left": POSE}, "intrinsics": {"left": [100.0, 100.0, 48.0, 36.0]}}
 
 
 class World:
@@ -255,7 +256,9 @@ class World:
         shown = self.site.document.content
         said = "list of recent recordings" in shown or str(sequence) in shown
         return (
-            "" if said or case.wrong in ("empty list", *MISSING) or case.place == (0, "sequence") else "nothing is said"
+            ""
+            if said or case.wrong in ("empty list", REMOVED, *MISSING) or case.place == (0, "sequence")
+            else "nothing is said"
         )
 
     def open_thumbnail(self, case: Case, place: Path) -> str:
@@ -272,6 +275,8 @@ class World:
         shutil.rmtree(data_dir() / "drafts", ignore_errors=True)
         draft = asdict(Draft(Step.CHECK, str(sequence.parent), "tiny")) | {"options": OPTIONS, "points": [POINT]}
         draft |= {"format": "carts-draft/1", "calibration": CALIBRATION}
+        if case.companion == "draft hand-eye":
+            draft |= {"step": Step.HAND_EYE, "options": {}}
         plant(data_dir() / "drafts" / "0123.json", draft, case)
         self.do(self.site.show_start)
         if "Not finished" not in self.site.document.content:
@@ -333,7 +338,7 @@ class World:
         if problem := self.serves():
             return problem
         shown = self.site.document.content
-        said = "cannot be read" in shown or "no batch that can be read" in shown
+        said = "cannot be read" in shown or 'class="problem"' in shown
         if name == "batch.json" and "Batch case" not in shown and not said:
             return "nothing is said"
         if name in ("job.json", "findings.json") and case.wrong in NEVER and not said:
@@ -365,6 +370,7 @@ def cases(world: World, group: str) -> list[Case]:
         "network": places({"network": ""}),
         "recent": places([recent]),
         "draft": places({**draft, "format": ""}),
+        "draft hand-eye": [way for way in places(draft) if way[:1] in (("points",), ("calibration",))],
     }
     if group == "beside":
         return [case for name in BESIDE for case in files(f"beside {name}")]
@@ -410,7 +416,7 @@ BESIDE = (
     "sequence_exports",
 )
 GROUPS = (
-    *("jobs", "network", "beside", "decision", "recent", "thumbnail", "draft"),
+    *("jobs", "network", "beside", "decision", "recent", "thumbnail", "draft", "draft hand-eye"),
     *(
         f"batch {name}"
         for name in ("batch.json", "job.json", "findings.json", "results.json", "kinematics.csv", "*.jpg")
