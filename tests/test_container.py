@@ -51,8 +51,15 @@ def test_everything_that_is_copied_exists_and_is_sent_to_docker() -> None:
 
 def test_what_is_installed_is_pinned_and_torch_is_the_build_without_cuda() -> None:
     installs = [line for line in arguments_of("RUN") if line.startswith("pip ")]
-    assert len(installs) == 2 and all("-c constraints.txt" in line for line in installs)
-    assert "https://download.pytorch.org/whl/cpu" in installs[0] and installs[0].endswith(" torch")
+    packages, torch, ours = installs
+    assert "--require-hashes -r requirements.lock" in packages and all("--no-deps" in line for line in installs)
+    assert "https://download.pytorch.org/whl/cpu" in torch and torch.endswith("-c constraints.txt torch")
+    assert ours.endswith("--no-build-isolation .")
+
+
+def test_the_image_it_builds_on_is_named_by_its_digest() -> None:
+    (image,) = arguments_of("FROM")
+    assert re.fullmatch(r"python:3\.\d+-slim@sha256:[0-9a-f]{64}", image)
 
 
 def follow(folder: Path, environment: dict[str, str], variables: Path) -> None:

@@ -149,7 +149,7 @@ class Project:
         """Save one gesture as one step of undo. It is on disk when this returns.
 
         Args:
-            name: for the history, say "Drag PSM1".
+            name: for the history, say "Drag PSM1"; shortened to `LONGEST_NAME` characters.
             edits: what changes; see `ProjectState.changed` for what is left out and added.
             figures: frame -> figures of the frame with these edits; kept even if nothing else differs.
 
@@ -355,6 +355,7 @@ def read_state(path: Path) -> ProjectState:
 
 def _step_name(name: str) -> str:
     text = " ".join(name.encode("utf-8", "replace").decode().split())
-    if not 1 <= len(text) <= LONGEST_NAME:
-        raise ProjectError(f"a step's name has {len(text)} characters, but must have 1 to {LONGEST_NAME}.")
-    return text
+    if not text:
+        raise ProjectError("a step's name is empty. Give one.")
+    # Names of arms, joints and frames, of which steps' names are made, may be long.
+    return text if len(text) <= LONGEST_NAME else f"{text[: LONGEST_NAME - 1]}…"

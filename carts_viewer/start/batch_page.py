@@ -142,7 +142,8 @@ def _row(entry: KnownJob) -> str:
     )
     error = f"<br><small>{escaped(entry.error)}</small>" if entry.error else ""
     open_it = button("review", "Open", entry.job.name) if entry.findings else ""
+    status = escaped(entry.status)
     return (
         f"<tr><td>{escaped(entry.job.name)}<br><small>{escaped(entry.job.recording)}</small></td>"
-        f'<td><span class="status {entry.status}">{entry.status}</span>{error}</td>{numbers}<td>{open_it}</td></tr>'
+        f'<td><span class="status {status}">{status}</span>{error}</td>{numbers}<td>{open_it}</td></tr>'
     )
