@@ -1,18 +1,19 @@
 # CaRTS for a CPU: `docker build -t carts .`, then see docs/howto/install.md.
-FROM python:3.12-slim
+FROM python:3.12-slim@sha256:78387bc3881b8273120a12ebe6c1ab22b018ccc2c9adf565ae1ac9b536e184ea
 ENV PYTHONUNBUFFERED=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /opt/carts
 
-# torch first and by itself: the CPU build, and a layer that a change of the code leaves alone.
-COPY constraints.txt ./
-RUN pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu -c constraints.txt torch
+# Packages by their hashes, then the CPU build of torch by its version, in layers that a change of the code leaves alone.
+COPY constraints.txt requirements.lock ./
+RUN pip install --no-cache-dir --no-deps --require-hashes -r requirements.lock
+RUN pip install --no-cache-dir --no-deps --index-url https://download.pytorch.org/whl/cpu -c constraints.txt torch
 
 COPY pyproject.toml README.md LICENSE ./
 COPY carts_core carts_core
 COPY carts_viewer carts_viewer
 COPY static static
 COPY sample_data sample_data
-RUN pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir --no-deps --no-build-isolation .
 
 # Nobody needs rights to view a recording. Projects and caches are kept in the volume.
 RUN useradd --create-home --uid 1000 carts && mkdir /data && chown carts /data

@@ -11,7 +11,7 @@ BIN := .venv/bin
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help view test lint docs format bench pictures wheel setup setup-dev clean
+.PHONY: help view test lint docs format bench pictures wheel lock setup setup-dev clean
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,6 +48,20 @@ pictures: setup-dev ## Take the pictures of the README, the tutorial and the exa
 
 wheel: setup-dev ## Build the sdist and the wheel into dist/
 	$(BIN)/python -m hatchling build -t sdist -t wheel
+
+lock: ## Pin all packages but PyTorch by their hashes, after a change of constraints.txt (needs a network)
+	$(PYTHON) -m venv .lock && .lock/bin/pip install -q uv
+	$(call locked,requirements.lock,)
+	$(call locked,requirements-dev.lock,--all-extras)
+	rm -rf .lock
+
+# For every system and Python; what is in the file already stays as it is where it can. The build backend is among it.
+# PyTorch, and what its build for CUDA brings, is left out: its hashes depend on the index, see .ci/setup.py.
+define locked
+	printf 'hatchling\neditables\n' | .lock/bin/uv pip compile -q --universal --python-version 3.11.5 --generate-hashes \
+	--no-annotate --no-header -c constraints.txt $(2) pyproject.toml - -o $(1)
+	awk '/^[^ ]/ { kept = !/^(torch=|triton=|nvidia-|cuda-)/ } kept' $(1) > $(1).new && mv $(1).new $(1)
+endef
 
 setup: ## Install into .venv, if that was not done yet
 	@$(PYTHON) .ci/setup.py

@@ -7,6 +7,7 @@ gets a sentence instead of a syntax error.
 
 TORCH_INDEX chooses where torch comes from: a package index URL, or `pypi`. Without it, a Linux machine with no NVIDIA
 driver takes the CPU build from PyTorch's own index, because the one on PyPI brings gigabytes of CUDA libraries.
+All other packages are those of requirements.lock (--dev: requirements-dev.lock), whose hashes pip checks.
 """
 
 import hashlib
@@ -24,6 +25,7 @@ VENV_PYTHON = VENV / "bin" / "python"
 OLDEST = (3, 11)
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 TORCH_INDEX = os.environ.get("TORCH_INDEX", "")
+LOCKS = {"": "requirements.lock", "dev": "requirements-dev.lock"}
 WARMUP = "carts_core.rendering.warmup"
 
 
@@ -78,7 +80,7 @@ def create_venv():
 def stamp(extras):
     """The file whose presence says that exactly this was installed, by this interpreter, from this folder."""
     digest = hashlib.sha256()
-    for name in ("pyproject.toml", "constraints.txt"):
+    for name in ("pyproject.toml", "constraints.txt", LOCKS[extras]):
         digest.update((ROOT / name).read_bytes())
     digest.update(str(output(VENV_PYTHON, "-VV")).encode())
     digest.update(str(ROOT).encode())
@@ -107,14 +109,18 @@ def torch_index():
 
 
 def install(extras):
-    pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "-c", "constraints.txt")
+    pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input")
+    # Everything but torch, by its hashes; the lists are complete, so no dependency is looked for.
+    run(*pip, "--no-deps", "--require-hashes", "-r", LOCKS[extras])
+    pinned = (*pip, "-c", "constraints.txt")
     index = torch_index()
     if index is not None or TORCH_INDEX:
         # Builds differ in what follows the + of their version only, so pip would be content with the one that is there.
         anew = ("--force-reinstall",) if TORCH_INDEX else ()
         say("torch comes from {}".format(index or "pip's default index"))
-        run(*pip, "--no-deps", *anew, *(("--index-url", index) if index else ()), "torch")
-    run(*pip, "-e", ".[{}]".format(extras) if extras else ".")
+        run(*pinned, "--no-deps", *anew, *(("--index-url", index) if index else ()), "torch")
+    run(*pinned, "torch")
+    run(*pip, "--no-deps", "--no-build-isolation", *(("-e", ".") if extras else (".",)))
     if (ROOT / (WARMUP.replace(".", "/") + ".py")).is_file():
         say("compiling the kernels, so that the first page does not wait for them")
         run(VENV_PYTHON, "-m", WARMUP)

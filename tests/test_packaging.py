@@ -152,17 +152,34 @@ main()
     assert "view" in _run(_python(environment), "-c", program, cwd=tmp_path)
 
 
+def _pins(name: str) -> dict[str, str]:
+    """Versions that a file pins, by the names of packages."""
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    named = (line.partition(";")[0].rstrip(" \\").split("==") for line in lines if re.match(r"[\w-]", line))
+    return {canonicalize_name(package): version.strip() for package, version in named}
+
+
 def test_every_direct_dependency_is_pinned_within_its_bounds() -> None:
-    pins = {}
-    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
-        if line and not line.startswith("#"):
-            name, version = line.split("==")
-            pins[canonicalize_name(name)] = version
+    pins = _pins("constraints.txt")
     extras = (requirement for extra in PROJECT["optional-dependencies"].values() for requirement in extra)
     for text in (*PROJECT["dependencies"], *extras):
         requirement = Requirement(text)
         if requirement.name != PROJECT["name"]:
             assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), text
+
+
+@pytest.mark.parametrize("extra", ["", "dev"])
+def test_what_is_installed_is_pinned_by_hashes_but_for_torch(extra: str) -> None:
+    """A list that is out of date fails here: run `make lock`."""
+    name = f"requirements-{extra}.lock" if extra else "requirements.lock"
+    groups = PROJECT["optional-dependencies"]
+    needed = [*PROJECT["dependencies"], *((text for group in groups.values() for text in group) if extra else ())]
+    names = {canonicalize_name(Requirement(text).name) for text in needed} - {PROJECT["name"], "torch"}
+    pins, locked = _pins("constraints.txt"), _pins(name)
+    assert {package: locked.get(package) for package in names} == {package: pins[package] for package in names}
+    assert "hatchling" in locked and "torch" not in locked
+    entries = re.split(r"\n(?=\S)", (ROOT / name).read_text(encoding="utf-8").strip())
+    assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries)
 
 
 def test_the_version_is_the_same_wherever_it_is_written() -> None:
