@@ -107,6 +107,8 @@ def size_problem(content: bytes) -> str | None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
     if size == _FAR_TOO_LARGE:
         return f"is far too large; at most {LARGEST_IMAGE // 10**6} million pixels are read"
+    if content.startswith(PNG) and content[24:25] == b"\x10" and 2 * size[0] * size[1] > LARGEST_IMAGE:
+        return f"is {size[0]} x {size[1]} pixels of 16 bits; at most {LARGEST_IMAGE // 2 // 10**6} million are read"
     return pixels_problem(*size)
 
 

@@ -19,6 +19,8 @@ from ...wording import shown
 _LONGEST_UNIT = 12
 """Longest word that is taken for a unit."""
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
+_LONGEST_NUMBER = 100
+"""Longer cells are texts; arrays of texts take the length of the longest for each [characters]."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
@@ -177,6 +179,8 @@ def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
 def _typed(cells: list[str], commas: bool = False) -> np.ndarray:
     if not cells:
         return np.empty(0)
+    if max(map(len, cells)) > _LONGEST_NUMBER:
+        return np.array(cells, object)
     for kind in (np.int64, np.float64):
         try:
             return np.array(cells, dtype=str).astype(kind)
