@@ -49,7 +49,7 @@ class Replay:
         if rate is not None:
             self._times = np.arange(count) / rate
         elif sequence.timestamps is None:
-            raise SettingsError(f"{sequence.name} has no times. Say how many frames a second with --rate.")
+            raise SettingsError(f"{sequence.name} has no times. Give its images per second (--rate).")
         else:
             self._times = sequence.timestamps - sequence.timestamps[0]
         last_gap = self._times[-1] - self._times[-2] if count > 1 else 1.0

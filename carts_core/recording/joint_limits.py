@@ -21,9 +21,11 @@ ANGLE_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
 """[rad] of one unit; "percent" is not among them, since it counts from the middle of the limits."""
 LENGTH_UNITS: Mapping[str, float] = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3}
 """[m] of one unit."""
+PERCENT = "percent"
+"""Unit of -100 to 100 of the range of a joint."""
 _BEYOND = 0.15
 """Share of the range of a joint by which positions may exceed its limits."""
-_FAR = 0.5
+FAR = 0.5
 """The same, beyond which a unit is wrong."""
 _FEW = 0.02
 """Share of rows that may be beyond, as spikes of an encoder."""
@@ -159,6 +161,6 @@ def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert
     """Whether converted columns are nowhere far beyond the limits; the sign does not count."""
     for joint, values in zip(joints, columns, strict=True):
         converted = convert(joint, values)
-        if not (joint.fits(converted, _FAR) or joint.fits(-converted, _FAR)):
+        if not (joint.fits(converted, FAR) or joint.fits(-converted, FAR)):
             return False
     return True

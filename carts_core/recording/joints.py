@@ -9,10 +9,11 @@ from jaxtyping import Float
 from ..errors import SequenceError
 from ..model.robot import Robot
 from ..wording import closest
+from .joint_limits import ANGLE_UNITS, FAR, LENGTH_UNITS, PERCENT, Joint
 from .table import Table
 from .toml_table import TomlTable
 
-_UNITS = {"revolute": {"rad": 1.0, "deg": float(np.pi / 180)}, "prismatic": {"m": 1.0, "mm": 1e-3}}
+_UNITS = {"revolute": (*ANGLE_UNITS, PERCENT), "prismatic": (*LENGTH_UNITS, PERCENT)}
 
 PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
 """Largest magnitude [rad], [m] of a joint position; more means that the unit was not given."""
@@ -29,6 +30,8 @@ class JointColumn:
     offset: float
     """[rad] or [m]"""
     unit: str
+    given: bool = False
+    """Whether the file says the unit, so that positions beyond the limits are meant."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,30 @@ class JointColumns:
                     f"({PLAUSIBLE[kind]:.3g} {symbol} is allowed). If the column is in {other}, say so: "
                     f'{column.joint} = {{ column = "{column.column}", unit = "{other}" }}.'
                 )
+            self._check_limits(table, column, index, values)
             positions[:, index] = values
         return positions
+
+    def _check_limits(self, table: Table, column: JointColumn, index: int, values: np.ndarray) -> None:
+        """See that positions whose unit is not given are not far beyond the limits of the robot.
+
+        Raises:
+            SequenceError: they are, and another unit would fit.
+        """
+        low, high = self.robot.joint_limits[index].tolist()
+        joint = Joint(column.joint, self.robot.joint_types[index] == "revolute", low, high)
+        if column.given or joint.fits(values, FAR):
+            return
+        units = ANGLE_UNITS if joint.revolute else LENGTH_UNITS
+        fitting = [unit for unit, factor in units.items() if factor != 1.0 and joint.fits(values * factor)]
+        if fitting:
+            key, name = ("angle_unit", "rad") if joint.revolute else ("length_unit", "m")
+            raise SequenceError(
+                f"{table.path}, column {column.column!r}: read as {joint.unit}, joint {joint.name!r} is from "
+                f"{values.min():.4g} to {values.max():.4g} {joint.unit}, and its limits are {low:.4g} to {high:.4g}. "
+                f'Say the unit in [[arms]]: {key} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
+                f'"{name}" if it is that.'
+            )
 
 
 def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
@@ -79,12 +104,13 @@ def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
     Raises:
         SequenceError: a joint is not in the robot, has no value, or a unit does not fit it.
     """
+    given = {"revolute": "angle_unit" in table, "prismatic": "length_unit" in table}
     units = {
-        "revolute": table.take_choice("angle_unit", tuple(_UNITS["revolute"]), "rad"),
-        "prismatic": table.take_choice("length_unit", tuple(_UNITS["prismatic"]), "m"),
+        "revolute": table.take_choice("angle_unit", _UNITS["revolute"], "rad"),
+        "prismatic": table.take_choice("length_unit", _UNITS["prismatic"], "m"),
     }
     mapping, defaults = table.take_table("joints"), table.take_table("defaults")
-    columns = tuple(_take_column(mapping, joint, robot, units) for joint in mapping.items())
+    columns = tuple(_take_column(mapping, joint, robot, units, given) for joint in mapping.items())
     values: dict[str, float] = {}
     for joint in defaults.items():
         _joint_type(defaults, joint, robot)
@@ -116,13 +142,29 @@ def _joint_type(table: TomlTable, joint: str, robot: Robot) -> str:
     return robot.joint_types[robot.joint_names.index(joint)]
 
 
-def _take_column(mapping: TomlTable, joint: str, robot: Robot, units: Mapping[str, str]) -> JointColumn:
+def _take_column(
+    mapping: TomlTable, joint: str, robot: Robot, units: Mapping[str, str], given: Mapping[str, bool]
+) -> JointColumn:
     kind = _joint_type(mapping, joint, robot)
     if isinstance(mapping.take(joint, (str, dict)), str):
-        return JointColumn(joint, mapping.take(joint, str), _UNITS[kind][units[kind]], 0.0, units[kind])
+        scale, offset = _conversion(joint, units[kind], robot)
+        return JointColumn(joint, mapping.take(joint, str), scale, offset, units[kind], given[kind])
     entry = TomlTable(mapping.take(joint, dict), mapping.file, f"{mapping.where}: {joint}")
-    unit = entry.take_choice("unit", tuple(_UNITS[kind]), units[kind])
-    scale = float(entry.take("scale", float, 1.0)) * _UNITS[kind][unit]
-    result = JointColumn(joint, entry.take("column", str), scale, float(entry.take("offset", float, 0.0)), unit)
+    said = given[kind] or any(key in entry for key in ("unit", "scale"))
+    unit = entry.take_choice("unit", _UNITS[kind], units[kind])
+    scale, offset = _conversion(joint, unit, robot)
+    scale, offset = scale * float(entry.take("scale", float, 1.0)), offset + float(entry.take("offset", float, 0.0))
+    result = JointColumn(joint, entry.take("column", str), scale, offset, unit, said)
     entry.finish()
     return result
+
+
+def _conversion(joint: str, unit: str, robot: Robot) -> tuple[float, float]:
+    """Scale and offset to [rad] or [m]; those of percent are between the limits of the joint."""
+    index = robot.joint_names.index(joint)
+    if unit != PERCENT:
+        return {**ANGLE_UNITS, **LENGTH_UNITS}[unit], 0.0
+    low, high = robot.joint_limits[index].tolist()
+    if not np.isfinite([low, high]).all():
+        raise SequenceError(f"joint {joint!r} of {robot.urdf} has no limits, so {PERCENT} of its range is not known.")
+    return (high - low) / 200, (high + low) / 2

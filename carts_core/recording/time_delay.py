@@ -34,6 +34,12 @@ _BLOCKS = 10
 """Parts of the recording, each of which the jackknife leaves out once."""
 _GRID = 0.02
 """[s] Distance of the delays that are tried first."""
+_WIDEST = 3.0
+"""[s] How far the search goes by itself where the best delay is at the end of what was tried."""
+_PLAIN = 0.6
+"""A delay that explains a smaller share is compared with those up to `_WIDEST`."""
+_EQUAL, _APART = 0.05, 0.15
+"""Share by which another delay may explain less, and time [s] by which it is apart, to be as good."""
 _KEPT = 1e-4
 """Share of the largest variance, below which a direction of motion is left out."""
 _POSTURES = 3
@@ -71,6 +77,10 @@ class TimeOffsetEstimate:
     """Share that the present one predicts; below 0 if it misleads [1]."""
     problem: str | None
     """Why it cannot be relied on, for people; None where it can."""
+    others: tuple[float, ...] = ()
+    """Other delays that explain as much [s]."""
+    at_end: bool = False
+    """Whether it is at the end of what was tried, so that a better one may be beyond."""
 
     @property
     def proposed(self) -> float | None:
@@ -107,7 +117,7 @@ def estimate_time_offset(
         sequence: rows of its tables are matched with frames by time.
         camera: whose images count; the first one by default.
         domain: of the images; the first one by default.
-        largest: how far from the present offset it is looked for [s].
+        largest: how far from the present offset it is looked for [s]; up to 3 s where the best one is at the end.
         progress: called with how many frames are read, and how many there are.
 
     Raises:
@@ -121,7 +131,12 @@ def estimate_time_offset(
     flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
     if np.sqrt((flows**2).mean()) < _STILL:
         return _unknown(present, "nothing moves in the images.")
-    return _Delays(sequence, sequence.timestamps, steps, flows).estimate(present, largest)
+    delays = _Delays(sequence, sequence.timestamps, steps, flows)
+    found = delays.estimate(present, largest)
+    if largest < _WIDEST and (found.at_end or found.explained < _PLAIN):
+        # A motion that nearly repeats itself has peaks beside the best one.
+        return delays.estimate(present, _WIDEST)
+    return found
 
 
 def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
@@ -197,13 +212,17 @@ class _Delays:
         seconds = self._refined(best, np.ones(_BLOCKS, bool))
         without = np.array([self._refined(seconds, np.arange(_BLOCKS) != left) for left in range(_BLOCKS)])
         deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(without - np.mean(without)).sum()))
+        others = _as_good(curve, best)
+        at_end = best - 1.5 * _GRID < min(curve) or best + 1.5 * _GRID > max(curve)
         return TimeOffsetEstimate(
             present,
             seconds,
             max(deviation, _LEAST_DEVIATION),
             curve[best],
             curve.get(present, 0.0),
-            _problem(curve[best], list(curve.values()), abs(best - present) > largest - 1.5 * _GRID, deviation),
+            _problem(curve[best], list(curve.values()), abs(best - present) > largest - 1.5 * _GRID, deviation, others),
+            others,
+            at_end,
         )
 
     def _refined(self, around: float, blocks: np.ndarray) -> float:
@@ -255,6 +274,19 @@ class _Delays:
         return np.concatenate(places, 1), np.concatenate(moved, 1)
 
 
+def _as_good(curve: dict[float, float], best: float) -> tuple[float, ...]:
+    """Other peaks of the explained share that are nearly as high, as those of a periodic motion."""
+    offsets = sorted(curve)
+    shares = [curve[offset] for offset in offsets]
+    peaks = [
+        offset
+        for index, offset in enumerate(offsets[1:-1], start=1)
+        if shares[index] >= max(shares[index - 1], shares[index + 1])
+    ]
+    enough = curve[best] - _EQUAL * abs(curve[best])
+    return tuple(offset for offset in peaks if abs(offset - best) > _APART and curve[offset] >= enough)
+
+
 def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns directions"]:
     """The directions in which rows differ, scaled so that they do by 1 in each."""
     _, sizes, directions = np.linalg.svd(values, full_matrices=False)
@@ -290,11 +322,16 @@ def _fitted(XX: np.ndarray, XY: np.ndarray) -> np.ndarray:
     return np.linalg.solve(XX + _RIDGE * np.trace(XX) / len(XX) * np.eye(len(XX)), XY)
 
 
-def _problem(explained: float, curve: list[float], at_end: bool, deviation: float) -> str | None:
+def _problem(
+    explained: float, curve: list[float], at_end: bool, deviation: float, others: tuple[float, ...]
+) -> str | None:
     if explained < _FEWEST_EXPLAINED or explained - float(np.median(curve)) < _FEWEST_GAIN:
         return "the motion of the arms does not explain what moves in the images. Check columns, signs and units."
     if at_end:
         return "the best one is at the end of what was tried. Give a larger range, or check the clocks."
+    if others:
+        listed = ", ".join(f"{offset:.2f} s" for offset in others[:3])
+        return f"other delays explain as much ({listed}), as in a periodic motion. Take a part in which it is not."
     if deviation > _MOST_DEVIATION:
         return f"parts of the recording contradict each other (± {deviation:.2f} s)."
     return None

@@ -15,6 +15,8 @@ LengthUnit = Literal["m", "dm", "cm", "mm"]
 Axes = Literal["opencv", "dvrk"]
 """Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
 
+NO_TABLE = Path("none")
+"""What `kinematics` calls images without a table."""
 SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 

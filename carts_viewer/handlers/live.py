@@ -148,7 +148,8 @@ class LiveHandler:
         extractor = self._optimizers.prepare()
         state, sequence, cameras = context.state, session.sequence, context.cameras
         folder = self._folder() if intent.record else None
-        stream = open_stream(address, sequence, cameras, state.domain, loops=_FOR_EVER if intent.repeat else 1)
+        loops = _FOR_EVER if intent.repeat else 1
+        stream = open_stream(address, sequence, cameras, state.domain, rate=intent.rate, loops=loops)
         try:
             replayed = address.kind is StreamKind.REPLAY
             known = Backgrounds.of(sequence, cameras, state.domain) if replayed else None

@@ -20,6 +20,8 @@ class StartLive(Live):
     """With a camera: port of 127.0.0.1 where joints come from."""
     repeat: bool = False
     """Whether a replay begins again when it ends."""
+    rate: float | None = None
+    """Frames per second of a replay; those of the recording's times if None."""
     record: bool = False
     """Whether what is seen is kept as a recording with its corrections."""
 

@@ -9,6 +9,7 @@ from carts_viewer.transport.tab_page import TabPage
 
 _REPLAY, _SOCKET, _CAMERA = "Replay", "Socket", "Camera"
 _PORT = 7000
+_RATE = 30.0
 
 
 class LivePanel:
@@ -27,6 +28,9 @@ class LivePanel:
                 "Port", _PORT, min=1024, max=65535, step=1, hint="Of 127.0.0.1, where messages are sent to"
             )
             self._repeat = gui.add_checkbox("Repeat", False, hint="Begin again when the recording ends")
+            self._rate = gui.add_number(
+                "Images per second", _RATE, min=0.1, max=1000, hint="Of this recording, whose images have no times"
+            )
             self._record = gui.add_checkbox(
                 "Record", False, hint="Keep images, joints and corrections in a new folder beside the project"
             )
@@ -43,7 +47,10 @@ class LivePanel:
             _SOCKET: (f"socket:{port}", None),
             _CAMERA: (f"camera:{int(self._device.value)}", port),
         }.get(self._source.value, ("replay", None))
-        return intents.StartLive(source, joints_port, bool(self._repeat.value), bool(self._record.value))
+        rate = float(self._rate.value) if self._rate.visible else None
+        return intents.StartLive(
+            source, joints_port, repeat=bool(self._repeat.value), record=bool(self._record.value), rate=rate
+        )
 
     def show(self, state: ViewState) -> None:
         """Bring the widgets up to date."""
@@ -51,7 +58,8 @@ class LivePanel:
         self._device.visible = self._source.value == _CAMERA
         self._port.visible = self._source.value != _REPLAY
         self._repeat.visible = self._source.value == _REPLAY
-        for widget in (self._source, self._device, self._port, self._repeat, self._record, self._start):
+        self._rate.visible = self._source.value == _REPLAY and state.frame.timestamp is None
+        for widget in (self._source, self._device, self._port, self._repeat, self._rate, self._record, self._start):
             widget.disabled = on
         self._start.visible, self._stop.visible = not on, on
         text = "" if state.live is None else f'<p class="carts-caption" role="status">{escaped(state.live.text)}</p>'

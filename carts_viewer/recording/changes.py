@@ -4,19 +4,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from carts_core.errors import SettingsError
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording.importing.found import recording_name
+from carts_core.settings.importing import NO_TABLE, AngleUnit, LengthUnit
 from carts_viewer.recording.draft import Draft, Step
 
 _CHOICES = {
-    "angle_unit": ("rad", "deg"),
-    "length_unit": ("m", "mm"),
+    "angle_unit": get_args(AngleUnit),
+    "length_unit": get_args(LengthUnit),
     "clock": ("s", "ms", "us", "ns"),
 }
-_NUMBERS = ("time_offset", "frame_rate")
+_NUMBERS = ("time_offset", "frame_rate", "tool_point")
 _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
 
@@ -47,6 +48,11 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     elif kind == "flip" and which in JOINT_NAMES:
         without = tuple(joint for joint in draft.options.flip if joint != which)
         options[kind] = (*without, which) if value == "1" else without
+    elif kind == "unit" and which in (*JOINT_NAMES, "jaw"):
+        rest = {joint: unit for joint, unit in draft.options.units.items() if joint != which}
+        options["units"] = {**rest, which: value} if value else rest
+    elif name == "no-table":
+        options |= {"kinematics": NO_TABLE, "columns": {}, "flip": (), "units": {}}
     elif kind == "column" and which in _MEANINGS:
         options["columns"] = _columns(draft, which, value, guessed)
     elif name == "remove-camera":
@@ -74,7 +80,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
         case "calibration":
             return _new_import(draft.with_options(calibration={**options.calibration, which: path}))
         case "kinematics":
-            return _new_import(draft.with_options(kinematics=path, columns={}, flip=()))
+            return _new_import(draft.with_options(kinematics=path, columns={}, flip=(), units={}))
         case "robot":
             return _new_import(draft.with_options(robot={**options.robot, which: str(path)}))
     return draft

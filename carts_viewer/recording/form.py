@@ -2,10 +2,13 @@
 
 import re
 from pathlib import Path
+from typing import get_args
 
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording import TimeOffsetEstimate
+from carts_core.recording.importing.columns import sample
 from carts_core.recording.importing.found import FoundArm, FoundCamera
+from carts_core.settings.importing import NO_TABLE, AngleUnit, LengthUnit
 from carts_viewer.recording.delay import delay_note
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.guess import FOLDER, Guess
@@ -111,9 +114,10 @@ def _change(part: str, label: str, guess: Guess) -> str:
 def _kinematics(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) -> str:
     arms = () if guess.recording is None else guess.recording.arms
     table = "" if guess.table is None else f"<code>{escaped(guess.table.path)}</code>, {len(guess.table)} rows"
+    change = _change("kinematics", "Other table …", guess) + _no_table(draft, guess)
     parts = [
         "<section><h2>Arms and joints</h2>",
-        f"<p class='quiet-text'>{table}</p><div class='bar'>{_change('kinematics', 'Other table …', guess)}</div>",
+        f"<p class='quiet-text'>{table}</p><div class='bar'>{change}</div>",
         _problem(guess, "kinematics"),
         *(_arm(draft, guess, arm) for arm in arms),
         _problem(guess, "columns"),
@@ -122,6 +126,13 @@ def _kinematics(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) ->
         "</section>",
     ]
     return "".join(parts)
+
+
+def _no_table(draft: Draft, guess: Guess) -> str:
+    """A button that leaves the kinematics out."""
+    if guess.kind != FOLDER or draft.options.kinematics == NO_TABLE:
+        return ""
+    return button("no-table", "No table", kind="quiet")
 
 
 def _arm(draft: Draft, guess: Guess, arm: FoundArm) -> str:
@@ -140,15 +151,19 @@ def _columns(draft: Draft, guess: Guess) -> str:
     if guess.table is None:
         return ""
     chosen = draft.options.columns
+    samples = {column: f"{column} ({sample(values[0])})" for column, values in guess.table.columns.items()}
     guessed: dict[str, str] = {}
     if guess.meanings is not None:
         guessed = next(iter(guess.meanings.arms.values()), {})
-    columns = {"": _AS_GUESSED, **{column: column for column in guess.table.columns}}
+    columns = {"": _AS_GUESSED, **samples}
     rows = []
     for joint in (*JOINT_NAMES, "jaw"):
         now = guessed.get(joint, "")
         options = {**columns, "": f"{now} (guessed)" if now and joint not in chosen else _NONE}
         flip = check_box(f"flip {joint}", joint in draft.options.flip, "other sign") if joint != "jaw" else ""
+        known = get_args(LengthUnit if joint == "insertion" else AngleUnit)
+        units = {"": "unit of the rest", **{unit: unit for unit in known}}
+        flip += choices(f"unit {joint}", units, draft.options.units.get(joint, ""))
         field = choices(f"column {joint}", options, chosen.get(joint, ""), label=joint.replace("_", " "))
         rows.append(f"<tr><td>{escaped(joint.replace('_', ' '))}</td><td>{field}</td><td>{flip}</td></tr>")
     for role, text in (("time", "time"), ("frame", "image")):
@@ -157,19 +172,22 @@ def _columns(draft: Draft, guess: Guess) -> str:
         field = choices(f"column {role}", options, chosen.get(role, ""), label=text)
         rows.append(f"<tr><td>{text}</td><td>{field}</td><td></td></tr>")
     wrong = "columns" in guess.problems
-    opened = " open" if wrong or chosen or draft.options.flip else ""
+    opened = " open" if wrong or chosen or draft.options.flip or draft.options.units else ""
     body = f"<table><tr><th>meaning</th><th>column</th><th></th></tr>{''.join(rows)}</table>{_units(draft)}"
     return f"<details{opened}><summary>Columns, units and signs</summary>{body}</details>"
 
 
 def _units(draft: Draft) -> str:
     options = draft.options
-    guessed = {"": _AS_GUESSED}
+    angles = {"": _AS_GUESSED, "rad": "rad", "deg": "degrees", "percent": "-100 to 100 of the range"}
+    lengths = {"": _AS_GUESSED, **{unit: unit for unit in get_args(LengthUnit)}}
     return (
         "<div class='bar'>Angles "
-        + choices("angle_unit", {**guessed, "rad": "rad", "deg": "degrees"}, options.angle_unit or "")
+        + choices("angle_unit", angles, options.angle_unit or "")
         + " lengths "
-        + choices("length_unit", {**guessed, "m": "m", "mm": "mm"}, options.length_unit or "")
+        + choices("length_unit", lengths, options.length_unit or "")
+        + " poses are beyond the tip by [m] "
+        + text_field("tool_point", "" if options.tool_point is None else f"{options.tool_point:g}", hint="as guessed")
         + "</div>"
     )
 
@@ -178,20 +196,23 @@ def _times(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) -> str:
     """The clock of the table, the time between its rows and the images, and a rate for images without times."""
     options = draft.options
     by_row = guess.recording is not None and guess.recording.frame_times is None
+    rate = "" if options.frame_rate is None else f"{options.frame_rate:g}"
+    rates = (
+        "<div class='bar'>Images per second, if they have no times "
+        + text_field("frame_rate", rate, hint="from the images")
+        + "</div>"
+    )
     if by_row and options.time_offset is None:
-        return "<p class='quiet-text'>Each row belongs to one image.</p>"
+        return f"<p class='quiet-text'>Each row belongs to one image.</p>{rates}"
     clocks = {"": _AS_GUESSED, "s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
     offset = "" if options.time_offset is None else f"{options.time_offset:g}"
-    rate = "" if options.frame_rate is None else f"{options.frame_rate:g}"
     return (
         "<div class='bar'>Clock of the table " + choices("clock", clocks, options.clock or "") + "</div>"
         "<div class='bar'>Time in the table minus time of the image [s] "
         + text_field("time_offset", offset, hint="as guessed")
         + "</div>"
         + (delay_note(delay) if guess.recording is not None and not by_row else "")
-        + "<div class='bar'>Images per second, if they have no times "
-        + text_field("frame_rate", rate, hint="from the images")
-        + "</div>"
+        + rates
     )
 
 

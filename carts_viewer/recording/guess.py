@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import numpy as np
 
 from carts_core.errors import CartsError
 from carts_core.recording.importing.columns import ColumnMeanings, guess_columns
-from carts_core.recording.importing.foreign_tables import ForeignTable, read_foreign_table
+from carts_core.recording.importing.foreign_tables import ForeignTable
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.recording.importing.importer import detect, find
 from carts_core.recording.importing.media import find_images
-from carts_core.settings.importing import ImportOptions
+from carts_core.recording.sources.folder import kinematics_table
+from carts_core.settings.importing import NO_TABLE, ImportOptions
 from carts_viewer.recording.draft import Draft
 
 FOLDER = "folder"
@@ -63,19 +65,26 @@ def guess(draft: Draft) -> Guess:
     try:
         recording = find(source, options)
     except CartsError as error:
-        recording = None
         if not problems:
             problems[_place_of(str(error), options)] = str(error)
-    path = _table_of(source, options, recording) if kind == FOLDER else None
-    if path is not None:
+        recording = _images_alone(source, options) if kind == FOLDER else None
+    if kind == FOLDER:
         try:
-            table = read_foreign_table(path)
-            meanings = guess_columns(table, options)
+            table = kinematics_table(source, options)
+            meanings = None if table is None else guess_columns(table, options)
         except CartsError as error:
             problems.setdefault("kinematics" if table is None else "columns", str(error))
     if table is not None and meanings is not None and not meanings.arms:
         problems["columns"] = "Six joints are not recognized among the columns. Choose a column for each."
     return Guess(kind, recording, problems, table, meanings)
+
+
+def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None:
+    """The cameras, to be seen while something is wrong with the kinematics."""
+    plain = ImportOptions(source=options.source, images=options.images, kinematics=NO_TABLE)
+    with suppress(CartsError):
+        return find(source, plain)
+    return None
 
 
 def _problems_of_parts(source: Path, options: ImportOptions) -> dict[str, str]:
@@ -106,22 +115,13 @@ def _place_of(message: str, options: ImportOptions) -> str:
         ("--images", "images"),
         ("camera_matrix", "calibration"),
         ("column", "columns"),
+        ("-unit", "columns"),
         ("--clock", "columns"),
+        ("--frame-rate", "columns"),
     ):
         if word in message:
             return place
     return "recording"
-
-
-def _table_of(source: Path, options: ImportOptions, recording: FoundRecording | None) -> Path | None:
-    """The table of the kinematics: as named, or as found, or the only one there."""
-    if options.kinematics is not None:
-        return source / options.kinematics
-    for note in () if recording is None else recording.notes:
-        if note.text.startswith("kinematics: "):
-            path = Path(note.text.removeprefix("kinematics: ").rpartition(", ")[0])
-            return path if path.is_file() else None
-    return None
 
 
 def joint_table(recording: FoundRecording) -> Mapping[str, np.ndarray]:

@@ -59,9 +59,30 @@ def test_kinematics_of_another_motion_give_no_delay(recording: Path, shipped_psm
     assert "is not known" in found.sentence()
 
 
-def test_a_delay_beyond_what_is_tried_is_not_proposed(recording: Path, shipped_psm: Robot) -> None:
-    write_log(recording.with_name("log.csv"), shipped_psm, SEED, SECONDS, 0.3)
-    assert estimate_time_offset(Sequence.open(recording), largest=0.1).proposed is None
+@pytest.mark.parametrize("late", [0.3, 71 / 30])
+def test_a_delay_beyond_what_is_tried_first_is_found_up_to_3_s(
+    recording: Path, shipped_psm: Robot, late: float
+) -> None:
+    write_log(recording.with_name("log.csv"), shipped_psm, SEED, SECONDS + 2.0, late)
+    found = estimate_time_offset(Sequence.open(recording), largest=0.1)
+    assert found.proposed is not None and abs(found.proposed - late) < 0.010
+
+
+def test_several_delays_that_explain_as_much_are_said(recording: Path) -> None:
+    """A motion that repeats itself every 0.4 s, in images and log."""
+    log = recording.with_name("log.csv")
+    header, *rows = log.read_text().splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    period = [rest for stamp, rest in cells if 0.0 <= float(stamp) < 0.4 - 1e-6]
+    log.write_text("\n".join([header, *(f"{stamp},{period[row % 40]}" for row, (stamp, _) in enumerate(cells))]) + "\n")
+    video = recording.with_name("times.csv")
+    video.write_text("frame,timestamp,number\n" + "".join(f"{n},{n / 30:.5f},{n % 12}\n" for n in range(200)))
+    text = recording.read_text().replace('[frames]\nvideo = "left.mp4"', '[frames]\ntable = "times.csv"')
+    recording.write_text(text.replace('images = "left.mp4"', 'images = "left.mp4"\nvideo_frame = "number"'))
+    found = estimate_time_offset(Sequence.open(recording))
+    assert found.proposed is None and len(found.others) >= 1
+    assert min(abs(found.others[0] - found.seconds - k * 0.4) for k in (-2, -1, 1, 2)) < 0.07
+    assert "other delays explain as much" in found.sentence()
 
 
 def test_an_arm_that_stands_still_gives_no_delay(recording: Path) -> None:

@@ -97,3 +97,24 @@ def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app:
 
 def _png(image: np.ndarray) -> ImageMessage:
     return ImageMessage(cv2.imencode(".png", image[..., ::-1])[1].tobytes(), "png")
+
+
+@pytest.mark.browser
+def test_a_replay_of_images_without_times_has_a_field_for_their_rate(
+    tmp_path: Path, open_tab: Callable[..., Tab]
+) -> None:
+    folder = tmp_path / "recording"
+    shutil.copytree(sample_sequence().parent, folder)
+    text = (folder / "sequence.toml").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith("timestamp")]
+    (folder / "sequence.toml").write_text("\n".join(lines) + "\n")
+    with ViewerApp.open(folder / "sequence.toml", port=0) as app:
+        app.wait_until_shown(SECONDS)
+        assert app.state.frame.timestamp is None
+        tab = open_tab(app)
+        tab.page.get_by_role("tab", name="Live").click()
+        expect(tab.page.get_by_label("Images per second")).to_have_value("30")
+        tab.page.get_by_label("Images per second").fill("10")
+        tab.button("Start")
+        eventually(lambda: tab.state.live, lambda live: live is not None and live.on, SECONDS)
+        tab.button("Stop")

@@ -300,11 +300,12 @@ def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
 def samples(table: ForeignTable, most: int = 30) -> str:
     """The columns of a table with a value of each, for errors."""
     columns = list(table.columns.items())
-    text = ", ".join(f"{name} ({_sample(values[0])})" for name, values in columns[:most])
+    text = ", ".join(f"{name} ({sample(values[0])})" for name, values in columns[:most])
     return f"{text} and {len(columns) - most} more" if len(columns) > most else text
 
 
-def _sample(value: object) -> str:
+def sample(value: object) -> str:
+    """A value of a column, for people."""
     return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
 
 

@@ -47,8 +47,10 @@ def in_si(
             raise SequenceError(f"{option} {joint} is no joint. Joints are: {', '.join(names)}.")
     angle, length = options.angle_unit or "rad", options.length_unit or "m"
     if columns:
-        angle = options.angle_unit or _angle_unit(values, joints, arm, columns, instrument)
-        length = options.length_unit or _length_unit(values, joints, arm, columns)
+        rest = [index for index, name in enumerate(names) if name not in options.units]
+        asked = values[:, rest], [joints[index] for index in rest], arm, [columns[index] for index in rest]
+        angle = options.angle_unit or _angle_unit(*asked, instrument)
+        length = options.length_unit or _length_unit(*asked)
         text = f"{arm}: angles are in {angle}, lengths in {length} (change: --angle-unit, --length-unit)."
         note(Note("guessed", text))
     result = values.copy()
@@ -126,12 +128,12 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
             return unit
     highest = max(float(np.nanmax(np.abs(values[:, index]))) for index in chosen)
     limit = max(abs(joints[index].upper) for index in chosen)
-    if any("order" in text or "way round" in text for misfit in misfits(joints, values) for text in misfit.remedies):
-        return "m"
-    return length_unit(highest, limit, arm, " ".join(joints[index].name for index in chosen))
+    remedies = dict.fromkeys(text for misfit in misfits(joints, values) for text in misfit.remedies)
+    orders = [text for text in remedies if "order" in text or "way round" in text]
+    return length_unit(highest, limit, arm, " ".join(joints[index].name for index in chosen), orders)
 
 
-def length_unit(highest: float, limit: float, arm: str, what: str) -> str:
+def length_unit(highest: float, limit: float, arm: str, what: str, orders: Sequence[str] = ()) -> str:
     """The unit in which a length is possible.
 
     Args:
@@ -139,6 +141,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str) -> str:
         limit: largest possible magnitude [m].
         arm: its name, for people.
         what: the length is of, for people.
+        orders: of the columns that would fit as well, for people.
 
     Raises:
         SequenceError: decimetres or centimetres would fit better than millimetres.
@@ -149,9 +152,10 @@ def length_unit(highest: float, limit: float, arm: str, what: str) -> str:
     if "mm" in fitting or not fitting:
         return "mm"
     listed = ", ".join(f"{unit} ({highest * LENGTH_UNITS[unit]:.3g} m)" for unit in (*fitting, "mm"))
+    also = f" Or name the columns (--columns), since {' or '.join(orders)} would fit." if orders else ""
     raise SequenceError(
         f"{arm}: the unit of {what} is not clear: it is up to {highest:.4g}, and at most {limit:.3g} m is possible. "
-        f"Give it: --length-unit {listed}."
+        f"Give it: --length-unit {listed}.{also}"
     )
 
 

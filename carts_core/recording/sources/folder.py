@@ -8,7 +8,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import ImportOptions
+from ...settings.importing import NO_TABLE, ImportOptions
 from ..importing.cameras import side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
@@ -26,8 +26,6 @@ _CALIBRATION_WORDS = re.compile(
     rb"camera_matrix|cameraMatrix|intrinsic|projection_parameters|[\"<]K[\">]|^K:|[\"<]?\bM1[\">:]|git-lfs",
     re.MULTILINE,
 )
-_NO_TABLE = Path("none")
-"""What `--kinematics` calls images without a table."""
 
 
 def _detect(path: Path) -> bool:
@@ -128,7 +126,7 @@ def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
     Raises:
         SequenceError: the table that was named is missing or damaged, or a chosen column is not there.
     """
-    if options.kinematics == _NO_TABLE:
+    if options.kinematics == NO_TABLE:
         return None
     if options.kinematics is not None:
         return read_foreign_table(options.kinematics if options.kinematics.is_file() else path / options.kinematics)
@@ -155,7 +153,7 @@ def _kinematics(path: Path, options: ImportOptions, notes: list[Note]) -> list[t
     Raises:
         SequenceError: a table was named or may have joints, but its columns are not recognized; or it is damaged.
     """
-    if options.kinematics == _NO_TABLE:
+    if options.kinematics == NO_TABLE:
         return []
     if options.kinematics is not None or options.columns:
         table = kinematics_table(path, options)

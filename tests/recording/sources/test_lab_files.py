@@ -486,6 +486,10 @@ JOINTS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     "decimetres, said": (joint_table(scaled(1.0, 10.0), length_unit="dm"), of_each_row()),
     "swapped columns": (
         joint_table(swapped),
+        "insertion is not clear.*Or name the columns .*columns of insertion and roll the other way round would fit",
+    ),
+    "swapped columns, said to be metres": (
+        joint_table(swapped, length_unit="m"),
         lambda found: says(found, "warning: PSM1: insertion is", "columns of insertion and roll the other way round"),
     ),
     "L19 names beside positions": (named_columns, of_each_row()),

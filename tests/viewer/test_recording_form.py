@@ -1,0 +1,62 @@
+"""The form of a new recording: what is asked has a control, and what is known stays in view."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_viewer.recording.changes import changed
+from carts_viewer.recording.draft import Draft
+from carts_viewer.recording.form import check_form
+from carts_viewer.recording.guess import Guess, guess
+
+FRAMES = 6
+JOINTS = np.array([0.1, 0.05, 0.12, 0.5, 0.1, -0.2])
+
+
+def recording(folder: Path, header: list[str], values: np.ndarray) -> Draft:
+    (folder / "left").mkdir(parents=True)
+    for number in range(FRAMES):
+        cv2.imwrite(str(folder / f"left/{number:03d}.png"), np.zeros((48, 64, 3), np.uint8))
+    np.savetxt(folder / "log.csv", np.tile(values, (FRAMES, 1)), delimiter=",", header=",".join(header), comments="")
+    return Draft(source=str(folder), name="rec")
+
+
+def after(draft: Draft, *choices: tuple[str, str]) -> tuple[Draft, Guess]:
+    for name, value in choices:
+        made = changed(draft, name, value, {})
+        assert made is not None
+        draft = made
+    return draft, guess(draft)
+
+
+def test_a_table_of_unknown_columns_is_shown_with_values_and_the_cameras_stay(tmp_path: Path) -> None:
+    draft = recording(tmp_path / "rec", [f"{letter} thing" for letter in "abcdef"], JOINTS)
+    found = guess(draft)
+    assert found.recording is not None and [camera.name for camera in found.recording.cameras] == ["left"]
+    assert "not recognized" in found.problems["columns"]
+    form = check_form(draft, found, {})
+    assert "c thing (0.12)" in form and "log.csv" in form and "64 × 48" in form
+    joints = [(f"column {joint}", f"{letter} thing") for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]
+    _, found = after(draft, *joints)
+    assert found.recording is not None and not found.problems
+    assert found.recording.arms[0].values is not None and found.recording.arms[0].values[0] == pytest.approx(JOINTS)
+    _, found = after(draft, ("no-table", ""))
+    assert found.recording is not None and not found.problems
+
+
+def test_a_question_about_units_and_rates_is_answered_in_the_form(tmp_path: Path) -> None:
+    decimetres = JOINTS * np.where(np.arange(6) == 2, 10, 1)
+    draft = recording(tmp_path / "rec", list(JOINT_NAMES), decimetres)
+    found = guess(draft)
+    assert "insertion is not clear" in found.problems["columns"]
+    assert 'value="dm"' in check_form(draft, found, {})
+    for choice in (("length_unit", "dm"), ("unit insertion", "dm")):
+        _, found = after(draft, choice)
+        assert found.recording is not None and not found.problems
+        assert found.recording.arms[0].values is not None
+        assert found.recording.arms[0].values[0] == pytest.approx(JOINTS)
+    _, found = after(draft, ("length_unit", "dm"), ("frame_rate", "10"))
+    assert found.recording is not None and found.recording.frame_times == pytest.approx(np.arange(FRAMES) / 10)
