@@ -29,7 +29,7 @@ class TimeOffset:
     domain: str | None = None
     """Of the images; by default the first one."""
     largest: float = 0.5
-    """How far from the present time_offset it is looked for [s]."""
+    """How far from the present time_offset it is looked for first [s]; up to 3 s where that explains little."""
 
     def run(self) -> None:
         """Say what the motion says, and write a file where that was asked for."""

@@ -666,3 +666,25 @@ def test_a_table_that_is_not_understood_is_shown_with_its_values_and_can_be_left
     assert find(tmp_path / "rec", ImportOptions(kinematics=Path("none"))).kind == "images without kinematics"
     chosen: dict[str, str] = dict(zip(JOINT_NAMES, columns, strict=True))
     assert np.abs(measured(find(tmp_path / "rec", ImportOptions(columns=chosen))) - joints_at(times)).max() < 1e-9
+
+
+def test_a_sequence_file_never_reads_shares_of_a_range_as_radians(tmp_path: Path) -> None:
+    """States of -8 to 8 out of -100 to 100, without and with their unit."""
+    frames(tmp_path / "images")
+    write_urdf(tmp_path / "so101.urdf", SO101)
+    values = {name: np.linspace(-8.0, 8.0, FRAMES) for name in SO101}
+    table(tmp_path / "log.csv", {"frame": [f"{n + 1:03d}" for n in range(FRAMES)], **values})
+    names = "".join(f'{name} = "{name}"\n' for name in SO101)
+    text = (
+        'format = "carts-sequence/1"\n[kinematics]\ntable = "log.csv"\n[[arms]]\nname = "arm"\nrobot = "so101.urdf"\n'
+        f'UNIT[arms.joints]\n{names}[[cameras]]\nname = "left"\nsize = [96, 72]\nimages = "images/{{frame}}.png"\n'
+        "K = { fx = 100.0, fy = 100.0, cx = 48.0, cy = 36.0 }\npixel_center = 0.5\n"
+    )
+    path = tmp_path / "sequence.toml"
+    path.write_text(text.replace("UNIT", ""))
+    with pytest.raises(
+        CartsError, match=r'read as rad, .* -8 to 8 rad, .* -1.92 to 1.92.*angle_unit = "deg" or "percent"'
+    ):
+        Sequence.open(path)
+    path.write_text(text.replace("UNIT", 'angle_unit = "percent"\n'))
+    assert np.abs(Sequence.open(path).measured["arm"][-1] - 0.08 * 1.92).max() < 1e-9
