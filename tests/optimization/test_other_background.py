@@ -10,6 +10,7 @@ import torch
 
 from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
+from carts_core.model.surface import COVERAGE
 from carts_core.optimization import FrameOptimizer, ImagePredictor, SurfaceSolver, Verdict
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -25,17 +26,19 @@ class SeesArmsAsideBeforeRooms(ImagePredictor):
 
     device, stride = torch.device("cpu"), 16
 
-    def __init__(self, mask: np.ndarray) -> None:
-        self.mask = torch.from_numpy(mask)
+    def __init__(self, parts: torch.Tensor) -> None:
+        self.parts = parts
+        """Coverage of every part [1, parts, height, width]."""
 
     def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
         """See the class."""
         found = torch.zeros_like(given)
         size = images.shape[-2:]
-        mask = torch.nn.functional.interpolate(self.mask.float()[None, None], size, mode="area")[0, 0]
+        parts = torch.nn.functional.interpolate(self.parts, size, mode="area")
+        mask = parts[0].sum(0)
         if float(images[..., mask > 0.9].mean()) < 0.2:
             before_nothing = float(images[:, 0, :8, :8].std()) < 0.02
-            found[:, 0] = mask if before_nothing else mask.roll(ASIDE * size[1] // SIZE["width"], 1)
+            found[:, COVERAGE] = parts if before_nothing else parts.roll(ASIDE * size[1] // SIZE["width"], -1)
         return window.of(found)
 
 
@@ -59,7 +62,7 @@ def test_what_overlaps_more_with_the_change_against_the_background_is_kept(
         scene,
         replace(frame, images={"left": image}),
         {"left": room},
-        SeesArmsAsideBeforeRooms(mask),
+        SeesArmsAsideBeforeRooms(renderer.surface_maps(scene.state(frame.truth))[:, COVERAGE]),
         settings=settings,
         live=False,
     )
