@@ -1,7 +1,8 @@
-"""What this process asks of the machine: how many threads, and what becomes of memory it has used."""
+"""Threads and memory of this process."""
 
 import ctypes
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,31 +16,33 @@ _MMAP_THRESHOLD = 1 << 30
 _TRIM_THRESHOLD = 1 << 28
 """Free memory at the end of the heap beyond which some is given back to the system [bytes]."""
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_ARENAS = 2
+"""Heaps of malloc. By default each thread gets one of up to 8 per core, and each of them keeps its own largest use."""
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 """Numbers of these parameters in glibc's malloc.h."""
 
 
 @dataclass
-class _Cores:
+class _Tuned:
     """Of this process."""
 
-    left_free: bool = False
+    core_left_free: bool = False
     """Whether torch leaves one to others."""
+    memory_kept: bool = False
+    """Whether malloc keeps memory of images."""
 
 
-_CORES = _Cores()
+_TUNED = _Tuned()
 
 
-def tune_process(*, keep_memory: bool) -> None:
-    """Set up a program, at its start; a library leaves both to its caller.
+def tune_process() -> None:
+    """Set up a program, at its start; a library leaves that to its caller.
 
-    Args:
-        keep_memory: keep freed memory for the next image, which is faster. A server that runs for days had rather give
-            it back: in an hour of use it held 1.09 GB instead of 1.00 GB, and took longer to stop growing.
+    Freed memory is kept for the next image, which is faster; a server returns it with `return_memory`.
     """
     _leave_a_core_free()
-    if keep_memory:
-        _keep_memory()
+    _keep_memory()
 
 
 def _leave_a_core_free() -> None:
@@ -50,7 +53,7 @@ def _leave_a_core_free() -> None:
     """
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MOST_THREADS)))
-        _CORES.left_free = True
+        _TUNED.core_left_free = True
 
 
 def inference_threads() -> int:
@@ -59,7 +62,7 @@ def inference_threads() -> int:
     Its threads hand out work in small pieces, so that one that has to wait for a core holds up no other: with another
     process on one or on both of two cores, two threads took .73 and .53 of the time of one.
     """
-    return min(os.cpu_count() or 1, MOST_THREADS) if _CORES.left_free else torch.get_num_threads()
+    return min(os.cpu_count() or 1, MOST_THREADS) if _TUNED.core_left_free else torch.get_num_threads()
 
 
 def _keep_memory() -> None:
@@ -69,10 +72,30 @@ def _keep_memory() -> None:
     640x480 px took 29 ms with that and 16 ms without, in one run beside other programs. `MALLOC_...` variables of the
     environment count for more.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    mallopt = _of_malloc("mallopt")
     if mallopt is None:
         return
-    if "MALLOC_MMAP_THRESHOLD_" not in os.environ:
-        mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD)
-    if "MALLOC_TRIM_THRESHOLD_" not in os.environ:
-        mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD)
+    for variable, parameter, value in (
+        ("MALLOC_MMAP_THRESHOLD_", _M_MMAP_THRESHOLD, _MMAP_THRESHOLD),
+        ("MALLOC_TRIM_THRESHOLD_", _M_TRIM_THRESHOLD, _TRIM_THRESHOLD),
+        ("MALLOC_ARENA_MAX", _M_ARENA_MAX, _ARENAS),
+    ):
+        if variable not in os.environ:
+            mallopt(parameter, value)
+    _TUNED.memory_kept = True
+
+
+def memory_kept() -> bool:
+    """Whether malloc keeps memory of images, so that a library needs no pool of its own that never shrinks."""
+    return _TUNED.memory_kept
+
+
+def return_memory() -> None:
+    """Return freed memory to the system, where glibc is the C library."""
+    trim = _of_malloc("malloc_trim")
+    if trim is not None:
+        trim(0)
+
+
+def _of_malloc(name: str) -> Callable[..., int] | None:
+    return getattr(ctypes.CDLL(None), name, None) if os.name == "posix" else None

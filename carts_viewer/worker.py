@@ -1,5 +1,6 @@
 """The one thread that computes: takes intents, changes the state, and shows what came out."""
 
+import gc
 import logging
 import threading
 import time
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from queue import SimpleQueue
 
 from carts_core.errors import CartsError
+from carts_core.process import return_memory
 from carts_viewer import intents
 from carts_viewer.intent_queue import Asked, IntentQueue
 from carts_viewer.tab import Tab
@@ -14,6 +16,8 @@ from carts_viewer.tabs import Tabs
 
 _log = logging.getLogger(__name__)
 
+MEMORY_KEPT = 30.0
+"""How long freed memory is kept for what comes next [s]."""
 _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
 """Intents that may begin what takes long."""
 
@@ -32,6 +36,8 @@ class Worker:
         self._startup: Callable[[], None] | None = None
         self._rest = threading.Condition()
         self._resting = False
+        self._worked_at: float | None = 0.0
+        """When something was done last [s, monotonic]; None where its memory is returned."""
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:
@@ -79,11 +85,14 @@ class Worker:
 
     def _round(self) -> None:
         wait_time = self._wait_time()
-        self._set_resting(wait_time is None and self._queue.empty() and self._calls.empty())
-        waits = [wait_time, *(tab.controller.overdue_in() for tab in self._tabs)]
+        at_rest = wait_time is None and self._queue.empty() and self._calls.empty()
+        self._set_resting(at_rest)
+        waits = [wait_time, self._memory_wait(at_rest), *(tab.controller.overdue_in() for tab in self._tabs)]
         known = [wait for wait in waits if wait is not None]
         waiting = self._queue.take(min(known, default=None) if self._calls.empty() else 0.0)
         self._set_resting(False)
+        if waiting:
+            self._worked_at = time.monotonic()
         while not self._calls.empty():
             self._attempt(self._calls.get_nowait(), *self._tabs)
         for asked in waiting:
@@ -96,6 +105,22 @@ class Worker:
             if tab.controller.state.busy is not None:
                 tab.controller.say(None)
         self._publish()
+
+    def _memory_wait(self, at_rest: bool) -> float | None:
+        """Return memory after some rest; gives how long to wait for that [s], None where it was done."""
+        now = time.monotonic()
+        if not at_rest:
+            self._worked_at = now
+        if self._worked_at is None:
+            return None
+        if now - self._worked_at < MEMORY_KEPT:
+            return self._worked_at + MEMORY_KEPT - now
+        self._worked_at = None
+        if not any(tab.view for tab in self._tabs):
+            # Widgets of a page that is gone refer to one another. Beside a page, this would hold up what moves there.
+            gc.collect()
+        return_memory()
+        return None
 
     def _handle(self, asked: Asked[Tab]) -> None:
         # One of a tab that is gone for good has nobody to do it for.

@@ -140,7 +140,7 @@ def take(work: Photographer) -> None:
 
 def main() -> None:
     """Write docs/images/*.jpg."""
-    tune_process(keep_memory=False)
+    tune_process()
     chromium = os.environ.get("CARTS_CHROMIUM") or shutil.which("chromium")
     IMAGES.mkdir(exist_ok=True)
     with (

@@ -47,5 +47,5 @@ def main(sequence: Path | None = None, picture: Path = Path("overlay.png")) -> N
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

@@ -50,5 +50,5 @@ def main(iterations: int = 20, picture: Path = Path("paper.png")) -> None:
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

@@ -64,5 +64,5 @@ def main(sequence: Path | None = None, picture: Path = Path("stereo.png")) -> No
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

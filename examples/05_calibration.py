@@ -62,5 +62,5 @@ def main(frames: int = 4, picture: Path = Path("calibration.png")) -> None:
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

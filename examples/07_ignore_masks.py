@@ -55,5 +55,5 @@ def main(picture: Path = Path("ignore.png")) -> None:
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

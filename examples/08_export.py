@@ -54,5 +54,5 @@ def main(frames: int = 2, output: Path = Path("exported"), picture: Path = Path(
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

@@ -45,5 +45,5 @@ def main(picture: Path = Path("masks.png")) -> None:
 
 
 if __name__ == "__main__":
-    tune_process(keep_memory=True)
+    tune_process()
     tyro.cli(main)

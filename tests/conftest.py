@@ -43,7 +43,7 @@ def _projects_of_the_shipped_sequence_beside_the_test(tmp_path: Path, monkeypatc
 
 @pytest.fixture(scope="session", autouse=True)
 def _tuned_as_the_command() -> None:
-    tune_process(keep_memory=False)
+    tune_process()
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ import pytest
 from carts_core.model.mesh_cache import cache_dir, read
 from carts_core.project.place import data_dir
 
-TUNED = "from carts_core.process import tune_process; tune_process(keep_memory=True)"
+TUNED = "from carts_core.process import tune_process; tune_process()"
 
 FAULTS = """
 import resource
@@ -43,6 +43,40 @@ def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
     anew = page_faults("", MALLOC_MMAP_THRESHOLD_="131072")
     assert anew > 500_000
     assert page_faults(TUNED) < 0.01 * anew
+
+
+KEPT = """
+import os, threading
+import numpy as np
+from carts_core.process import return_memory, tune_process
+tune_process()
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def work(done, end):
+    images = [np.ones(10_000) for _ in range(500)]
+    del images
+    done.release()
+    end.wait()
+start, done, end = resident(), threading.Semaphore(0), threading.Event()
+threads = [threading.Thread(target=work, args=(done, end)) for _ in range(8)]
+for thread in threads:
+    thread.start()
+    done.acquire()
+print(resident() - start)
+last = [np.ones(10_000) for _ in range(2000)][-1]
+return_memory()
+print(resident() - start)
+end.set()
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators have no such heaps")
+def test_threads_share_heaps_and_freed_memory_is_returned_on_request() -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    ran = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True, env=environment)
+    kept, returned = map(float, ran.stdout.split())
+    # Each of the eight has used 40 MB, one after the other.
+    assert kept < 160 and returned < 20
 
 
 @pytest.mark.parametrize(("given", "expected"), [({"OMP_NUM_THREADS": "2"}, 2), ({}, None)])

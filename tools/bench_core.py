@@ -18,7 +18,7 @@ from carts_core.wording import counted
 
 def main() -> None:
     """Print the table."""
-    tune_process(keep_memory=True)
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--runs", type=int, default=30)

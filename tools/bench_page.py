@@ -203,7 +203,7 @@ def _made(folder: Path, frames: int, cameras: int) -> Path:
 
 def main() -> None:
     """Print the figures, with the load of the machine before and after."""
-    tune_process(keep_memory=False)
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=3600 * RATE)
     parser.add_argument("--moves", type=int, default=200)

@@ -121,7 +121,7 @@ images = "{images}"
 
 def main() -> None:
     """Print the table."""
-    tune_process(keep_memory=True)
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--runs", type=int, default=5, help="how often each is opened")

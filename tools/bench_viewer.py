@@ -169,7 +169,7 @@ def _figures(latency: Latency) -> str:
 
 def main() -> None:
     """Print the figures."""
-    tune_process(keep_memory=False)
+    tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--weights", type=Path, nargs="*", default=())

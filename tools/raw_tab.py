@@ -99,6 +99,10 @@ class RawTab:
         """
         self.send(_update(element, value))
 
+    def acknowledge(self, drawn: str) -> None:
+        """Say from now on in the field of this id that overlays are drawn."""
+        self._drawn = drawn
+
     def press(self, command: str) -> None:
         """Trigger the command of a key; errors as `set`."""
         self.send({"type": "CommandTriggerMessage", "uuid": command})

@@ -1,210 +1,250 @@
-"""Uses the viewer for a long time from three tabs, and says whether memory stayed flat and every picture was fresh.
+"""Memory of the viewer under random actions of several tabs, minute by minute, and after all tabs have left.
 
-    python -m tools.soak [SEQUENCE] --minutes 60
+    python -m tools.soak [SEQUENCE] --minutes 10 --tabs 5 --rest 1 --only run settings
 
-In every round the optimizer runs while other tabs watch, frames are scrubbed, a joint is dragged, and one tab is
-reloaded; then everything comes to rest and is checked. Server and tabs share one process, so its memory is theirs too.
+Bisects by kind of action with `--only`. The server is a process of its own, so the tabs' memory does not count.
 """
 
 import argparse
-import logging
+import json
+import os
 import random
+import re
+import shutil
+import subprocess
+import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import cv2
-import numpy as np
+from websockets.exceptions import ConnectionClosed
 
-from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_viewer.app import ViewerApp
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.scene_view import OVERLAY
-from carts_viewer.tab import Tab, View
-from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
-LARGEST_GROWTH = 0.05
-"""Of memory after warm-up that is still flat, as a share."""
-_TABS = 3
-_STEP = 0.05
-"""Between two values of a slider that is dragged, as a browser sends them [s]."""
-_WARM_UP = 0.2
-"""Share of the rounds after which memory counts."""
+LARGEST_GROWTH, LARGEST_REST = 0.15, 0.2
+"""Growth after the second minute, and what stays after the last tab left beyond the start, that pass [1]."""
+_SETTLED = 15.0
+"""From the tabs' coming to the start of the measurement [s]."""
+_PACE = 0.2
+"""Longest time between two actions [s]."""
+
+KINDS = {
+    "frames": ("Frame", "Domain", "Play", "Next frame", "Previous worst", "Next worst", "Next unreviewed"),
+    "joints": ("Yaw [°]", "Insertion [mm]", "Jaw [°]", "Perturb all joints", "All back to measured", "Copy previous"),
+    "overlay": ("Layer", "Opacity %", "Compare with", "Swipe %"),
+    "run": ("Run", "Pause", "Step", "Reset", "Check the fit"),
+    "settings": (
+        "Solver",
+        "Fit to",
+        "Whose masks",
+        "Preset",
+        "Iterations",
+        "Working width [px]",
+        "Loss",
+    ),
+    "review": (
+        "Accept + next",
+        "Accept",
+        "Reject",
+        "Note",
+        "Undo",
+        "Redo",
+        "Go to",
+        "Keyframe",
+        "Dice below",
+    ),
+    "jobs": ("Solve between", "Solve all", "Take all", "Stop and keep", "Optimize each alone", "Calibrate", "Cancel"),
+    "export": ("Format", "Frames", "Category per", "With images", "Export", "Cancel export", "Export mask"),
+    "live": ("Start", "Stop"),
+    "paint": (),
+    "prompt": (),
+    "connect": (),
+}
+"""Kind of action -> labels of the widgets that it uses; those without are gestures on the picture, or a new tab."""
+_RANGES = {"Working width [px]": (64, 640), "Iterations": (1, 60)}
+"""Of number fields without limits of their own."""
 
 
 @dataclass
 class Soak:
-    """What was seen."""
+    """Resident memory of the server [MB]."""
 
-    minutes: float = 0.0
-    rounds: int = 0
-    frames: int = 0
-    """Scrubbed to."""
-    iterations: int = 0
-    reloads: int = 0
-    stale: list[str] = field(default_factory=list)
-    """Pictures at rest that were not those of the state, one line each."""
-    exceptions: list[str] = field(default_factory=list)
-    megabytes: list[tuple[float, float]] = field(default_factory=list)
-    """Minutes since the start, and resident memory at rest [MB], one pair for each round."""
+    start: float
+    """With all tabs open and at rest."""
+    minutes: list[float] = field(default_factory=list)
+    """At the end of each minute of actions."""
+    rest: float = 0.0
+    """Some time after the last tab left."""
+    actions: int = 0
 
     @property
     def growth(self) -> float:
-        """Of memory after warm-up: the last tenth of the time against the first tenth after warm-up, as a share."""
-
-        megabytes = [megabytes for _, megabytes in self.megabytes]
-        begin, some = int(_WARM_UP * len(megabytes)), max(len(megabytes) // 10, 1)
-        return float(np.median(megabytes[-some:]) / np.median(megabytes[begin : begin + some])) - 1.0
+        """Of the last minute over the second one [1]; 0 where there are fewer."""
+        return self.minutes[-1] / self.minutes[1] - 1.0 if len(self.minutes) > 2 else 0.0
 
     @property
-    def spread(self) -> float:
-        """Greatest difference of two memories after warm-up, as a share of the least."""
-        settled = [megabytes for _, megabytes in self.megabytes[int(_WARM_UP * len(self.megabytes)) :]]
-        return max(settled) / min(settled) - 1.0
+    def kept(self) -> float:
+        """What stays beyond the start [1]."""
+        return self.rest / self.start - 1.0
 
 
-class _Listener(logging.Handler):
-    """Collects every error that anything logs, asyncio's unhandled ones included."""
+class RandomTab:
+    """A tab that does things at random, whatever the page shows."""
 
-    def __init__(self, lines: list[str]) -> None:
-        super().__init__(logging.ERROR)
-        self._lines = lines
+    def __init__(self, url: str, key: str, dice: random.Random) -> None:
+        self._dice, self._count, self._key = dice, 0, key
+        self.tab = RawTab(url, keep=1, key=key).__enter__()
+        self.tab.acknowledge(self._id("drawn"))
 
-    def emit(self, record: logging.LogRecord) -> None:
-        self._lines.append(record.getMessage())
+    def act(self, kind: str, frames: int) -> None:
+        """Do something of this kind."""
+        if kind in ("paint", "prompt"):
+            self._paint(frames, prompt=kind == "prompt")
+            return
+        offered = [(i, widget) for i, widget in list(self.tab.widgets.items()) if widget.get("label") in KINDS[kind]]
+        element, widget = self._dice.choice(offered)
+        if "value" in widget:
+            self.tab.set(element, self._value(widget))
+            self._say("released", "")
+        else:
+            self.tab.press(element)
+
+    def close(self) -> None:
+        """Leave."""
+        with suppress(ConnectionClosed, TimeoutError, RuntimeError):
+            self.tab.__exit__()
+
+    def _id(self, label: str) -> str:
+        return next(i for i, widget in self.tab.widgets.items() if widget.get("label") == label)
+
+    def _say(self, label: str, text: str) -> None:
+        self._count += 1
+        self.tab.set(self._id(label), f"{self._key} {self._count} {text}")
+
+    def _value(self, widget: dict[str, Any]) -> object:
+        value, dice = widget["value"], self._dice
+        if "options" in widget:
+            return dice.choice(list(widget["options"]))
+        if isinstance(value, bool):
+            return True
+        if isinstance(value, str):
+            return dice.choice(["", "smoke", "occluded"])
+        low, high = _RANGES.get(widget["label"], (widget.get("min"), widget.get("max")))
+        return value if low is None or high is None else round(dice.uniform(low, high))
+
+    def _paint(self, frames: int, *, prompt: bool) -> None:
+        dice = self._dice
+        points = [[dice.uniform(0, 640), dice.uniform(0, 480)] for _ in range(1 if prompt else dice.randrange(3, 60))]
+        stroke = {
+            "number": self._count + 1,
+            "frame": dice.randrange(frames),
+            "camera": "left",
+            "target": dice.choice(["Mask", "Ignore region"]),
+            "erase": dice.random() < 0.3,
+            "polygon": not prompt and dice.random() < 0.3,
+            "diameter": dice.randrange(1, 80),
+            "points": points,
+            "prompt": prompt,
+        }
+        self._say("painted", json.dumps(stroke))
 
 
-class Soaking:
-    """Three tabs of a viewer, and what they do all the time."""
-
-    def __init__(self, app: ViewerApp, *, run: float = 6.0, seed: int = 0) -> None:
-        """
-        Args:
-            app: The viewer.
-            run: How long the optimizer runs in each round [s].
-            seed: Of what is done.
-        """
-        self._app = app
-        self._run_seconds = run
-        self._random = random.Random(seed)
-        self._tabs: list[RawTab] = []
-        self.seen = Soak()
-
-    def soak(self, minutes: float) -> Soak:
-        """Go on for so long; gives what was seen."""
-        listener, hook = _Listener(self.seen.exceptions), threading.excepthook
-        logging.getLogger().addHandler(listener)
-        threading.excepthook = lambda arguments: self.seen.exceptions.append(repr(arguments.exc_value))
-        start = time.monotonic()
+@contextmanager
+def served(sequence: Path, python: str) -> Iterator[tuple[str, int]]:
+    """Serve a copy of a sequence's folder with this interpreter; gives address and number of the process."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy"
+        shutil.copytree(sequence.parent, copy)
+        command = [python, "-m", "carts_core.cli", "view", str(copy / sequence.name), "--port", "0"]
+        server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
         try:
-            self._tabs = [self._open(f"soak {number}") for number in range(_TABS)]
-            while self.seen.minutes < minutes:
-                self._round()
-                self.seen.minutes = (time.monotonic() - start) / 60
-                self.seen.megabytes.append((self.seen.minutes, resident_megabytes()))
+            assert server.stdout is not None
+            found = (re.search(r"http://\S+", line) for line in server.stdout)
+            url = next(match.group() for match in found if match is not None)
+            threading.Thread(target=server.stdout.read, daemon=True).start()
+            yield url, server.pid
         finally:
-            for tab in self._tabs:
-                tab.__exit__()
-            logging.getLogger().removeHandler(listener)
-            threading.excepthook = hook
-        return self.seen
-
-    def _open(self, key: str) -> RawTab:
-        return RawTab(self._app.url, self._app.page.drawn_id, keep=1, key=key).__enter__()
-
-    def _place(self, tab: RawTab) -> Tab:
-        return next(place for place in self._app.tabs if place.key == tab.key)
-
-    def _view(self, tab: RawTab) -> View:
-        view = self._place(tab).view
-        assert view is not None
-        return view
-
-    def _set(self, tab: RawTab, label: str, value: object) -> None:
-        tab.set(self._app.page.element_id(self._view(tab).page.find(label)), value)
-
-    def _round(self) -> None:
-        dice = self._random
-        runner = dice.choice(self._tabs)
-        self._set(runner, "Run", True)
-        end = time.monotonic() + self._run_seconds
-        while time.monotonic() < end:
-            # Watching: a change of opacity needs a new picture, but does not end the run.
-            self._set(dice.choice(self._tabs), "Opacity %", dice.randrange(20, 100, 5))
-            time.sleep(0.5)
-        self.seen.iterations += max(len(self._place(runner).controller.state.run.curves.loss) - 1, 0)
-        count = len(self._app.sequence)
-        place = dice.randrange(count)
-        for _ in range(40):
-            place = (place + 1) % count
-            self._set(dice.choice(self._tabs), "Frame", place + 1)
-            self.seen.frames += 1
-            time.sleep(_STEP)
-        tab, arm = dice.choice(self._tabs), self._app.scene.arms[0]
-        slider = self._view(tab).layout.joints.slider(arm.name, dice.randrange(len(arm.robot.joint_names)))
-        value = slider.value
-        for step in range(20):
-            tab.set(self._app.page.element_id(slider), value + 0.1 * (step + 1))
-            time.sleep(_STEP)
-        # In the middle of a drag: its tab is closed, and a new one comes.
-        self._tabs.remove(tab)
-        tab.__exit__()
-        self._tabs.append(self._open(tab.key))
-        self.seen.reloads += 1
-        self._check()
-        self.seen.rounds += 1
-
-    def _check(self) -> None:
-        """Wait until everything is at rest; then every tab shows its state, and nothing has gone wrong."""
-        self._app.wait_until_shown(60.0)
-        end = time.monotonic() + 10.0
-        while time.monotonic() < end and any(_newest(tab) != self._view(tab).scene.sent(OVERLAY) for tab in self._tabs):
-            time.sleep(0.05)
-        for number, tab in enumerate(self._tabs):
-            state = self._place(tab).controller.state
-            if state.error is not None:
-                self.seen.exceptions.append(state.error)
-            # Drawn anew, by somebody who has never drawn anything.
-            right = OverlayRenderer(self._app.sequence).overlay(
-                state.pose.scene, state.frame, state.camera, state.layer, state.opacity, state.maps
-            )
-            png = cv2.imdecode(np.frombuffer(_newest(tab), np.uint8), cv2.IMREAD_UNCHANGED)
-            if png is None or not np.array_equal(cv2.cvtColor(png, cv2.COLOR_BGRA2RGBA), right):
-                self.seen.stale.append(f"round {self.seen.rounds}, tab {number}, frame {state.index}")
+            server.terminate()
+            server.wait(60)
 
 
-def _newest(tab: RawTab) -> bytes:
-    return tab.overlays[-1][1] if tab.overlays else b"none"
+def soak(
+    sequence: Path,
+    *,
+    minutes: float = 10.0,
+    tabs: int = 5,
+    rest: float = 1.0,
+    only: tuple[str, ...] = tuple(KINDS),
+    seed: int = 0,
+    python: str = sys.executable,
+) -> Soak:
+    """Use a viewer at random, then leave it alone.
+
+    Args:
+        sequence: Sequence file of 640x480 px with a camera `left`.
+        minutes: Duration of the actions.
+        tabs: Number of tabs.
+        rest: From the last tab's leaving to the last measurement [min].
+        only: Kinds of action, of `KINDS`.
+        seed: Of the actions.
+        python: Interpreter of the server; another one measures another checkout.
+    """
+    dice = random.Random(seed)
+    with served(sequence, python) as (url, process):
+        opened = [RandomTab(url, f"soak{number}", dice) for number in range(tabs)]
+        time.sleep(_SETTLED)
+        seen, began = Soak(_megabytes(process)), time.monotonic()
+        while (now := (time.monotonic() - began) / 60) < minutes:
+            if now >= len(seen.minutes) + 1:
+                seen.minutes.append(_megabytes(process))
+                print(f"{now:5.1f} min {seen.minutes[-1]:6.0f} MB, {seen.actions} actions", flush=True)
+            kind, number = dice.choice(only), dice.randrange(tabs)
+            try:
+                if kind == "connect" and dice.random() < 0.1:
+                    raise ConnectionAbortedError
+                if kind != "connect":
+                    opened[number].act(kind, 24)
+            except (ConnectionClosed, ConnectionAbortedError):
+                opened[number].close()
+                key = dice.choice([f"soak{number}", f"soak{number} {seen.actions}"])
+                opened[number] = RandomTab(url, key.replace(" ", "-"), dice)
+            seen.actions += 1
+            time.sleep(_PACE * dice.random())
+        seen.minutes.append(_megabytes(process))
+        for tab in opened:
+            tab.close()
+        time.sleep(60 * rest)
+        seen.rest = _megabytes(process)
+    return seen
+
+
+def _megabytes(process: int) -> float:
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def main() -> None:
-    """Print what was seen; ends with code 1 if that is not good."""
-    tune_process(keep_memory=False)
+    """Print what was seen; ends with code 1 if memory grew or was not returned."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
-    parser.add_argument("--minutes", type=float, default=60.0)
-    arguments = parser.parse_args()
-    logging.basicConfig(level=logging.WARNING)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        ViewerApp.open(arguments.sequence, project=Path(folder) / "soak.carts", port=0) as app,
-    ):
-        app.wait_until_shown(120)
-        seen = Soaking(app).soak(arguments.minutes)
-    print(
-        f"{seen.minutes:.1f} minutes, {seen.rounds} rounds: {seen.iterations} iterations, {seen.frames} frames "
-        f"scrubbed, {seen.reloads} tabs closed in mid-drag and opened anew"
-    )
-    for at, megabytes in seen.megabytes[:: max(len(seen.megabytes) // 12, 1)]:
-        print(f"  {at:5.1f} min {megabytes:6.0f} MB")
-    print(f"memory: {100 * seen.growth:+.1f} % after warm-up, spread {100 * seen.spread:.1f} %")
-    print(f"stale overlays: {len(seen.stale)}", *seen.stale, sep="\n  ")
-    print(f"exceptions: {len(seen.exceptions)}", *seen.exceptions, sep="\n  ")
-    if seen.stale or seen.exceptions or seen.growth > LARGEST_GROWTH:
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--tabs", type=int, default=5)
+    parser.add_argument("--rest", type=float, default=1.0, help="from the last tab's leaving to the last figure [min]")
+    parser.add_argument("--only", nargs="+", choices=list(KINDS), default=list(KINDS), help="kinds of action")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--python", default=sys.executable, help="interpreter of the server")
+    given = parser.parse_args()
+    options = {name: getattr(given, name) for name in ("minutes", "tabs", "rest", "seed", "python")}
+    seen = soak(given.sequence, only=tuple(given.only), **options)
+    print(f"start {seen.start:.0f} MB; growth after the second minute {seen.growth:+.0%}")
+    print(f"{given.rest:g} min after the last tab left: {seen.rest:.0f} MB, {seen.kept:+.0%} of the start")
+    if seen.growth > LARGEST_GROWTH or seen.kept > LARGEST_REST:
         raise SystemExit(1)
 
 

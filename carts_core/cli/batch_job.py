@@ -126,7 +126,7 @@ def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
 
 def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> int:
     """Take the steps that are not done; how many these were."""
-    tune_process(keep_memory=True)
+    tune_process()
     log_to_stderr()
     done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
     project = with_project(job) if work.project == "beside" else None

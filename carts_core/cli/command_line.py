@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
             from ..process import tune_process
 
         log_to_stderr()
-        tune_process(keep_memory=not isinstance(command, View))
+        tune_process()
         with stopped_by_signals():
             command.run()
     except CartsError as error:

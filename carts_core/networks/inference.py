@@ -27,7 +27,7 @@ from ..fingerprints import fingerprint
 from ..model.mesh_cache import cache_dir
 from ..model.surface import SURFACE_CHANNELS
 from ..onnx_runtime import onnxruntime
-from ..process import inference_threads
+from ..process import inference_threads, memory_kept
 from ..settings.optimization import Engine, Inference
 from .network import SurfaceNetwork
 
@@ -94,6 +94,8 @@ def _session(graph: bytes) -> onnxruntime.InferenceSession:
     options.intra_op_num_threads, options.inter_op_num_threads = inference_threads(), 1
     # Waiting threads that spin take the cores from whatever else runs, such as torch.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Its own pool has a block for every size of image and returns none.
+    options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])

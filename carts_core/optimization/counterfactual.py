@@ -50,6 +50,10 @@ _FITS, _SAMPLES = 4, 4
 """Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
 
 
+_KEPT = 4
+"""Sizes, treatments of haze and predictors for which the backgrounds of a domain are kept."""
+
+
 @dataclass(frozen=True)
 class Change:
     """What differs between images and the empty background."""
@@ -222,6 +226,11 @@ class Backgrounds:
             unknown = {name: ~mask for name, mask in self._known.items()}
             known = pixel_weights(scene, unknown, size).to(seen)
             self._found[key] = Background(stacked, known, seen * known)
+            while len(self._found) > _KEPT:
+                del self._found[next(iter(self._found))]
+        else:
+            # The one that was used least lately comes first.
+            self._found[key] = self._found.pop(key)
         return self._found[key]
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from ..errors import WeightsError
 from ..files.reading import WEIGHTS, read_bytes
 from ..onnx_runtime import onnxruntime
+from ..process import memory_kept
 from ..wording import shortened
 from .prompt import Prompt
 
@@ -182,6 +183,7 @@ def _session(path: Path) -> onnxruntime.InferenceSession:
             f"it as ONNX. {_REMEDY}"
         )
     options = onnxruntime.SessionOptions()
+    options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

@@ -309,6 +309,7 @@ class JobsHandler:
 
     def _end(self, job: Job, state: JobState, text: str) -> None:
         self._wait = 0.0
+        self._asked.pop(job.number, None)
         self._networks.look()
         if isinstance(job.options, AdaptOptions) and job.state is JobState.RUNNING:
             self._networks.trained(job.options.folder)

@@ -1,5 +1,6 @@
 """One server that goes from place to place: the start page, a new recording, and the viewer of a sequence."""
 
+import gc
 import logging
 import queue
 import threading
@@ -10,6 +11,7 @@ from pathlib import Path
 import viser
 
 from carts_core.errors import CartsError
+from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
 from carts_core.segmentation import Segmenter
 from carts_core.settings.optimization import Inference
@@ -218,6 +220,9 @@ class Site:
                 # What was under way is saved by now.
                 with suppress(CartsError):
                     remember(app)
+                del app
+                gc.collect()
+                return_memory()
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:

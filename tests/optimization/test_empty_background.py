@@ -1,5 +1,6 @@
 """What looks like an arm in the empty background is none; what has changed against it stays."""
 
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -138,6 +139,17 @@ def test_arms_that_never_leave_say_so_once_and_nothing_is_explained_away(tiny_se
     assert "camera 'left'" in problem and "hardly move" in problem and "`background` image" in problem
     assert Backgrounds.of(sequence, ["left"], "regular") is backgrounds
     assert set(Backgrounds.of(sequence, ["left"], "regular", required=True).images) == {"left"}
+
+
+def test_backgrounds_of_few_sizes_and_predictors_are_kept(scene: Scene) -> None:
+    backgrounds, predictors = Backgrounds({"left": _room()}), [DarkIsArm() for _ in range(20)]
+    made = [
+        weakref.ref(backgrounds.at(scene, (16 * width, 192), 0.0, predictor))
+        for width, predictor in enumerate(predictors, start=4)
+    ]
+    kept = [number for number, one in enumerate(made) if one() is not None]
+    assert 0 < len(kept) < 10 and kept[-1] == 19
+    assert backgrounds.at(scene, (16 * 23, 192), 0.0, predictors[-1]) is made[-1]()
 
 
 def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_dir: Path) -> None:

@@ -1,10 +1,12 @@
 """The running app over real sockets, without a browser."""
 
+import gc
 import math
 import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from places import place_of, widget
+from places import place_of, view_of, widget
 from viewer_canvas import decoded
 from waiting import get, wait_for
 from websockets.exceptions import InvalidStatus
@@ -23,7 +25,7 @@ from carts_core.errors import ProjectError, SequenceError, SettingsError
 from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
-from carts_viewer import editing, intents
+from carts_viewer import editing, intents, worker
 from carts_viewer.app import ViewerApp
 from carts_viewer.layers import Layer, mask
 from carts_viewer.overlay import OverlayRenderer
@@ -37,6 +39,21 @@ from tools.raw_tab import RawTab
 
 def _picture(png: bytes) -> np.ndarray:
     return cv2.cvtColor(decoded(png), cv2.COLOR_BGRA2RGBA)
+
+
+def test_nothing_is_left_of_the_page_of_a_tab_some_time_after_it_has_left(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "MEMORY_KEPT", 0.5)
+    app = open_viewer()
+    gc.disable()
+    try:
+        with RawTab(app.url) as tab:
+            page = weakref.ref(view_of(app, tab).page)
+            app.wait_until_shown()
+        wait_for(lambda: page() is None)
+    finally:
+        gc.enable()
 
 
 def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:

@@ -12,7 +12,7 @@ from carts_viewer import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.scene_view import FRAME, OVERLAY, SceneView
 from tools.bench_viewer import frame_latency, memory_while_optimizing, slider_latency
-from tools.soak import Soaking
+from tools.freshness import Soaking
 
 
 @pytest.mark.slow

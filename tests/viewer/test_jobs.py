@@ -1,6 +1,7 @@
 """Jobs: one after the other, with progress and a log, and what becomes of them when the viewer ends."""
 
 import json
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +65,13 @@ def test_a_job_that_waits_or_runs_can_be_cancelled_and_started_again(desk: Desk)
     assert desk.state.jobs == ()
     with pytest.raises(CartsError, match="no job 7"):
         desk.do(intents.CancelJob(7))
+
+
+def test_what_was_chosen_for_a_job_is_forgotten_with_the_job(desk: Desk) -> None:
+    desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"), intents.Calibrate(2))
+    frame = weakref.ref(desk.state.frame)
+    desk.do(intents.CancelJob(2), intents.CancelJob(1), intents.ShowFrame(1), intents.OptimizeFrames("all"))
+    assert frame() is None
 
 
 def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_accepted_frames(desk: Desk) -> None:
