@@ -29,6 +29,11 @@ mislead [1]."""
 UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
 
 
+def overlap_below_usual(overlap: float) -> str:
+    """Text on an overlap below `RECOGNIZED`, rounded down so that it reads as less."""
+    return f"an overlap of {math.floor(1000 * overlap) / 1000:.3f} only ({RECOGNIZED} or more is usual)"
+
+
 @dataclass(frozen=True)
 class Familiarity:
     """How well a network knows arms and images, from one frame."""
@@ -52,11 +57,9 @@ class Familiarity:
             place = "Check T_camera_world, T_world_base and the units of the joints."
             found.append(f"{where}: no arm is in view as measured. {place}")
         elif self.recognized < RECOGNIZED:
-            # Rounded down: what is below the usual overlap reads as less.
-            overlap = math.floor(1000 * self.recognized) / 1000
             found.append(
-                f"{where}: the network recognizes a rendering of these arms with an overlap of {overlap:.3f} only "
-                f"({RECOGNIZED} or more is usual), so it may not know this robot at this distance. {remedy}"
+                f"{where}: the network recognizes a rendering of these arms with "
+                f"{overlap_below_usual(self.recognized)}, so it may not know this robot at this distance. {remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(

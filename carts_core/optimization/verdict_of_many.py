@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.stats import t as student
 
 from .evidence import Evidence
-from .familiarity import RECOGNIZED, UNKNOWN_ROBOT_REMEDY, Familiarity
+from .familiarity import RECOGNIZED, UNKNOWN_ROBOT_REMEDY, Familiarity, overlap_below_usual
 from .verdict import Assessment, Verdict, assess
 
 _MANY, _MOST = 0.1, 0.5
@@ -94,8 +94,8 @@ def without_knowledge(found: Assessment, known: Sequence[Familiarity]) -> Assess
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
         return found
     reason = (
-        f"{found.reason.rstrip('.')}, and the network recognizes a rendering of these arms with an overlap of "
-        f"{np.median(recognized):.2f} only ({RECOGNIZED} or more is usual)."
+        f"{found.reason.rstrip('.')}, and the network recognizes a rendering of these arms with "
+        f"{overlap_below_usual(float(np.median(recognized)))}."
     )
     return replace(found, verdict=Verdict.FAILED, reason=reason, remedy=UNKNOWN_ROBOT_REMEDY)
 
