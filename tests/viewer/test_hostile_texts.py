@@ -32,7 +32,7 @@ from carts_core.recording import Sequence
 from carts_core.resources import shipped_robot
 from carts_viewer import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs import Job, JobState
+from carts_viewer.jobs import AdaptOptions, CalibrateOptions, Job, JobState, SolveOptions
 from carts_viewer.start.site import Site
 
 pytestmark = pytest.mark.browser
@@ -119,10 +119,11 @@ def write_companions(file: Path, texts: Texts) -> list[str]:
         verdict = FitVerdict("failed", texts("reason"), texts("remedy"), 0.9, cameras)
         project.record_verdict(0, verdict)
         project.log_export(texts("format"), file.parent / texts("export"), 1, {})
-    states = {"optimize": JobState.DONE, "calibrate": JobState.FAILED, texts("kind of a job"): JobState.CANCELLED}
+    kinds = {"solve": SolveOptions(), "calibrate": CalibrateOptions(2), "adapt": AdaptOptions(1, 1)}
+    states = (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
     jobs = [
-        asdict(Job(number, kind, texts("job"), {}, state, text=texts("job's text"), log=(texts("job's log"),)))
-        for number, (kind, state) in enumerate(states.items(), 1)
+        asdict(Job(number, kind, texts("job"), options, state, text=texts("job's text"), log=(texts("job's log"),)))
+        for number, ((kind, options), state) in enumerate(zip(kinds.items(), states, strict=True), 1)
     ]
     (file.parent / f"{file.stem}_jobs.json").write_text(json.dumps(jobs))
     (file.parent / f"{file.stem}_network.json").write_text(json.dumps({"network": texts("network")}))
@@ -253,7 +254,7 @@ def test_texts_of_a_recording_and_its_project_stay_texts_in_the_viewer(
             "label",
             "import",
         }
-        of_project = {"step", "note", "reason", "remedy", "job", "job's text", "job's log", "missing domain"}
+        of_project = {"step", "note", "reason", "remedy", "job's text", "job's log", "missing domain"}
         assert texts.reached > of_recording | of_project
 
 
