@@ -187,7 +187,7 @@ class World:
         self.folder, self._recording, self._batch = folder, recording, recording.parent.with_name("batch")
         self._count = 0
         folder.mkdir()
-        self.site = Site([folder], port=0, weights=(weights,))
+        self.site = Site([folder.parent], port=0, weights=(weights,))
         self.site.wait(120)
 
     def opened(self, case: Case) -> str:
