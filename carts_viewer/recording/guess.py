@@ -67,7 +67,8 @@ def guess(draft: Draft) -> Guess:
     except CartsError as error:
         if not problems:
             problems[_place_of(str(error), options)] = str(error)
-        recording = _images_alone(source, options) if kind == FOLDER else None
+        about_table = not any(place.startswith(("calibration", "images")) for place in problems)
+        recording = _images_alone(source, options) if kind == FOLDER and about_table else None
     if kind == FOLDER:
         try:
             table = kinematics_table(source, options)

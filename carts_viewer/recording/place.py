@@ -261,7 +261,7 @@ class RecordingPlace:
         if self._step is None:
             found = self._guessed()
             try:
-                if found.recording is None:
+                if found.recording is None or found.problems:
                     raise SettingsError(next(iter(found.problems.values()), "the recording cannot be read."))
                 self._host.document.show("<h1>Hand-eye</h1><p>Opening the images …</p>", "side")
                 self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
