@@ -1,7 +1,7 @@
 """`carts calibrate`: base frames and cameras from many frames at once."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +19,7 @@ from .solver_options import CalibrationOptions
 
 if TYPE_CHECKING:
     from ..optimization import CalibrationOptimizer, CalibrationResult
+    from ..optimization.hand_eye import HandEyePrior
     from ..recording import Sequence
 
 _SPREAD = "spread:"
@@ -46,6 +47,9 @@ class Calibrate:
     joint_prior_deg: float = 0.1
     """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
     all that is written."""
+    beyond_hand_eye: bool = False
+    """Write a calibration also where a base frame moves farther than `carts hand-eye`, which wrote the sequence file,
+    leaves open."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
     network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
@@ -55,6 +59,7 @@ class Calibrate:
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
         from ..files import MARKER, published, write_text
         from ..optimization import Backgrounds, CalibrationOptimizer
+        from ..optimization.hand_eye import read_prior
         from ..recording import Sequence
         from .hints import calibration_hint, print_hints
 
@@ -64,6 +69,8 @@ class Calibrate:
         indices = frame_indices(self.frames, self.positions, sequence)
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
+        prior = read_prior(sequence)
+        free = self.free if prior is None else _with_locked_cameras(self.free, cameras, prior)
         observer.check(sequence, indices, cameras, [self.domain])
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
@@ -77,13 +84,16 @@ class Calibrate:
                 frames,
                 observer.predictor,
                 settings=self.solving.chosen,
-                free=self.free,
+                free=free,
                 joint_prior_deg=self.joint_prior_deg,
                 ignore=[observer.ignore(index) for index in indices],
                 cameras=cameras,
                 backgrounds=backgrounds,
+                known_base_frames=prior and prior.base_covariances,
             )
             result = _optimized(optimizer, console)
+            if prior and not self.beyond_hand_eye:
+                _check_moves(sequence, result, prior)
             residuals = frame_residuals(sequence, frames, result)
             named = [sequence.frame_ids[index] for index in indices]
             write_calibration(folder, output.path, sequence, result, residuals)
@@ -128,6 +138,27 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
     from ..recording import spread
 
     return spread(len(sequence), int(count))
+
+
+def _with_locked_cameras(free: FreeParameters, cameras: list[str], prior: "HandEyePrior") -> FreeParameters:
+    """`free`, with the cameras locked whose pose was known before the hand-eye calibration."""
+    known = [camera for camera in cameras if camera not in prior.free_cameras]
+    return replace(free, locked_cameras=tuple(dict.fromkeys((*free.locked_cameras, *known))))
+
+
+def _check_moves(sequence: "Sequence", result: "CalibrationResult", prior: "HandEyePrior") -> None:
+    """See that no base frame has moved beyond its prior.
+
+    Raises:
+        SettingsError: one has.
+    """
+    from ..evaluation.calibration import beyond_prior
+
+    if (text := beyond_prior(sequence.scene, result, prior.base_covariances)) is not None:
+        raise SettingsError(
+            f"{text[0].upper()}{text[1:]} Nothing was written. Check the clicked points, the joints and the masks, or "
+            "write it all the same with --beyond-hand-eye."
+        )
 
 
 def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":

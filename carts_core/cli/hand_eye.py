@@ -44,6 +44,7 @@ class HandEye:
         """Solve and write; nothing is written after an error."""
         from ..files import MARKER, published, write_text
         from ..optimization.hand_eye import (
+            RESULT_FILE,
             HandEyeSettings,
             mounts_of_points,
             moved_cameras,
@@ -64,7 +65,8 @@ class HandEye:
         with published(output, overwrite=self.overwrite) as folder:
             text = calibrated_sequence_file(sequence.path, output.path, sequence.scene, result.scene, "hand-eye")
             write_text(folder / "sequence.toml", text)
-            write_text(folder / "hand_eye.json", json.dumps(result_json(sequence, points, result), indent=1))
+            content = result_json(sequence, points, result, self.free_cameras)
+            write_text(folder / RESULT_FILE, json.dumps(content, indent=1))
             write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
         _print(console, sequence, points, result)
         console.print(f"wrote {output}. Refine it over the recording: carts calibrate {output}/sequence.toml")

@@ -1,5 +1,6 @@
 """How well a calibration fits: per frame before and after, and as JSON."""
 
+from collections.abc import Mapping
 from collections.abc import Sequence as Frames
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -100,6 +101,25 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
         for thing, old, new in pairs
         if not np.array_equal(old, new)
     ]
+
+
+def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
+    """Which base frames have moved farther than hand-eye calibration leaves open; None if none has.
+
+    Args:
+        before: with the calibration as it was.
+        result: the new one.
+        known: arm -> covariance of its base frame, as of `HandEyeResult`.
+    """
+    said = []
+    for arm in result.beyond:
+        angle, way = pose_distance(before.arm(arm).T_world_base, result.scene.arm(arm).T_world_base)
+        turn, shift = (np.sqrt(np.trace(known[arm][part, part])) for part in (slice(3), slice(3, 6)))
+        said.append(
+            f"the base frame of {arm} moves by {angle:.1f} deg and {way:.1f} mm, where its hand-eye calibration is "
+            f"known to {np.degrees(turn):.1f} deg and {1e3 * shift:.1f} mm"
+        )
+    return f"{'; '.join(said)}." if said else None
 
 
 def remark(before: Scene, result: CalibrationResult) -> str | None:

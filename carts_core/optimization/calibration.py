@@ -21,11 +21,12 @@ from ..settings import (
     FreeParameters,
     SequenceSettings,
     SolverSettings,
+    SurfaceSolver,
     surface_solver,
 )
 from ..settings.stages import Descend
 from .calibrated_scene import calibrated_scene
-from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored
+from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .counterfactual import Backgrounds
 from .familiarity import familiarity
 from .fit import Fit, Point, StopReason
@@ -42,6 +43,12 @@ _HELD_INTRINSICS = 0.01
 """Expected error of focal lengths and principal points that are held, as a share of the focal length [1]. It widens
 deviations and moves nothing: they are consider parameters (Schmidt, Application of state-space methods to navigation
 problems, 1966)."""
+
+_TOO_FAR = 3.0
+"""Known deviations beyond which a base frame has moved too far [1]."""
+
+_CORRELATED = SequenceSettings.measurement_noise / SurfaceSolver.noise
+"""How many times larger a deviation is than that of independent pixels, as sequence mode takes it [1]."""
 
 _STANDS = 1e-3
 """Mounts whose transforms differ by less are at the same place [rad, m]."""
@@ -100,6 +107,8 @@ class CalibrationResult:
     stop_reason: StopReason
     assessment: Assessment | None
     """How far it can be relied on; None where the run was stopped before its end."""
+    beyond: tuple[str, ...] = ()
+    """Arms whose base frame has moved farther than what was known of it allows."""
 
 
 class CalibrationOptimizer:
@@ -258,21 +267,31 @@ class CalibrationOptimizer:
             frame_weights=evaluation.frame_weights.numpy().copy(),
             stop_reason=self.stop_reason or StopReason.CANCELLED,
             assessment=self.assessment,
+            beyond=tuple(arm for arm in self._known if self._moved_too_far(arm, offsets)),
+        )
+
+    def _moved_too_far(self, arm: str, offsets: torch.Tensor) -> bool:
+        """Whether a base frame has turned or shifted by more than several of its known deviations."""
+        rows = [index for index, name in enumerate(self.variables.names) if name.startswith(f"{arm}/base/")]
+        moved = offsets[rows].double().cpu().numpy()
+        known = with_joint_errors(self._known[arm], self.settings.length_scale)
+        return bool(rows) and any(
+            np.linalg.norm(moved[part]) > _TOO_FAR * np.sqrt(np.trace(known[part, part]))
+            for part in (slice(3), slice(3, 6))
         )
 
     def _changes(self, offsets: torch.Tensor, evaluation: CalibrationEvaluation) -> tuple[UnknownChange, ...]:
         """What became of each unknown, with deviations for all errors that are allowed for."""
         assert evaluation.hessian is not None and evaluation.outline is not None
         covariance = torch.linalg.inv(evaluation.hessian.double().cpu())
-        alone = covariance.diagonal().sqrt()
-        between = _between_frames(evaluation)
-        # Neighbouring pixels share their errors. With one frame nothing else says by how much.
-        share = SequenceSettings.measurement_noise / self.settings.noise
-        frames = share * alone if between is None else between
+        alone, between = covariance.diagonal().sqrt(), _between_frames(evaluation)
         shifts = [covariance @ evaluation.outline[:, None], covariance @ evaluation.gradient.double().cpu()[:, None]]
         if not self.free.intrinsics:
             shifts.append(_HELD_INTRINSICS * covariance @ self._problem.curvature_with_intrinsics(offsets))
-        total = (frames.square() + torch.cat(shifts, 1).square().sum(1)).sqrt()
+        shared = torch.cat(shifts, 1).square().sum(1)
+        # With one frame nothing but experience says how much neighbouring pixels share their errors.
+        frames = (_CORRELATED * alone if between is None else between).square()
+        total = _widened(frames, shared, len(self._frames))
         settings = self.settings
         prior = self.variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
         changes = []
@@ -287,9 +306,7 @@ def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, " 
     """Standard deviations from leaving out each frame in turn, by the quadratic model; None with one frame.
 
     The jackknife over clusters, here frames, whose pixels share their errors (CR3: MacKinnon, Nielsen and Webb, Fast
-    and reliable jackknife and bootstrap methods for cluster-robust inference, 2023), widened as Student's t with as
-    many degrees of freedom as frames but one is wider than a Gaussian (Bell and McCaffrey, Bias reduction in standard
-    errors for linear regression with multi-stage samples, 2002).
+    and reliable jackknife and bootstrap methods for cluster-robust inference, 2023).
     """
     gradients, curvatures = evaluation.frame_gradients, evaluation.frame_curvatures
     assert gradients is not None and curvatures is not None and evaluation.hessian is not None
@@ -297,8 +314,27 @@ def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, " 
     if count < 2:
         return None
     left = torch.linalg.solve(evaluation.hessian.double().cpu() - curvatures, gradients[..., None])[..., 0]
-    wider = float(student.ppf(gaussian.cdf(1.0), count - 1))
-    return wider * (left.square().sum(0) * (count - 1) / count).sqrt()
+    return (left.square().sum(0) * (count - 1) / count).sqrt()
+
+
+def _widened(
+    frames: Float[torch.Tensor, " n"], shared: Float[torch.Tensor, " n"], count: int
+) -> Float[torch.Tensor, " n"]:
+    """Standard deviations, as much wider as Student's t is wider than a Gaussian.
+
+    Args:
+        frames: variances from a number of frames, with one degree of freedom less than that.
+        shared: variances that are known, of errors that all frames share.
+        count: of frames.
+    """
+    variance = frames + shared
+    if count < 2:
+        return variance.sqrt()
+    # Welch's and Satterthwaite's degrees of freedom of a sum (An approximate distribution of estimates of variance
+    # components, 1946).
+    freedom = (count - 1) * (variance / frames.clamp(min=1e-30)).square()
+    wider = student.ppf(gaussian.cdf(1.0), freedom.clamp(max=1e9).numpy())
+    return variance.sqrt() * torch.from_numpy(wider)
 
 
 def _some_camera_moves(frames: Sequence[Frame]) -> bool:

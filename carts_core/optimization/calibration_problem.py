@@ -304,19 +304,25 @@ class CalibrationProblem:
         )
 
 
+def with_joint_errors(covariance: Float[np.ndarray, "6 6"], length_scale: float) -> Float[np.ndarray, "6 6"]:
+    """A base frame's covariance [rad, m] in radian-like units, widened for errors that joints have in all frames: they
+    look like an error of the base frame, and points do not tell them apart."""
+    scales = np.repeat([1.0, length_scale], 3)
+    return covariance / np.outer(scales, scales) + np.radians(SurfaceSolver.frame_prior_deg) ** 2 * np.eye(6)
+
+
 def _with_base_frames(
     variables: Variables, settings: SurfaceSolver, known: Mapping[str, Float[np.ndarray, "6 6"]] | None
 ) -> Prior:
     """The prior of the settings, with the covariances of base frames that are known."""
     prior = variables.prior(settings)
-    precision, scales = prior.precision.clone(), variables.scales
+    precision = prior.precision.clone()
     for arm, covariance in (known or {}).items():
         rows = [index for index, name in enumerate(variables.names) if name.startswith(f"{arm}/base/")]
         if rows:
             here = torch.tensor(rows, device=precision.device)
-            scale = scales[here]
-            inverse = torch.from_numpy(np.linalg.inv(covariance)).to(precision)
-            precision[here[:, None], here] = scale[:, None] * inverse * scale
+            inverse = np.linalg.inv(with_joint_errors(covariance, settings.length_scale))
+            precision[here[:, None], here] = torch.from_numpy(inverse).to(precision)
     return replace(prior, precision=precision)
 
 

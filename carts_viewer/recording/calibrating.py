@@ -2,15 +2,18 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from carts_core.errors import CartsError
+from carts_core.evaluation.calibration import beyond_prior
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
+from carts_core.optimization.hand_eye import HandEyePrior
 from carts_core.recording import Sequence, spread
+from carts_core.settings import CALIBRATION
 from carts_core.settings.optimization import Inference
 
 FRAMES = 20
@@ -46,6 +49,7 @@ class CalibrationJob:
         sequence: Sequence,
         scene: Scene,
         *,
+        known: HandEyePrior,
         weights: tuple[Path, ...],
         device: str,
         inference: Inference,
@@ -56,12 +60,13 @@ class CalibrationJob:
         Args:
             sequence: the recording.
             scene: its arms and cameras, with the calibration to begin with.
+            known: what that calibration leaves open.
             weights: weights files.
             device: where the networks run.
             inference: who runs the surface network.
             report: called on the job's thread with every progress, the last one `ended`.
         """
-        self._sequence, self._scene = sequence, scene
+        self._sequence, self._scene, self._known = sequence, scene, known
         self._weights, self._device = weights, device
         self._inference: Inference = inference
         self._report = report
@@ -105,7 +110,10 @@ class CalibrationJob:
             if self.cancelled:
                 return STOPPED
             frames.append(self._sequence.frame(index))
-        optimizer = CalibrationOptimizer(self._scene, frames, extractor)
+        covariances = self._known.base_covariances
+        held = [camera.name for camera in self._scene.cameras if camera.name not in self._known.free_cameras]
+        free = replace(CALIBRATION, locked_cameras=tuple(held))
+        optimizer = CalibrationOptimizer(self._scene, frames, extractor, free=free, known_base_frames=covariances)
         last: CalibrationIterate | None = None
         for iterate in optimizer:
             if self.cancelled:
@@ -116,6 +124,9 @@ class CalibrationJob:
         if last is None:
             return Progress("", 0.0, error="The calibration made no step.", ended=True)
         result = optimizer.result()
+        if (text := beyond_prior(self._scene, result, covariances)) is not None:
+            why = f"Not taken: {text} Check points and joints, or save and run carts calibrate --beyond-hand-eye."
+            return Progress("", 0.0, error=why, ended=True)
         return Progress("Calibrated", 1.0, result.scene, result, ended=True)
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
-from carts_core.optimization.hand_eye import ImagePoint
+from carts_core.optimization.hand_eye import HandEyePrior, ImagePoint
 from carts_core.recording.importing.found import FoundRecording
 from carts_viewer.recording import plots
 from carts_viewer.recording.calibrating import FRAMES, STOPPED, CalibrationJob, Progress, as_plain
-from carts_viewer.recording.clicking import Clicking, Wish
+from carts_viewer.recording.clicking import Clicking, Wish, unknown_cameras
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.panel import hand_eye_panel
 from carts_viewer.recording.picture import FramePicture
@@ -204,6 +204,7 @@ class HandEyeStep:
         self._job = CalibrationJob(
             self._sequence,
             self._clicking.result.scene,
+            known=HandEyePrior(self._clicking.result.base_covariances, unknown_cameras(self._sequence.scene)),
             weights=self._host.weights,
             device=self._host.device,
             inference=self._host.inference,

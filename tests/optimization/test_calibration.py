@@ -16,6 +16,7 @@ from carts_core.model.scene import Scene
 from carts_core.optimization import (
     CALIBRATION,
     CALIBRATION_SETTINGS,
+    Backgrounds,
     CalibrationOptimizer,
     DescentSolver,
     FreeParameters,
@@ -23,7 +24,7 @@ from carts_core.optimization import (
     StopReason,
     Verdict,
 )
-from carts_core.optimization.calibration import with_fixed_gauge
+from carts_core.optimization.calibration import UnknownChange, with_fixed_gauge
 from carts_core.optimization.calibration_problem import frame_weights
 from carts_core.optimization.elimination import eliminate
 from carts_core.recording import Frame, Sequence
@@ -144,6 +145,51 @@ def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start
     assert result.assessment is not None and result.assessment.verdict is Verdict.FAILED and result.assessment.remedy
     assert result.stop_reason is StopReason.FAILED
     assert np.array_equal(result.scene.arms[0].T_world_base, wrong.arms[0].T_world_base)
+
+
+def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+) -> None:
+    free = FreeParameters(joints=False, base_frames=True)
+
+    def found(count: int) -> tuple[UnknownChange, ...]:
+        optimizer = CalibrationOptimizer(
+            with_wrong_base(sequence.scene), frames[:count], predictor, settings=SETTINGS, free=free, cameras=["left"]
+        )
+        list(optimizer)
+        return optimizer.result().unknowns
+
+    for unknown in found(1):
+        assert unknown.deviation_between_frames is None
+        assert unknown.standard_deviation > 1.5 * unknown.deviation
+    for unknown in found(2):
+        between = unknown.deviation_between_frames
+        assert between is not None and unknown.standard_deviation > max(between, unknown.deviation)
+
+
+def test_what_differs_from_the_empty_background_counts_in_a_calibration(
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+) -> None:
+    renderer = Renderer(sequence.scene, cameras=["left"])
+    bright = []
+    for frame in frames:
+        arm = renderer.segment(sequence.scene.state(frame.measured))[0] >= 0
+        bright.append(replace(frame, images={"left": np.where(arm[..., None], 255, frame.images["left"]).astype("u1")}))
+    backgrounds = Backgrounds({"left": np.zeros((SIZE[1], SIZE[0], 3), np.uint8)})
+    free = FreeParameters(joints=False, base_frames=True)
+    optimizer = CalibrationOptimizer(
+        with_wrong_base(sequence.scene),
+        bright,
+        predictor,
+        settings=SETTINGS,
+        free=free,
+        cameras=["left"],
+        backgrounds=backgrounds,
+    )
+    list(optimizer)
+    assert optimizer.assessment is not None and optimizer.assessment.verdict is Verdict.GOOD
+    overlap = optimizer.assessment.evidence.overlap_with_change
+    assert overlap is not None and overlap > 0.9
 
 
 def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(

@@ -223,6 +223,15 @@ def test_the_command_reads_a_table_and_writes_a_sequence_file(
     assert not (tmp_path / "other").exists()
 
 
+def test_edges_that_were_all_clicked_on_one_side_are_tried_on_both_sides_of_the_shaft(shipped_psm: Robot) -> None:
+    tiny = tiny_scene(shipped_psm, 8, ("left",), 310, 244)
+    measured = {"PSM1": tiny.truth}
+    names = ("tip", "shaft edge", "shaft edge")
+    points = clicked(tiny.scene, measured, (0, 2, 5, 7), ["left"], noise=2.0, names=names, side=1.0)
+    result = solve_hand_eye(unknown(tiny.scene), measured, points)
+    assert result.distances.max() < 20.0
+
+
 def test_a_further_camera_is_found_from_four_points_that_nearly_lie_in_a_plane(shipped_psm: Robot) -> None:
     """The tip and the shaft's end in two frames of a small motion: perspective-n-point alone finds no pose there."""
     tiny = tiny_scene(shipped_psm, 8, ("left", "right"), 320, 240)
@@ -237,3 +246,36 @@ def test_a_further_camera_is_found_from_four_points_that_nearly_lie_in_a_plane(s
         place = link_transforms(tiny.scene.arms[0], measured["PSM1"])[:, 2, :3, 3]
         _, sideways, depth = offset(result.scene, tiny.scene, "PSM1", "right", place)
         assert sideways < 4.0 * said.sideways_mm < 3.0 and depth < 4.0 * said.depth_mm and result.error < 1.5
+
+
+def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_sequence(frames=2, cameras=("left", "right"), width=160, height=120)
+    sequence = Sequence.open(path)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.radians([0.0, 9.0, 0.0])).as_matrix()
+    arm = sequence.scene.arms[0]
+    wrong = replace(sequence.scene, arms=(replace(arm, T_world_base=arm.T_world_base @ turn),))
+    for name, scene in (("right", sequence.scene), ("wrong", wrong)):
+        points = clicked(scene, sequence.measured, range(2), ["left", "right"], noise=0.5)
+        rows = [
+            f"{sequence.frame_ids[point.frame]},{point.camera},PSM1,{point.landmark},{point.pixel[0]},{point.pixel[1]}"
+            for point in points
+        ]
+        (tmp_path / f"{name}.csv").write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
+        found = tmp_path / name
+        main(["hand-eye", str(path), "--points", str(tmp_path / f"{name}.csv"), "--output", str(found)])
+    refine = ["--observe", "masks", "--frames", "all"]
+    main(["calibrate", str(tmp_path / "right/sequence.toml"), *refine, "--output", str(tmp_path / "refined")])
+    refined = Sequence.open(tmp_path / "refined/sequence.toml").scene
+    for before, after in zip(sequence.scene.cameras, refined.cameras, strict=True):
+        assert np.allclose(before.T_camera_world, after.T_camera_world, atol=1e-9)
+    assert not np.array_equal(refined.arms[0].T_world_base, arm.T_world_base)
+    again = ["calibrate", str(tmp_path / "wrong/sequence.toml"), *refine, "--output", str(tmp_path / "moved")]
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main(again)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "he base frame of PSM1 moves by" in said and "its hand-eye calibration is known to" in said
+    assert "--beyond-hand-eye" in said and not (tmp_path / "moved").exists()

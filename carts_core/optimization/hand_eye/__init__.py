@@ -1,6 +1,9 @@
 """Hand-eye calibration from points that a person has found in a few images, without any initial pose."""
 
+from .files import RESULT_FILE as RESULT_FILE
+from .files import HandEyePrior as HandEyePrior
 from .files import read_points as read_points
+from .files import read_prior as read_prior
 from .files import result_json as result_json
 from .moving_cameras import mounts_of_points as mounts_of_points
 from .moving_cameras import moved_cameras as moved_cameras

@@ -3,16 +3,23 @@
 import csv
 import io
 import math
+from collections.abc import Mapping
 from collections.abc import Sequence as Rows
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from ...errors import SettingsError
-from ...files.reading import TABLE, read_text
+from ...files.reading import TABLE, VALUES, parse_json, read_bytes, read_text
 from ...recording import Sequence
 from .points import ImagePoint
 from .result import HandEyeResult
 
+RESULT_FILE = "hand_eye.json"
+"""Name of the file with what was found, beside the sequence file."""
 COLUMNS = ("frame", "camera", "arm", "landmark", "u", "v")
 
 
@@ -49,9 +56,55 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
     return points
 
 
-def result_json(sequence: Sequence, points: Rows[ImagePoint], result: HandEyeResult) -> dict[str, Any]:
-    """Points with their distances, poses with their standard deviations."""
+@dataclass(frozen=True)
+class HandEyePrior:
+    """What a hand-eye calibration leaves open, for one that refines it."""
+
+    base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
+    """As in `HandEyeResult`."""
+    free_cameras: tuple[str, ...]
+    """Cameras whose pose was not known before."""
+
+
+def read_prior(sequence: Sequence) -> HandEyePrior | None:
+    """What the hand-eye calibration that wrote a sequence file leaves open; None where none has, or base frames are no
+    longer those that it found.
+
+    Raises:
+        SettingsError: `hand_eye.json` beside the sequence file cannot be read.
+    """
+    path = sequence.path.parent / RESULT_FILE
+    if not path.is_file():
+        return None
+    try:
+        content = parse_json(read_bytes(path, VALUES))
+        if "base_frames" not in content:
+            return None
+        known = {name: np.array(entry["T_world_base"], float) for name, entry in content["base_frames"].items()}
+        covariances = {name: np.array(entry["covariance"], float) for name, entry in content["base_frames"].items()}
+        free = tuple(str(camera) for camera in content["free_cameras"])
+        fits = all(T.shape == (4, 4) and covariances[name].shape == (6, 6) for name, T in known.items())
+        fits = fits and all(np.linalg.eigvalsh(covariance)[0] > 0 for covariance in covariances.values())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, np.linalg.LinAlgError) as error:
+        raise SettingsError(f"{path} cannot be read ({error}). Run carts hand-eye again, or remove it.") from error
+    if not fits:
+        raise SettingsError(f"{path} has no covariances of base frames. Run carts hand-eye again, or remove it.")
+    now = {arm.name: arm.T_world_base for arm in sequence.scene.arms}
+    if not all(name in now and np.allclose(now[name], T, atol=1e-6) for name, T in known.items()):
+        return None
+    return HandEyePrior(covariances, free)
+
+
+def result_json(
+    sequence: Sequence, points: Rows[ImagePoint], result: HandEyeResult, free_cameras: Rows[str] = ()
+) -> dict[str, Any]:
+    """Points with their distances, poses with their standard deviations, base frames with their covariances."""
     return {
+        "free_cameras": list(free_cameras),
+        "base_frames": {
+            arm: {"T_world_base": result.scene.arm(arm).T_world_base.tolist(), "covariance": covariance.tolist()}
+            for arm, covariance in result.base_covariances.items()
+        },
         "error_px": result.error,
         "points": [
             {

@@ -41,6 +41,8 @@ class HandEyeResult:
     """From each given point to where the landmark is now seen [px]; NaN for points that were not used."""
     deviations: Mapping[tuple[str, str], PoseDeviation]
     """(arm, camera) -> how well the arm's pose before that camera is known."""
+    base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
+    """Arm -> covariance of the turn and shift of its base frame in its own axes [rad, m]."""
     focal_deviation: Mapping[str, float]
     """Camera -> standard deviation of its focal length as a share of it; empty unless it was solved for."""
     contradicting: tuple[int, ...]
@@ -75,6 +77,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
         deviations={
             (arms[view.arm], names[view.camera]): _deviation(problem, view, fit.x, covariance) for view in problem.views
         },
+        base_covariances={arms[arm]: _base_covariance(problem, arm, fit.x, covariance) for arm in bases},
         focal_deviation={
             names[camera]: float(np.sqrt(covariance[start + place, start + place]))
             for place, camera in enumerate(problem.focal)
@@ -94,6 +97,20 @@ def _covariance(problem: HandEyeProblem, fit: OptimizeResult) -> np.ndarray:
     spare = max(sum(2 if point else 1 for view in problem.views for point in view.is_point) - len(fit.x), 1)
     inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
     return inverse * max(2.0 * fit.cost / spare, 1.0)
+
+
+def _base_covariance(
+    problem: HandEyeProblem, arm: int, values: np.ndarray, covariance: np.ndarray
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of an arm's base frame in its own axes [rad, m], from that of the unknowns."""
+    T_base_world = np.linalg.inv(problem.poses(values)[0][arm])
+
+    def step(at: np.ndarray) -> np.ndarray:
+        T = T_base_world @ problem.poses(at)[0][arm]
+        return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+
+    J = _differences(step, values)
+    return J @ covariance @ J.T
 
 
 def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covariance: np.ndarray) -> PoseDeviation:
