@@ -265,13 +265,28 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
         ]
         (tmp_path / f"{name}.csv").write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
         found = tmp_path / name
-        main(["hand-eye", str(path), "--points", str(tmp_path / f"{name}.csv"), "--output", str(found)])
+        main(
+            [
+                "hand-eye",
+                str(path),
+                "--points",
+                str(tmp_path / f"{name}.csv"),
+                "--output",
+                str(found),
+                "--pixel-error",
+                "0.5",
+            ]
+        )
     refine = ["--observe", "masks", "--frames", "all"]
     main(["calibrate", str(tmp_path / "right/sequence.toml"), *refine, "--output", str(tmp_path / "refined")])
     refined = Sequence.open(tmp_path / "refined/sequence.toml").scene
     for before, after in zip(sequence.scene.cameras, refined.cameras, strict=True):
         assert np.allclose(before.T_camera_world, after.T_camera_world, atol=1e-9)
     assert not np.array_equal(refined.arms[0].T_world_base, arm.T_world_base)
+    # As if the points had left nothing open.
+    known = json.loads((tmp_path / "wrong/hand_eye.json").read_text())
+    known["base_frames"]["PSM1"]["covariance"] = (1e-8 * np.eye(6)).tolist()
+    (tmp_path / "wrong/hand_eye.json").write_text(json.dumps(known))
     again = ["calibrate", str(tmp_path / "wrong/sequence.toml"), *refine, "--output", str(tmp_path / "moved")]
     capsys.readouterr()
     with pytest.raises(SystemExit):
