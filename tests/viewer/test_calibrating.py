@@ -27,14 +27,14 @@ CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 class OneStep:
     """Stands for `CalibrationOptimizer`: one step, and the scene as it is for a result."""
 
-    def __init__(self, scene: Scene, *_: object) -> None:
+    def __init__(self, scene: Scene, *_: object, **options: object) -> None:
         self._scene = scene
 
     def __iter__(self) -> Iterator[SimpleNamespace]:
         yield SimpleNamespace(stage=0, stages=1, index=0, loss=0.5, scene=self._scene)
 
     def result(self) -> SimpleNamespace:
-        return SimpleNamespace(scene=self._scene)
+        return SimpleNamespace(scene=self._scene, beyond=())
 
 
 @pytest.fixture
