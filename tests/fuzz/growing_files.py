@@ -517,7 +517,7 @@ BAG: dict[str, Maker] = {
         "SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(100) AS data FROM n",
     ),
     "messages of a gigabyte": _database("UPDATE messages SET data = zeroblob(900000000) WHERE id < 3"),
-    "false counts": _database("UPDATE messages SET data = unhex('00010000ffffff7fffffff7fffffff7f') || zeroblob(40)"),
+    "false counts": _database("UPDATE messages SET data = x'00010000ffffff7fffffff7fffffff7f' || zeroblob(40)"),
     "nested definition": _database(
         "UPDATE message_definitions SET encoded_message_definition = 'a/B[1000000000] header\n" + "=" * 80 + "\n"
         "MSG: a/B\na/C[1000000000] c\n" + "=" * 80 + "\nMSG: a/C\nuint8[1000000000] d\n'"
