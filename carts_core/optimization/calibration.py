@@ -2,15 +2,17 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm as gaussian
 from scipy.stats import t as student
 
 from ..errors import SettingsError
+from ..model.landmarks import link_transforms
 from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
@@ -31,8 +33,10 @@ from .counterfactual import Backgrounds
 from .familiarity import familiarity
 from .fit import Fit, Point, StopReason
 from .frame import Progress
+from .hand_eye.result import PoseDeviation
 from .predictor import SurfacePredictor, predictor_of
 from .stages import run_stages
+from .variables import APART
 from .verdict import Assessment, Verdict
 from .verdict_of_many import assess_calibration, without_knowledge, worse_in
 
@@ -109,6 +113,8 @@ class CalibrationResult:
     """How far it can be relied on; None where the run was stopped before its end."""
     beyond: tuple[str, ...] = ()
     """Arms whose base frame has moved farther than what was known of it allows."""
+    deviations: Mapping[tuple[str, str], PoseDeviation] = field(default_factory=dict)
+    """(arm, camera) -> standard deviations of the arm's pose before that camera, at the mean of its tips."""
 
 
 class CalibrationOptimizer:
@@ -259,15 +265,20 @@ class CalibrationOptimizer:
             raise SettingsError("no step was made yet. Call `step` first.")
         offsets = self.best.offsets
         evaluation = self._problem.evaluate(offsets, self._problem.present)
+        assert evaluation.hessian is not None
+        alone = torch.linalg.inv(evaluation.hessian.double().cpu())
+        between = _between_frames(evaluation)
+        total = self._covariance(offsets, evaluation, alone, between)
         return CalibrationResult(
             scene=self.best.scene,
-            unknowns=self._changes(offsets, evaluation),
+            unknowns=self._changes(offsets, total, alone, between),
             frame_losses_before=self._problem.frame_losses(torch.zeros_like(offsets)),
             frame_losses_after=self._problem.frame_losses(offsets),
             frame_weights=evaluation.frame_weights.numpy().copy(),
             stop_reason=self.stop_reason or StopReason.CANCELLED,
             assessment=self.assessment,
             beyond=tuple(arm for arm in self._known if self._moved_too_far(arm, offsets)),
+            deviations=self._pose_deviations(offsets, total.numpy()),
         )
 
     def _moved_too_far(self, arm: str, offsets: torch.Tensor) -> bool:
@@ -280,30 +291,68 @@ class CalibrationOptimizer:
             for part in (slice(3), slice(3, 6))
         )
 
-    def _changes(self, offsets: torch.Tensor, evaluation: CalibrationEvaluation) -> tuple[UnknownChange, ...]:
-        """What became of each unknown, with deviations for all errors that are allowed for."""
-        assert evaluation.hessian is not None and evaluation.outline is not None
-        covariance = torch.linalg.inv(evaluation.hessian.double().cpu())
-        alone, between = covariance.diagonal().sqrt(), _between_frames(evaluation)
-        shifts = [covariance @ evaluation.outline[:, None], covariance @ evaluation.gradient.double().cpu()[:, None]]
+    def _covariance(
+        self,
+        offsets: torch.Tensor,
+        evaluation: CalibrationEvaluation,
+        alone: Float[torch.Tensor, "n n"],
+        between: Float[torch.Tensor, "n n"] | None,
+    ) -> Float[torch.Tensor, "n n"]:
+        """Of the unknowns, for all errors that are allowed for."""
+        assert evaluation.outline is not None
+        shifts = [alone @ evaluation.outline[:, None], alone @ evaluation.gradient.double().cpu()[:, None]]
         if not self.free.intrinsics:
-            shifts.append(_HELD_INTRINSICS * covariance @ self._problem.curvature_with_intrinsics(offsets))
-        shared = torch.cat(shifts, 1).square().sum(1)
+            shifts.append(_HELD_INTRINSICS * alone @ self._problem.curvature_with_intrinsics(offsets))
+        together = torch.cat(shifts, 1)
+        shared = together @ together.T
+        if self._known:
+            # Frames that are left out do not show the error of base frames that were known.
+            shared = shared + alone @ self._problem.prior.precision.double().cpu() @ alone
         # With one frame nothing but experience says how much neighbouring pixels share their errors.
-        frames = (_CORRELATED * alone if between is None else between).square()
-        total = _widened(frames, shared, len(self._frames))
+        frames = _CORRELATED**2 * alone if between is None else between
+        total = frames + shared
+        wider = _widened(frames.diagonal(), shared.diagonal(), len(self._frames)) / total.diagonal().sqrt()
+        return wider[:, None] * total * wider
+
+    def _changes(
+        self,
+        offsets: torch.Tensor,
+        total: Float[torch.Tensor, "n n"],
+        alone: Float[torch.Tensor, "n n"],
+        between: Float[torch.Tensor, "n n"] | None,
+    ) -> tuple[UnknownChange, ...]:
+        """What became of each unknown, with its deviations."""
         settings = self.settings
         prior = self.variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
+        known = (offsets.cpu(), total.diagonal().sqrt(), alone.diagonal().sqrt())
+        frames = None if between is None else between.diagonal().sqrt()
         changes = []
         for index, (name, unit, scale) in enumerate(self.variables.units()):
-            change, deviation, one = (scale * float(values[index]) for values in (offsets.cpu(), total, alone))
-            other = None if between is None else scale * float(between[index])
+            change, deviation, one = (scale * float(values[index]) for values in known)
+            other = None if frames is None else scale * float(frames[index])
             changes.append(UnknownChange(name, unit, change, deviation, one, other, scale * float(prior[index])))
         return tuple(changes)
 
+    def _pose_deviations(
+        self, offsets: torch.Tensor, covariance: Float[np.ndarray, "n n"]
+    ) -> dict[tuple[str, str], PoseDeviation]:
+        """Of each arm before each camera that takes part, by central differences."""
+        around = self.variables.around(offsets)
+        found = {}
+        for number, arm in enumerate(self._scene.arms):
+            joints = np.stack([frame.measured[arm.name] for frame in self._frames])
+            middle = link_transforms(arm, joints)[:, -1, :, 3].mean(0)
+            for index, camera in enumerate(self._scene.cameras):
+                Ts = (around.T_camera_world[:, index] @ around.T_world_base[:, number]).double().cpu().numpy()
+                turns = Rotation.from_matrix(Ts[:, :3, :3] @ Ts[0, :3, :3].T).as_rotvec()
+                below, above = np.split(np.hstack([turns, Ts[:, :3] @ middle])[1:], 2)
+                J = (above - below).T / APART
+                found[arm.name, camera.name] = PoseDeviation.of(J @ covariance @ J.T)
+        return found
 
-def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, " n"] | None:
-    """Standard deviations from leaving out each frame in turn, by the quadratic model; None with one frame.
+
+def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, "n n"] | None:
+    """Covariance from leaving out each frame in turn, by the quadratic model; None with one frame.
 
     The jackknife over clusters, here frames, whose pixels share their errors (CR3: MacKinnon, Nielsen and Webb, Fast
     and reliable jackknife and bootstrap methods for cluster-robust inference, 2023).
@@ -314,7 +363,7 @@ def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, " 
     if count < 2:
         return None
     left = torch.linalg.solve(evaluation.hessian.double().cpu() - curvatures, gradients[..., None])[..., 0]
-    return (left.square().sum(0) * (count - 1) / count).sqrt()
+    return left.T @ left * (count - 1) / count
 
 
 def _widened(

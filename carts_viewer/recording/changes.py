@@ -88,7 +88,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
 
 def _new_import(draft: Draft) -> Draft:
     """What was calibrated before does not hold for other files; points in images stay."""
-    return replace(draft, calibration=None)
+    return draft.uncalibrated()
 
 
 def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -> dict[str, str]:

@@ -15,6 +15,7 @@ from carts_core.files.reading import SETTINGS, VALUES, check_path, is_regular, p
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.place import data_dir
 from carts_core.settings.importing import ImportOptions
+from carts_viewer.recording.report import CalibrationReport
 
 _FORMAT = "carts-draft/1"
 _LONGEST_NAME = 200
@@ -46,6 +47,10 @@ class Draft:
     """Whether the focal length is solved for, too."""
     calibration: Mapping[str, Any] | None = None
     """Base frames, camera poses and intrinsics by arm or camera, as `carts calibrate` found them; None before."""
+    offered: Mapping[str, Any] | None = None
+    """A calibration that clicked points speak against, until it is kept or discarded."""
+    report: CalibrationReport | None = None
+    """Figures of the calibration that is kept or offered."""
 
     def to_json(self) -> str:
         """The draft as text."""
@@ -72,6 +77,10 @@ class Draft:
             return draft
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
+
+    def uncalibrated(self, **changes: Any) -> "Draft":
+        """The draft with other fields, and without the calibration that does not hold for these."""
+        return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
         """The draft with other options; what was clicked or calibrated before stays."""

@@ -34,7 +34,9 @@ def check_form(
     """
     recording = guess.recording
     cameras = () if recording is None else recording.cameras
-    head = _problem(guess, "recording") + _notes(guess, None)
+    head = _problem(guess, "recording") + _trials(guess) + _notes(guess, None)
+    if guess.trials:
+        return head
     left = "".join(_camera(draft, guess, camera, pictures.get(camera.name, [])) for camera in cameras)
     if not cameras:
         left = "".join(_named_images(draft, guess, camera) for camera in draft.options.images)
@@ -43,6 +45,14 @@ def check_form(
     wrong = _problem(guess, "images") + _problem(guess, "calibration")
     left = f"<section><h2>Cameras</h2>{wrong}{left}{_add_camera(guess)}</section>"
     return f'{head}<div class="columns">{left}{_kinematics(draft, guess, delay)}</div>'
+
+
+def _trials(guess: Guess) -> str:
+    """A list of the recordings in the folder."""
+    if len(guess.trials) < 2:
+        return ""
+    options = {"": "Trial …", **{str(trial): trial.stem for trial in guess.trials}}
+    return f"<div class='bar'>{choices('trial', options, '', label='Trial')}</div>"
 
 
 def _camera(draft: Draft, guess: Guess, camera: FoundCamera, pictures: list[tuple[str, str]]) -> str:
@@ -159,7 +169,7 @@ def _columns(draft: Draft, guess: Guess) -> str:
     rows = []
     for joint in (*JOINT_NAMES, "jaw"):
         now = guessed.get(joint, "")
-        options = {**columns, "": f"{now} (guessed)" if now and joint not in chosen else _NONE}
+        options = {**columns, "": _unchosen(guess, "" if joint in chosen else now)}
         flip = check_box(f"flip {joint}", joint in draft.options.flip, "other sign") if joint != "jaw" else ""
         known = get_args(LengthUnit if joint == "insertion" else AngleUnit)
         units = {"": "unit of the rest", **{unit: unit for unit in known}}
@@ -168,13 +178,21 @@ def _columns(draft: Draft, guess: Guess) -> str:
         rows.append(f"<tr><td>{escaped(joint.replace('_', ' '))}</td><td>{field}</td><td>{flip}</td></tr>")
     for role, text in (("time", "time"), ("frame", "image")):
         now = "" if guess.meanings is None else getattr(guess.meanings, role) or ""
-        options = {**columns, "": f"{now} (guessed)" if now and role not in chosen else _NONE}
+        options = {**columns, "": _unchosen(guess, "" if role in chosen else now)}
         field = choices(f"column {role}", options, chosen.get(role, ""), label=text)
         rows.append(f"<tr><td>{text}</td><td>{field}</td><td></td></tr>")
     wrong = "columns" in guess.problems
     opened = " open" if wrong or chosen or draft.options.flip or draft.options.units else ""
     body = f"<table><tr><th>meaning</th><th>column</th><th></th></tr>{''.join(rows)}</table>{_units(draft)}"
     return f"<details{opened}><summary>Columns, units and signs</summary>{body}</details>"
+
+
+def _unchosen(guess: Guess, column: str) -> str:
+    """The label of a column that was not chosen."""
+    if not column:
+        return _NONE
+    assert guess.meanings is not None
+    return f"{column} ({'by name' if column in guess.meanings.stated else 'guessed'})"
 
 
 def _units(draft: Draft) -> str:

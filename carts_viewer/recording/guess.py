@@ -14,6 +14,7 @@ from carts_core.recording.importing.foreign_tables import ForeignTable
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.recording.importing.importer import detect, find
 from carts_core.recording.importing.media import find_images
+from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
 from carts_core.recording.sources.folder import kinematics_table
 from carts_core.settings.importing import NO_TABLE, ImportOptions
 from carts_viewer.recording.draft import Draft
@@ -34,6 +35,8 @@ class Guess:
     table: ForeignTable | None = None
     """Of the kinematics, where they are a table of named columns."""
     meanings: ColumnMeanings | None = None
+    trials: tuple[Path, ...] = ()
+    """Recordings in the folder, of which one has to be chosen."""
 
     def notes(
         self, *, about: str | None = None, kinds: tuple[str, ...] = ("warning", "missing", "guessed")
@@ -76,8 +79,13 @@ def guess(draft: Draft) -> Guess:
         except CartsError as error:
             problems.setdefault("kinematics" if table is None else "columns", str(error))
     if table is not None and meanings is not None and not meanings.arms:
-        problems["columns"] = "Six joints are not recognized among the columns. Choose a column for each."
-    return Guess(kind, recording, problems, table, meanings)
+        problems["columns"] = (
+            "Six joints are not recognized among the columns, nor a tip's pose. Choose a column for each joint."
+        )
+    trials = jigsaws_trials(source) if kind == JIGSAWS.name and recording is None else ()
+    if len(trials) > 1:
+        problems = {"recording": f"The folder has {len(trials)} trials of JIGSAWS. Choose one."}
+    return Guess(kind, recording, problems, table, meanings, trials)
 
 
 def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None:

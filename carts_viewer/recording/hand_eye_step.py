@@ -6,6 +6,7 @@ from pathlib import Path
 
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
+from carts_core.optimization import CalibrationResult, StopReason
 from carts_core.optimization.hand_eye import HandEyePrior, ImagePoint
 from carts_core.recording.importing.found import FoundRecording
 from carts_viewer.recording import plots
@@ -14,6 +15,7 @@ from carts_viewer.recording.clicking import Clicking, Wish, unknown_cameras
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.panel import hand_eye_panel
 from carts_viewer.recording.picture import FramePicture
+from carts_viewer.recording.report import report_of
 from carts_viewer.recording.saving import calibrated_recording, target_folder, write_saved
 from carts_viewer.recording.scenes import calibrated_scene
 from carts_viewer.start.host import Host
@@ -87,7 +89,7 @@ class HandEyeStep:
             self._wanted = None
         kept = tuple(each for each in draft.points if _wish_of(each) != wish)
         self._progress = None
-        return replace(draft, points=(*kept, point), calibration=None)
+        return draft.uncalibrated(points=(*kept, point))
 
     def chosen(self, draft: Draft, name: str, value: str) -> Draft:
         """The draft after a choice in the panel; anything else changes nothing.
@@ -110,16 +112,26 @@ class HandEyeStep:
             self._skip_frame(draft, wish)
         elif kind == "look":
             self._look(wish or self._clicking.plan[-1], which, value)
-        elif name == "focal_length":
-            return replace(draft, focal_length=value == "1", calibration=None)
+        elif name == "calibrate":
+            self._calibrate()
+        else:
+            return self._changed(draft, name, value)
+        return draft
+
+    def _changed(self, draft: Draft, name: str, value: str) -> Draft:
+        """The draft after a choice that changes it."""
+        if name == "focal_length":
+            draft = draft.uncalibrated(focal_length=value == "1")
         elif name == "name":
-            return replace(draft, name=value.strip())
+            draft = replace(draft, name=value.strip())
+        elif name == "keep" and draft.offered is not None:
+            draft = replace(draft, calibration=draft.offered, offered=None)
+        elif name == "discard" and draft.offered is not None:
+            draft = draft.uncalibrated()
         elif name == "remove-point" and value.isdecimal() and int(value) < len(draft.points):
             row = int(value)
             self._wanted = _wish_of(draft.points[row])
-            return replace(draft, points=(*draft.points[:row], *draft.points[row + 1 :]), calibration=None)
-        elif name == "calibrate":
-            self._calibrate()
+            draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
 
     def write(self, draft: Draft) -> Path:
@@ -189,8 +201,8 @@ class HandEyeStep:
         """Arms and cameras as the overlay shows them; None without an overlay."""
         if self._running() and self._progress is not None and self._progress.scene is not None:
             return self._progress.scene
-        if draft.calibration is not None:
-            return calibrated_scene(self._sequence.scene, draft.calibration)
+        if (calibration := draft.calibration or draft.offered) is not None:
+            return calibrated_scene(self._sequence.scene, calibration)
         return None if self._clicking.result is None else self._clicking.result.scene
 
     def _calibrate(self) -> None:
@@ -218,8 +230,19 @@ class HandEyeStep:
             # It may have ended before it saw that it was stopped, and still not be wanted.
             progress = STOPPED if progress.result is not None else progress
         self._progress = progress
-        scene = progress.scene if progress.ended and progress.result is not None else None
-        self._report(lambda draft: draft if scene is None else replace(draft, calibration=as_plain(scene)))
+        self._report(lambda draft: draft if progress.result is None else self._calibrated(draft, progress.result))
+
+    def _calibrated(self, draft: Draft, result: CalibrationResult) -> Draft:
+        """The draft with a calibration that the points agree with, or with the offer of one that they speak against."""
+        report = report_of(result, self._clicking, draft.points)
+        if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
+            text = f"The calibration from your points is as it was, with a loss of {report.loss_before:.4f}."
+            verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
+            self._progress = Progress("", 0.0, error=text + verdict, ended=True)
+            return draft
+        self._progress, found = None, as_plain(result.scene)
+        draft = draft.uncalibrated(report=report)
+        return replace(draft, offered=found) if report.objection else replace(draft, calibration=found)
 
     def _target(self, draft: Draft) -> str:
         try:

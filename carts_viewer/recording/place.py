@@ -81,7 +81,7 @@ class RecordingPlace:
             except (CartsError, LookupError, TypeError, ValueError) as error:
                 self._leave_hand_eye()
                 self._problem = f"The points or the calibration of this import do not fit the recording: {error}"
-                self._change(replace(self._draft, step=Step.CHECK, calibration=None))
+                self._change(self._draft.uncalibrated(step=Step.CHECK))
         self._host.document.show(self._browsing() if self._browser is not None else self._checking())
 
     def choose(self, name: str, value: str) -> None:
@@ -109,6 +109,9 @@ class RecordingPlace:
             self._pick(browser.picked(value))
         elif self._step is not None and self._draft.step is Step.HAND_EYE:
             return self._in_hand_eye(name, value)
+        elif name == "trial":
+            if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
+                self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))
         elif (draft := changed(self._draft, name, value, self._guessed_columns())) is not None:
             self._set(draft)
         self.show()

@@ -128,6 +128,10 @@ def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
     assert result.stop_reason == "converged" and len(optimizer.history) == optimizer.history[-1].index + 1
     for unknown in result.unknowns:
         assert 0 < unknown.deviation <= unknown.prior_deviation * (1 + 1e-6)
+    assert set(result.deviations) == {("PSM1", "left"), ("PSM1", "right")}
+    for deviation in result.deviations.values():
+        assert angle < 4 * deviation.rotation_deg < 20
+        assert distance < 4 * np.hypot(deviation.sideways_mm, deviation.depth_mm) < 40
 
 
 def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start(

@@ -17,7 +17,7 @@ from carts_core.model.camera import Camera
 from carts_core.model.landmarks import link_transforms
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
-from carts_core.optimization.hand_eye import HandEyeSettings, ImagePoint, solve_hand_eye
+from carts_core.optimization.hand_eye import HandEyeSettings, ImagePoint, agreement_with_points, solve_hand_eye
 from carts_core.recording import Sequence
 
 FRAMES = 6
@@ -294,3 +294,45 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     said = " ".join(capsys.readouterr().err.split())
     assert "he base frame of PSM1 moves by" in said and "its hand-eye calibration is known to" in said
     assert "--beyond-hand-eye" in said and not (tmp_path / "moved").exists()
+
+
+def test_covariances_of_base_frames_are_as_large_as_their_errors(scene: Scene) -> None:
+    one = replace(scene, arms=scene.arms[:1])
+    measured = {"PSM1": joints()}
+    (arm,), squares = one.arms, []
+    for seed in range(12):
+        points = clicked(one, measured, range(4), ["left"], seed=seed)
+        result = solve_hand_eye(unknown(one), measured, points)
+        T = np.linalg.inv(result.scene.arms[0].T_world_base) @ arm.T_world_base
+        error = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+        squares.append(error @ np.linalg.solve(result.base_covariances["PSM1"], error))
+    assert 3.0 < np.mean(squares) < 9.0, "six degrees of freedom"
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "noise", "agrees"), [(0.0, 2.0, True), (0.0, 5.0, True), (2.0, 2.0, False), (0.02, 0.1, True)]
+)
+def test_points_agree_with_the_truth_and_speak_against_another_calibration(
+    scene: Scene, turn_deg: float, noise: float, agrees: bool
+) -> None:
+    measured = {arm.name: joints() for arm in scene.arms}
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, turn_deg, 0.0], degrees=True).as_matrix()
+    other = replace(scene, arms=tuple(replace(arm, T_world_base=turn @ arm.T_world_base) for arm in scene.arms))
+    for seed in range(2):
+        points = clicked(scene, measured, range(4), ["left"], noise=noise, seed=seed)
+        found = solve_hand_eye(unknown(scene), measured, points)
+        compared = agreement_with_points(other, measured, points, found)
+        assert compared.agrees is agrees
+        assert compared.before == pytest.approx(found.distances, nan_ok=True)
+        assert agrees or len(compared.disagreeing) > len(points) / 4
+
+
+def test_a_point_that_contradicts_the_others_does_not_speak_against_a_calibration(scene: Scene) -> None:
+    measured = {arm.name: joints() for arm in scene.arms}
+    points = clicked(scene, measured, range(4), ["left"], noise=0.5)
+    u, v = points[0].pixel
+    points[0] = replace(points[0], pixel=(u + 60.0, v))
+    found = solve_hand_eye(unknown(scene), measured, points)
+    compared = agreement_with_points(scene, measured, points, found)
+    assert compared.after[0] == pytest.approx(60.0, abs=3.0) and compared.agrees

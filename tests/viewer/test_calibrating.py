@@ -2,18 +2,21 @@
 
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from clicked_points import clicked
+from scipy.spatial.transform import Rotation
 from viewer_canvas import eventually
 from visitor import write_lab_files
 
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.scene import Scene
-from carts_core.optimization import CalibrationOptimizer
+from carts_core.optimization import CalibrationOptimizer, StopReason
+from carts_core.optimization.hand_eye import PoseDeviation
 from carts_core.recording import Sequence
 from carts_viewer.recording import calibrating, hand_eye_step
 from carts_viewer.recording.calibrating import CalibrationJob
@@ -27,14 +30,22 @@ CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 class OneStep:
     """Stands for `CalibrationOptimizer`: one step, and the scene as it is for a result."""
 
-    def __init__(self, scene: Scene, *_: object, **options: object) -> None:
+    def __init__(self, scene: Scene, *_: object, **__: object) -> None:
         self._scene = scene
 
     def __iter__(self) -> Iterator[SimpleNamespace]:
         yield SimpleNamespace(stage=0, stages=1, index=0, loss=0.5, scene=self._scene)
 
     def result(self) -> SimpleNamespace:
-        return SimpleNamespace(scene=self._scene, beyond=())
+        return SimpleNamespace(
+            scene=self._scene,
+            frame_losses_before=np.array([0.5]),
+            frame_losses_after=np.array([0.25]),
+            stop_reason=StopReason.CONVERGED,
+            assessment=None,
+            beyond=(),
+            deviations={("PSM1", "left"): PoseDeviation(7.1, 8.2, 9.3)},
+        )
 
 
 @pytest.fixture
@@ -155,3 +166,50 @@ def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkey
     assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
     (content,) = shown
     assert "Stopping …" in content
+
+
+def test_a_calibration_that_points_agree_with_is_kept_with_its_figures(site: Site, jobs: list[CalibrationJob]) -> None:
+    place = place_of(site)
+    assert "± 8.2 mm" not in site.document.content
+    site.post(lambda: place.choose(*CALIBRATE))
+    draft = ended(site, "Calibrated")
+    assert draft.report is not None and draft.offered is None
+    assert draft.report.before == pytest.approx(draft.report.after, abs=1e-6) and len(draft.report.before) == 12
+    content = site.document.content
+    for text in ("Loss 0.5000 → 0.2500", "± 8.2 mm", "± 9.3 mm", "± 7.1°", "<td>0.00°</td><td>0.0 mm</td>"):
+        assert text in content
+    assert Draft.from_json(draft.to_json()) == draft
+    site.post(lambda: place.choose("undo", ""))
+    assert "Loss" not in ended(site, "Of the calibration from points").to_json()
+    assert place_of(site).draft.calibration is None and "± 8.2 mm" not in site.document.content
+
+
+def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Moved(OneStep):
+        """An optimizer that turns the base frame by two degrees."""
+
+        def __init__(self, scene: Scene, *_: object, **__: object) -> None:
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec([0.0, 2.0, 0.0], degrees=True).as_matrix()
+            super().__init__(
+                replace(scene, arms=tuple(replace(a, T_world_base=turn @ a.T_world_base) for a in scene.arms))
+            )
+
+    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Moved)
+    place = place_of(site)
+    site.post(lambda: place.choose(*CALIBRATE))
+    offer = ended(site, "Calibration not kept")
+    assert offer.calibration is None and offer.offered is not None
+    assert offer.report is not None and offer.report.disagreeing
+    assert "px allowed" in site.document.content and "<td>2.00°</td>" in site.document.content
+    for choice, text, kept in (
+        ("keep", "Kept by choice", True),
+        ("undo", "Calibration not kept", False),
+        ("discard", "Of the calibration from points", False),
+        ("undo", "Calibration not kept", False),
+    ):
+        site.post(lambda choice=choice: place.choose(choice, ""))
+        assert (ended(site, text).calibration is not None) is kept
+        assert ("Keep anyway" in site.document.content) is (text == "Calibration not kept")

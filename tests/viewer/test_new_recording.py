@@ -1,30 +1,38 @@
 """From raw files to a calibrated overlay, in a browser, as a person does it."""
 
 import csv
+import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import torch
 from clicked_points import clicked
 from playwright.sync_api import Browser, expect
+from scipy.spatial.transform import Rotation
 from swaying import write_log, write_swaying
 from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
 from waiting import wait_in
 
 from carts_core.evaluation.metrics import dice
+from carts_core.imaging.window import Window
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
-from carts_core.optimization import CalibrationOptimizer
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import CalibrationOptimizer, ImagePredictor
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_viewer.recording.calibrating import CalibrationJob
+from carts_viewer.recording.draft import Draft, DraftFile, Step
 from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.site import Site
 
@@ -196,6 +204,71 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(
     visitor.reads("Images and kinematics fit as they are", 90)
     visitor.press("Undo")
     eventually(lambda: place.draft.options.time_offset, lambda offset: offset is None)
+
+
+class Truths(ImagePredictor):
+    """Predicts the true surface map of one of three frames: the red, the green or the blue one."""
+
+    device = torch.device("cpu")
+    stride = 16
+
+    def __init__(self, made: Sequence) -> None:
+        renderer = Renderer(made.scene, width=640, height=480)
+        frames = map(made.frame, range(len(made)))
+        maps = [renderer.surface(made.scene.state(frame.measured)).maps for frame in frames]
+        self.maps = [torch.nn.functional.avg_pool2d(each, 2) for each in maps]
+
+    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
+        """The truth in a window."""
+        return window.of(self.maps[int(images[0].mean((1, 2)).argmax())])[: len(images)]
+
+
+@pytest.mark.parametrize("agreeing", [True, False])
+def test_a_calibration_shows_its_figures_and_is_kept_where_clicked_points_agree(
+    tiny_sequence: Callable[..., Path],
+    tmp_path: Path,
+    visit: Callable[[Path], Visitor],
+    monkeypatch: pytest.MonkeyPatch,
+    agreeing: bool,
+) -> None:
+    made = Sequence.open(tiny_sequence(frames=3, cameras=("left",), width=320, height=240))
+    folder = tmp_path / "labs" / "day"
+    (folder / "left").mkdir(parents=True)
+    for number in range(3):
+        cv2.imwrite(str(folder / f"left/{number}.png"), np.full((240, 320, 3), 200 * np.eye(3)[2 - number], np.uint8))
+    write_lab_files(folder, range(3), made.measured["PSM1"], [("left", (320, 240), made.scene.cameras[0].K - SHIFT)])
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0 if agreeing else 6.0, 0.0], degrees=True).as_matrix()
+    (arm,) = made.scene.arms
+    seen = replace(made.scene, arms=(replace(arm, T_world_base=turn @ arm.T_world_base),))
+    points = tuple(clicked(seen, made.measured, range(3), ("left",), noise=1.0))
+    DraftFile().write(Draft(Step.HAND_EYE, str(folder), "day", points=points))
+    monkeypatch.setattr(FeatureExtractor, "load", lambda *_, **__: Truths(made))
+    visitor = visit(tmp_path / "labs")
+    visitor.press("Go on with day")
+    visitor.reads("Of the calibration from points", 90)
+    visitor.dismiss_warning()
+    known = visitor.page.locator("main").get_by_text("±").all_inner_texts()
+    visitor.press("Calibrate")
+    visitor.reads("Calibrated" if agreeing else "Calibration not kept", 240)
+    visitor.reads("Loss")
+    if (pictures := os.environ.get("CARTS_PICTURES")) is not None:
+        visitor.page.screenshot(path=f"{pictures}/calibrated_{agreeing}.png")
+    assert visitor.page.locator("main").get_by_text("±").all_inner_texts() != known
+    assert visitor.page.locator("main details tr").count() >= 1 + len(points)
+    draft = place_of(visitor).draft
+    assert draft.report is not None
+    print(draft.report)
+    if agreeing:
+        assert draft.calibration is not None and not draft.report.disagreeing
+        return
+    assert draft.calibration is None and visitor.page.locator("tr.wrong").count() == len(draft.report.disagreeing) > 0
+    visitor.press("Keep anyway")
+    visitor.reads("Kept by choice")
+    visitor.press("Undo")
+    visitor.press("Discard")
+    visitor.reads("Of the calibration from points")
+    assert place_of(visitor).draft.calibration is None
 
 
 @pytest.mark.slow

@@ -60,3 +60,33 @@ def test_a_question_about_units_and_rates_is_answered_in_the_form(tmp_path: Path
         assert found.recording.arms[0].values[0] == pytest.approx(JOINTS)
     _, found = after(draft, ("length_unit", "dm"), ("frame_rate", "10"))
     assert found.recording is not None and found.recording.frame_times == pytest.approx(np.arange(FRAMES) / 10)
+
+
+def test_columns_that_were_chosen_or_named_are_not_called_guessed(tmp_path: Path) -> None:
+    draft = recording(tmp_path / "named", list(JOINT_NAMES), JOINTS)
+    form = check_form(draft, guess(draft), {})
+    assert "yaw (by name)" in form and "(guessed)" not in form
+    draft = recording(tmp_path / "numbered", [f"q{number}" for number in range(6)], JOINTS)
+    assert "q0 (guessed)" in check_form(draft, guess(draft), {})
+    chosen = after(draft, *((f"column {joint}", f"q{number}") for number, joint in enumerate(JOINT_NAMES)))
+    assert "(guessed)" not in check_form(*chosen, {})
+
+
+def test_a_pose_table_that_raises_a_question_is_not_called_missing(tmp_path: Path) -> None:
+    poses = np.array([0.1, 0.2, 30.0, 0.0, 0.0, 0.0, 1.0])
+    draft = recording(tmp_path / "rec", [*"xyz", "qx", "qy", "qz", "qw"], poses)
+    found = guess(draft)
+    form = check_form(draft, found, {})
+    assert found.problems and "log.csv" in form and "64 × 48" in form
+    assert "no table" not in form
+
+
+def test_the_trials_of_a_folder_of_jigsaws_are_offered(tmp_path: Path) -> None:
+    folder = tmp_path / "JIGSAWS/Suturing/kinematics/AllGestures"
+    folder.mkdir(parents=True)
+    for number in (1, 2):
+        (folder / f"Suturing_B00{number}.txt").write_text("1 2 3\n")
+    draft = Draft(source=str(tmp_path / "JIGSAWS"), name="JIGSAWS")
+    found = guess(draft)
+    form = check_form(draft, found, {})
+    assert "Choose one" in form and f'<option value="{folder / "Suturing_B002.txt"}">Suturing_B002</option>' in form

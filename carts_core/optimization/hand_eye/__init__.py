@@ -1,5 +1,7 @@
 """Hand-eye calibration from points that a person has found in a few images, without any initial pose."""
 
+from .agreement import PointAgreement as PointAgreement
+from .agreement import agreement_with_points as agreement_with_points
 from .files import RESULT_FILE as RESULT_FILE
 from .files import HandEyePrior as HandEyePrior
 from .files import read_points as read_points

@@ -17,6 +17,8 @@ _OUTLIER = 4.0
 """Points that are further off than this many expected errors are said to contradict the others."""
 _SINGULAR = 1e-12
 """Relative to the largest, an eigenvalue of the curvature that says nothing."""
+_TURN, _SIDEWAYS = slice(0, 3), slice(3, 5)
+"""Of a turn and a shift in a camera's frame."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,20 @@ class PoseDeviation:
     """Across the camera's view [mm], of the worst direction."""
     depth_mm: float
     """Along the camera's view [mm]."""
+
+    @staticmethod
+    def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
+        """The deviations of a turn and a shift in the camera's frame.
+
+        Args:
+            covariance: of both [rad, m].
+        """
+        turn, sideways = (max(np.linalg.eigvalsh(covariance[part, part])[-1], 0.0) for part in (_TURN, _SIDEWAYS))
+        return PoseDeviation(
+            rotation_deg=float(np.degrees(np.sqrt(turn))),
+            sideways_mm=float(1e3 * np.sqrt(sideways)),
+            depth_mm=float(1e3 * np.sqrt(max(covariance[5, 5], 0.0))),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +63,8 @@ class HandEyeResult:
     """Camera -> standard deviation of its focal length as a share of it; empty unless it was solved for."""
     contradicting: tuple[int, ...]
     """Which of the given points do not agree with the others and hardly count."""
+    noise: float
+    """Standard deviation of a point in each direction [px]: as expected, or larger where the points differ by more."""
     missing: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """(arm, camera) -> how many more points are needed for it, where it stays as it was."""
 
@@ -67,7 +85,8 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
     distances = np.full(count, np.nan)
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
         distances[list(view.rows)] = np.linalg.norm(found, axis=-1)
-    covariance = _covariance(problem, fit)
+    excess = _excess(problem, fit)
+    covariance = excess * _inverse_curvature(fit)
     names = [camera.name for camera in problem.scene.cameras]
     arms = [arm.name for arm in problem.scene.arms]
     start = len(fit.x) - len(problem.focal)
@@ -83,20 +102,44 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
             for place, camera in enumerate(problem.focal)
         },
         contradicting=tuple(np.flatnonzero(distances > _OUTLIER * problem.settings.pixel_error).tolist()),
+        noise=_noise(problem, fit, excess),
         missing={(arms[arm], names[camera]): more for (camera, arm), more in problem.missing.items()},
     )
 
 
-def _covariance(problem: HandEyeProblem, fit: OptimizeResult) -> np.ndarray:
-    """Of the unknowns, from the curvature; never smaller than the expected error of points makes it."""
+def _excess(problem: HandEyeProblem, fit: OptimizeResult) -> float:
+    """Variance of the points over the expected one [1], at least 1."""
+    return max(2.0 * fit.cost / _spare(problem, fit), 1.0)
+
+
+def _spare(problem: HandEyeProblem, fit: OptimizeResult) -> int:
+    """Degrees of freedom of the residuals, at least 1."""
+    return max(sum(2 if point else 1 for view in problem.views for point in view.is_point) - len(fit.x), 1)
+
+
+def _noise(problem: HandEyeProblem, fit: OptimizeResult, excess: float) -> float:
+    """Standard deviation of a point in each direction [px].
+
+    Distances of points are Rayleigh distributed, whose median wrong points hardly change; Cauchy's loss alone
+    underestimates noise that is larger than expected.
+    """
+    points = [
+        np.linalg.norm(found[view.is_point], axis=-1)
+        for view, found in zip(problem.views, problem.distances(fit.x), strict=True)
+    ]
+    spare = _spare(problem, fit)
+    typical = float(np.median(np.concatenate(points))) / np.sqrt(2.0 * np.log(2.0))
+    return float(max(problem.settings.pixel_error * np.sqrt(excess), typical * np.sqrt(1.0 + len(fit.x) / spare)))
+
+
+def _inverse_curvature(fit: OptimizeResult) -> np.ndarray:
+    """Covariance of the unknowns for points as exact as expected."""
     information = fit.jac.T @ fit.jac
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if values[0] < _SINGULAR:
         raise SettingsError("the points leave a direction open. Click others, in frames where the arm is elsewhere.")
-    spare = max(sum(2 if point else 1 for view in problem.views for point in view.is_point) - len(fit.x), 1)
-    inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    return inverse * max(2.0 * fit.cost / spare, 1.0)
+    return (vectors / values) @ vectors.T / np.outer(scale, scale)
 
 
 def _base_covariance(
@@ -122,17 +165,10 @@ def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covarian
         turn = Rotation.from_matrix(T[:3, :3] @ T_now[:3, :3].T).as_rotvec()
         return np.concatenate([turn, place_of(T, problem.middles[view.arm])])
 
-    T_now = np.eye(4)
     bases, cameras, _ = problem.poses(values)
     T_now = cameras[view.camera] @ bases[view.arm]
     J = _differences(seen, values)
-    spread = J @ covariance @ J.T
-    sideways = np.linalg.eigvalsh(spread[3:5, 3:5])[-1]
-    return PoseDeviation(
-        rotation_deg=float(np.degrees(np.sqrt(max(np.linalg.eigvalsh(spread[:3, :3])[-1], 0.0)))),
-        sideways_mm=float(1e3 * np.sqrt(max(sideways, 0.0))),
-        depth_mm=float(1e3 * np.sqrt(max(spread[5, 5], 0.0))),
-    )
+    return PoseDeviation.of(J @ covariance @ J.T)
 
 
 def _filled(

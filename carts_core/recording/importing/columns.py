@@ -94,6 +94,8 @@ class ColumnMeanings:
     frame: str | None
     arms: dict[str, dict[str, str]]
     """Arm -> joint or part of a pose -> column."""
+    stated: frozenset[str] = frozenset()
+    """Columns that were chosen, or whose names state their meaning; other meanings are guesses."""
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
@@ -110,9 +112,11 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
     time = options.columns.get("time") or _first(words, _TIMES) or _dated(table)
     frame = options.columns.get("frame") or _file_names(table) or _first(words, _FRAMES)
     chosen = {joint: column for joint, column in options.columns.items() if joint not in ("time", "frame")}
+    stated = set(options.columns.values()) | {column for column in (time, frame) if column}
     if others:
         arm, joints = next(iter(others.items()))
-        return ColumnMeanings(time, frame, {arm: _joints_by_name(table, words, joints, chosen)})
+        named = _joints_by_name(table, words, joints, chosen)
+        return ColumnMeanings(time, frame, {arm: named}, frozenset({*stated, *named.values()}))
     arms: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         if column in (time, frame):
@@ -121,13 +125,14 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
         meaning = _meaning(re.sub(r"\bpsm ?\d?\b", "", text).strip(), _mentions_pose(column))
         if meaning is not None:
             arms.setdefault(arm, {}).setdefault(meaning, column)
+    stated |= {column for found in arms.values() for meaning, column in found.items() if not meaning.startswith("#")}
     arms = {arm: _numbers_to_joints(found) for arm, found in arms.items()}
     if chosen:
         arms = {next(iter(options.arms), next(iter(arms), "")): chosen}
     usable = {arm: found for arm, found in arms.items() if _has_joints(found) or _has_pose(found)}
     if not usable and not chosen:
         usable = _numbered_family(words, (time, frame))
-    return ColumnMeanings(time, frame, usable)
+    return ColumnMeanings(time, frame, usable, frozenset(stated))
 
 
 def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
@@ -383,6 +388,7 @@ def arm_log(
     times: np.ndarray,
     options: ImportOptions,
     note: Callable[[Note], None],
+    stated: frozenset[str] = frozenset(),
 ) -> ArmLog:
     """The log of one arm from its columns, in radians and metres.
 
@@ -392,14 +398,15 @@ def arm_log(
         found: joint or part of a pose -> column.
         times: of the rows, or positions of their images; NaN for rows of no image.
         options: with units and signs.
-        note: called with what was guessed.
+        note: called with what was found and guessed.
+        stated: columns whose meaning is no guess.
 
     Raises:
         SequenceError: a cell is no number, a unit is not clear, or a joint to be flipped does not exist.
     """
     other = other_robots(options).get(arm)
     if other is None and not _has_joints(found):
-        return _pose_log(table, arm, found, times, options, note)
+        return _pose_log(table, arm, found, times, options, note, stated)
     joints = {joint.name: joint for joint in other or joints_of_arm(arm, options)}
     order = [*joints] if other is not None else [*JOINT_NAMES, "jaw"]
     free = {name: Joint(name, name != "insertion", -np.inf, np.inf) for name in order}
@@ -408,7 +415,8 @@ def arm_log(
     raw = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
     spoken = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
     values = in_si(raw, chosen, options, note, arm=arm, columns=spoken, instrument=other is None)
-    note(Note("guessed", f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
+    kind = "found" if stated.issuperset(columns) else "guessed"
+    note(Note(kind, f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
     logged = track([(time, *row) for time, row in zip(times, values, strict=True)])
     if other is not None:
         return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in chosen), si=True)
@@ -425,19 +433,20 @@ def _pose_log(
     times: np.ndarray,
     options: ImportOptions,
     note: Callable[[Note], None],
+    stated: frozenset[str],
 ) -> ArmLog:
     """The log of an arm whose tip's pose is in the table."""
     columns = [found[name] for name in _POSE_ORDER]
     values = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
-    unit = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])
-    if unit is None:
-        unit = length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's place")
+    given = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])
+    unit = given or length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's place")
     values[:, :3] *= LENGTH_UNITS[unit]
-    note(Note("guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
+    note(Note("found" if given else "guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
     poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
     seen = arm in options.base
     frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
-    note(Note("guessed", f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
+    kind = "found" if seen and stated.issuperset(columns) else "guessed"
+    note(Note(kind, f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
     log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
     if "jaw" not in found:
         return log

@@ -52,7 +52,7 @@ def in_si(
         angle = options.angle_unit or _angle_unit(*asked, instrument)
         length = options.length_unit or _length_unit(*asked)
         text = f"{arm}: angles are in {angle}, lengths in {length} (change: --angle-unit, --length-unit)."
-        note(Note("guessed", text))
+        note(Note("found" if options.angle_unit and options.length_unit else "guessed", text))
     result = values.copy()
     for index, joint in enumerate(joints):
         unit = options.units.get(joint.name, angle if joint.revolute else length)

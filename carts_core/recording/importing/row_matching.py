@@ -243,9 +243,9 @@ def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: 
                 f"{counted(len(frames.ids), 'image')}, so it does not say which row is of which image. Give the "
                 f"images' rate (--frame-rate), or say that it does: --columns frame {rows.image_column!r}."
             )
-        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", note)
+        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", note, stated=explicit)
     if in_order:
-        return _by_image(frames, rows, np.arange(rows.count), times, "their order", note)
+        return _by_image(frames, rows, np.arange(rows.count), times, "their order", note, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
     raise SequenceError(
         f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
@@ -268,7 +268,7 @@ def _by_time(
         f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named is not None else ""
     )
     text = f"rows meet images by time: column {rows.time_column!r} and {frames.source}{dropped}."
-    note(Note("guessed", text))
+    note(Note("found" if "time" in options.columns else "guessed", text))
     offset = options.time_offset
     if offset is None:
         offset = float(times[0] - frames.times[0]) if apart else 0.0
@@ -284,8 +284,11 @@ def _by_image(
     times: np.ndarray | None,
     how: str,
     note: Callable[[Note], None],
+    *,
+    stated: bool,
 ) -> RowMatch:
-    note(Note("guessed", f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
+    kind = "found" if stated else "guessed"
+    note(Note(kind, f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
     if unnamed := int((positions < 0).sum()):
         note(Note("warning", f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image."))
     known = positions[positions >= 0]

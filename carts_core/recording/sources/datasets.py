@@ -6,6 +6,7 @@ JIGSAWS    TASK/kinematics/AllGestures/TRIAL.txt (76 columns), TASK/video/TRIAL_
 """
 
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ...errors import SequenceError
 from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...settings.importing import ImportOptions
+from ...wording import listed
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.media import cameras_of, common_ids, find_images, image_files
@@ -25,6 +27,8 @@ _JIGSAWS_COLUMNS = 76
 _JIGSAWS_ARMS = {"PSM_left": 38, "PSM_right": 57}
 """Arm -> its first column, from 0; each has x y z, R by rows, two velocities and the gripper's angle."""
 _JIGSAWS_RATE = 30.0
+_LISTED = 12
+"""Most trials that an error names."""
 _ENDOVIS_PART = (320, 28, 1280, 1024)
 """Left, top, width and height of the picture inside EndoVis' frames of 1920 x 1080."""
 
@@ -147,11 +151,41 @@ def _endovis_calibration(camera: FoundCamera, file: Path, notes: list[Note]) -> 
     return replace(camera, intrinsics=(fx, fy, cx, cy), distortion=distortion, T_camera_world=T)
 
 
+def jigsaws_trials(folder: Path) -> tuple[Path, ...]:
+    """Kinematics of the trials of JIGSAWS in a folder, in the order of their names.
+
+    Args:
+        folder: the root of the data set, one of its tasks, or a folder of a task.
+    """
+    levels = ("", "AllGestures", "kinematics/AllGestures", "*/kinematics/AllGestures", "*/*/kinematics/AllGestures")
+    try:
+        found = {file for level in levels for file in folder.glob(f"{level}/*.txt" if level else "*.txt")}
+    except OSError:
+        return ()
+    return tuple(sorted(file for file in found if not file.name.startswith(".") and _is_trial(file)))
+
+
+def _is_trial(file: Path) -> bool:
+    return file.parts[-3:-1] == ("kinematics", "AllGestures") and file.is_file()
+
+
 def _detect_jigsaws(path: Path) -> bool:
+    if path.is_dir():
+        return bool(jigsaws_trials(path))
     return path.suffix == ".txt" and path.is_file() and path.parent.parent.name == "kinematics"
 
 
 def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
+    trials = jigsaws_trials(path) if path.is_dir() else (path,)
+    if len(trials) > 1:
+        names = listed([trial.stem for trial in trials], _LISTED)
+        raise SequenceError(
+            f"{path} has {len(trials)} trials of JIGSAWS: {names}. Import one of them: "
+            f"carts import {shlex.quote(str(trials[0]))}"
+        )
+    if not trials:
+        raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
+    path = trials[0]
     notes: list[Note] = []
     try:
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
@@ -202,7 +236,7 @@ ENDOVIS = Source(
 JIGSAWS = Source(
     "jigsaws",
     "a trial of JIGSAWS",
-    "a file TASK/kinematics/AllGestures/TRIAL.txt",
+    "a file TASK/kinematics/AllGestures/TRIAL.txt, or a folder with such files",
     _detect_jigsaws,
     ("time_offset", "frame_rate"),
     _read_jigsaws,

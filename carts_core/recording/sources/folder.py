@@ -91,8 +91,8 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
     return {side: find_images(found[0]) for side, found in sorted(named.items())}
 
 
-def _calibrations(path: Path, cameras: list[str], notes: list[Note]) -> dict[str, Path]:
-    """Calibration files by camera: of the same side, or the only one."""
+def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes: list[Note]) -> dict[str, Path]:
+    """Calibration files by camera, of those without a given one: of the same side, or the only one."""
     files = [file for file in _files(path, _CALIBRATION_SUFFIXES) if _looks_like_calibration(file)]
     found: dict[str, Path] = {}
     for camera in cameras:
@@ -102,6 +102,7 @@ def _calibrations(path: Path, cameras: list[str], notes: list[Note]) -> dict[str
             found[camera] = own[0]
         elif len(shared) == 1 or (len(files) == 1 and len(cameras) == 1):
             found[camera] = (shared or files)[0]
+    found = {camera: file for camera, file in found.items() if camera not in options.calibration}
     for camera, file in found.items():
         notes.append(
             Note("guessed", f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
@@ -224,7 +225,7 @@ def _frames(
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
     notes: list[Note] = []
     images = _images(path, options)
-    cameras = cameras_of(images, options, notes, _calibrations(path, list(images), notes))
+    cameras = cameras_of(images, options, notes, _calibrations(path, list(images), options, notes))
     ids = common_ids(list(images.values()))
     for name, each in images.items():
         if lacking := [frame for frame in each.ids if frame not in set(ids)]:
@@ -238,7 +239,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
     found = _kinematics(path, options, notes)
     if not found:
-        notes.append(Note("missing", f"no table with joints or poses in {path}. Name one: --kinematics FILE."))
+        notes.append(_without_kinematics(path, options))
         return FoundRecording("images without kinematics", path.name, cameras, (), ids, None, tuple(notes))
     frames = _frames(path, next(iter(images.values())), ids, [table.path for table, _ in found], options, notes)
     arms, match = _matched(found, frames, options, notes)
@@ -253,6 +254,21 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     )
 
 
+def _without_kinematics(path: Path, options: ImportOptions) -> Note:
+    """Why there are images alone; tables that were looked at are named with their columns."""
+    if options.kinematics == NO_TABLE:
+        return Note("found", "kinematics are left out, as given.")
+    tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
+    if not tables:
+        return Note("missing", f"no table of joints or poses in {path}. Name one: --kinematics FILE.")
+    seen = "; ".join(f"{table.path.name} has {', '.join([*table.columns][:12])}" for table in tables[:3])
+    return Note(
+        "missing",
+        f"no table in {path} has six joints or a tip's pose (x, y, z, qx, qy, qz, qw): {seen}. Name another: "
+        "--kinematics FILE.",
+    )
+
+
 def _matched(
     found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: list[Note]
 ) -> tuple[tuple[FoundArm, ...], RowMatch]:
@@ -264,7 +280,8 @@ def _matched(
     arms: list[FoundArm] = []
     matches: list[RowMatch] = []
     for table, meanings in found:
-        notes.append(Note("guessed", f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
+        kind = "guessed" if options.kinematics is None else "found"
+        notes.append(Note(kind, f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
         notes += [Note("found", f"{table.path.name}: {remark}.") for remark in table.remarks]
         try:
             match = match_rows(frames, log_rows(table, meanings), options, notes.append)
@@ -294,7 +311,7 @@ def _arms(
         if options.arms and recorded not in rename and len(meanings.arms) > 1:
             continue
         name = rename.get(recorded) or recorded or next(iter(options.arms), "PSM1")
-        log = arm_log(table, name, found, rows, options, notes.append)
+        log = arm_log(table, name, found, rows, options, notes.append, meanings.stated)
         arms.append(arm_from_log(log, options, notes.append))
     return tuple(arms)
 

@@ -191,7 +191,8 @@ def _arms(
         if rename and recorded not in rename:
             continue
         name = rename.get(recorded, recorded or "PSM1")
-        arms.append(arm_from_log(arm_log(table, name, columns, times, options, notes.append), options, notes.append))
+        log = arm_log(table, name, columns, times, options, notes.append, meanings.stated)
+        arms.append(arm_from_log(log, options, notes.append))
     return tuple(arms)
 
 

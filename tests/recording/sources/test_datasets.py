@@ -1,5 +1,6 @@
 """SurgPose, EndoVis and JIGSAWS in the layouts of their owners, from one command to a sequence."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 from recordings import SIZE, K, assert_refused, image, joints_at, write_images, write_video
 
+from carts_core.errors import SequenceError
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
@@ -98,6 +100,18 @@ def test_a_trial_of_jigsaws_gets_its_joints_by_inverse_kinematics(tmp_path):
     assert np.abs(frame.measured["PSM_left"][:6] - joints_at(2 / 30)).max() < 1e-6
     assert frame.measured["PSM_right"][6] == pytest.approx(0.4)
     assert [camera.name for camera in sequence.scene.cameras] == ["left", "right"]
+
+
+@pytest.mark.parametrize("root", ["", "Suturing", "Suturing/kinematics"])
+def test_a_folder_of_jigsaws_names_its_trials_and_the_command(tmp_path, root):
+    first = jigsaws(tmp_path / "JIGSAWS set/Suturing")
+    folder = tmp_path / "JIGSAWS set" / root
+    if root != "Suturing/kinematics":
+        assert find(folder).name == "Suturing_B001", "the only trial"
+    shutil.copy(first, first.with_name("Suturing_B002.txt"))
+    with pytest.raises(SequenceError, match="2 trials of JIGSAWS: Suturing_B001, Suturing_B002") as error:
+        find(folder)
+    assert f"carts import '{first}'" in str(error.value)
 
 
 def rewritten(name: str, old: str, new: str) -> Callable[[Path], object]:

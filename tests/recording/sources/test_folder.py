@@ -89,6 +89,38 @@ def test_every_guess_can_be_changed(folder):
     assert [camera.name for camera in find(folder, ImportOptions(images=images)).cameras] == ["scope"]
 
 
+@pytest.mark.parametrize(
+    ("header", "given", "guessed"),
+    [
+        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], (), ["joints are", "kinematics:", "each row"]),
+        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], ("columns",), ["kinematics:", "each row"]),
+        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], ("kinematics", "frame"), ["joints are"]),
+        (["image", *(f"{name} [deg]" for name in JOINT_NAMES)], ("kinematics", "frame"), []),
+    ],
+)
+def test_what_was_given_or_named_is_not_called_guessed(folder, header, given, guessed):
+    table = folder / "log.csv"
+    text = table.read_text().splitlines(keepends=True)
+    table.write_text("".join([",".join(header) + "\n", *text[1:]]))
+    columns: dict[str, str] = dict(zip(map(str, JOINT_NAMES), header[1:], strict=True)) if "columns" in given else {}
+    columns |= {"frame": "image"} if "frame" in given else {}
+    calibration = {name: folder / f"{name}.yaml" for name in ("left", "right")}
+    kinematics = table if "kinematics" in given else None
+    found = find(folder, ImportOptions(columns=columns, kinematics=kinematics, calibration=calibration))
+    notes = [note.text for note in found.notes if note.kind == "guessed" and "angles are in" not in note.text]
+    assert len(notes) == len(guessed) and all(any(text in note for note in notes) for text in guessed), notes
+
+
+@pytest.mark.parametrize("header", [["x", "y", "z"], ["px", "py", "pz", "rx"]])
+def test_a_table_that_is_no_pose_is_named_with_its_columns(tmp_path, header):
+    write_images(tmp_path / "rec/left", FRAMES)
+    write_csv(tmp_path / "rec/poses.csv", header, np.ones((FRAMES, len(header))))
+    (note,) = [note.text for note in find(tmp_path / "rec").notes if "no table" in note.text]
+    assert f"poses.csv has {', '.join(header)}" in note and "tip's pose (x, y, z, qx, qy, qz, qw)" in note
+    left_out = find(tmp_path / "rec", ImportOptions(kinematics=Path("none")))
+    assert not [note for note in left_out.notes if "no table" in note.text]
+
+
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path, unit):
     factor = {"s": 1e-9, "ms": 1e-6, "us": 1e-3, "ns": 1}[unit]
