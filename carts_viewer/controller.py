@@ -201,6 +201,11 @@ class Controller:
             self._optimizing.end("Stopped by an error", save=False)
             self._context.change(playing=False)
 
+    def leave(self) -> None:
+        """End the run, as nobody sees it any more; where it is, is saved. Errors as `close`."""
+        if self._optimizing.active:
+            self._optimizing.end("Stopped: its tab was closed; Run starts anew from here")
+
     def close(self) -> None:
         """Save what is under way.
 

@@ -1,5 +1,6 @@
 """One tab: where somebody is in the recording and what they do there, whether or not a page shows it just now."""
 
+import time
 from collections.abc import Callable, Hashable
 
 import viser
@@ -16,6 +17,9 @@ from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.storage import Storage
 from carts_viewer.transport.tab_page import TabPage
+
+AWAY = 20.0
+"""Time for a page to come back, as by reloading, before the run of its tab is ended [s]."""
 
 
 class View:
@@ -52,6 +56,7 @@ class Tab:
     Attributes:
         key: what the tab calls itself; None until one has taken this place.
         person: who works here.
+        session: the recording and its project, as they are used here.
         controller: holds the state and changes it.
         view: what shows it; None while no page does.
     """
@@ -62,9 +67,11 @@ class Tab:
         self.controller = controller
         self.view: View | None = None
         self._queue = queue
-        self._session = session
+        self.session = session
         self._shown: ViewState | None = None
         self._pictured: ViewState | None = None
+        self._left_at: float | None = None
+        """When the page left [s, monotonic]; None while there is one, and once its run is ended."""
 
     def put(self, intent: Intent) -> None:
         """Have the worker do something here. Any thread may ask."""
@@ -83,13 +90,28 @@ class Tab:
         """Show this place in a page, and no longer in an earlier one."""
         choose_theme(client.gui, light=light)
         self.person.present = True
-        self.view = View(client, self._session, renderer, storage, self.controller.state, self.put, self.waits)
-        self._shown = self._pictured = None
+        self.view = View(client, self.session, renderer, storage, self.controller.state, self.put, self.waits)
+        self._shown = self._pictured = self._left_at = None
 
     def detach(self) -> None:
-        """The page is gone; what is under way goes on."""
+        """The page is gone; what is under way goes on for as long as it may come back."""
         self.view = None
         self.person.present = False
+        self._left_at = time.monotonic()
+
+    def away_in(self) -> float | None:
+        """How long until `leave` is due [s]; None: it is not."""
+        return None if self._left_at is None else max(0.0, self._left_at + AWAY - time.monotonic())
+
+    def leave(self) -> None:
+        """End what only the page could show, once it has been gone for long.
+
+        Raises:
+            CartsError: it could not be saved.
+        """
+        if self.away_in() == 0.0:
+            self._left_at = None
+            self.controller.leave()
 
     @property
     def pictured(self) -> bool:
@@ -135,4 +157,4 @@ class Tab:
         try:
             self.controller.close()
         finally:
-            self._session.close()
+            self.session.close()

@@ -10,7 +10,7 @@ from typing import Any
 import viser
 
 from carts_core.errors import CartsError
-from carts_core.optimization import FreeParameters, SurfaceSolver
+from carts_core.optimization import Backgrounds, FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
 from carts_viewer import intents
 from carts_viewer.background import Background
@@ -136,6 +136,12 @@ class Tabs:
             tab.controller.handle(intents.Play(False))
             # The places of those who left last are kept longest.
             self._tabs = (*(other for other in self._tabs if other is not tab), tab)
+
+    def forget_images(self) -> None:
+        """Drop the images of the recording that are kept for the next time, and what was computed from them."""
+        self._sequence.forget_images()
+        for session in (self._session, *(tab.session for tab in self._tabs)):
+            Backgrounds.forget(session.sequence)
 
     def close(self) -> None:
         """Save everything that is under way.

@@ -16,7 +16,7 @@ from carts_viewer.tabs import Tabs
 
 _log = logging.getLogger(__name__)
 
-MEMORY_KEPT = 30.0
+MEMORY_KEPT = 10.0
 """How long freed memory is kept for what comes next [s]."""
 _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
 """Intents that may begin what takes long."""
@@ -87,17 +87,20 @@ class Worker:
         wait_time = self._wait_time()
         at_rest = wait_time is None and self._queue.empty() and self._calls.empty()
         self._set_resting(at_rest)
-        waits = [wait_time, self._memory_wait(at_rest), *(tab.controller.overdue_in() for tab in self._tabs)]
+        waits = [wait_time, self._memory_wait(at_rest)]
+        for tab in self._tabs:
+            waits += [tab.controller.overdue_in(), tab.away_in()]
         known = [wait for wait in waits if wait is not None]
         waiting = self._queue.take(min(known, default=None) if self._calls.empty() else 0.0)
         self._set_resting(False)
-        if waiting:
+        if waiting or any(tab.away_in() == 0.0 for tab in self._tabs):
             self._worked_at = time.monotonic()
         while not self._calls.empty():
             self._attempt(self._calls.get_nowait(), *self._tabs)
         for asked in waiting:
             self._handle(asked)
         for tab in self._tabs:
+            self._attempt(tab.leave, tab)
             self._attempt(tab.controller.advance, tab, stop=True)
         self._advance_background()
         for tab in self._tabs:
@@ -117,6 +120,7 @@ class Worker:
             return self._worked_at + MEMORY_KEPT - now
         self._worked_at = None
         if not any(tab.view for tab in self._tabs):
+            self._attempt(self._tabs.forget_images)
             # Widgets of a page that is gone refer to one another. Beside a page, this would hold up what moves there.
             gc.collect()
         return_memory()

@@ -210,10 +210,12 @@ def soak(
                     raise ConnectionAbortedError
                 if kind != "connect":
                     opened[number].act(kind, 24)
-            except (ConnectionClosed, ConnectionAbortedError):
+            except (ConnectionClosed, ConnectionAbortedError, TimeoutError, RuntimeError):
                 opened[number].close()
-                key = dice.choice([f"soak{number}", f"soak{number} {seen.actions}"])
-                opened[number] = RandomTab(url, key.replace(" ", "-"), dice)
+                # A viewer at work brings a tab up to date late; the next action, which fails, tries again.
+                with suppress(TimeoutError):
+                    key = dice.choice([f"soak{number}", f"soak{number}-{seen.actions}"])
+                    opened[number] = RandomTab(url, key, dice)
             seen.actions += 1
             time.sleep(_PACE * dice.random())
         seen.minutes.append(_megabytes(process))

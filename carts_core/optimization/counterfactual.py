@@ -206,6 +206,11 @@ class Backgrounds:
             kept[key] = Backgrounds(images, known, problems)
         return kept[key]
 
+    @staticmethod
+    def forget(recording: Recording) -> None:
+        """Drop what is kept of a recording; the mean backgrounds themselves are kept by the recording."""
+        _MADE.pop(recording, None)
+
     def covers(self, scene: Scene) -> bool:
         """Whether the background of each camera of a scene is there."""
         return all(camera.name in self.images for camera in scene.cameras)

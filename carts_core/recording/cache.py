@@ -43,6 +43,12 @@ class ByteCache:
                 self._changed.notify_all()
         return array
 
+    def clear(self) -> None:
+        """Keep none of them any longer."""
+        with self._changed:
+            self._arrays.clear()
+            self._used = 0
+
     def __contains__(self, key: Hashable) -> bool:
         with self._changed:
             return key in self._arrays

@@ -243,6 +243,10 @@ class Sequence:
         """
         return self.mean_background(camera, domain).image.copy()
 
+    def forget_images(self) -> None:
+        """Drop the decoded images and masks that are kept for the next time."""
+        self._cache.clear()
+
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
         """The same with where it is known, and whether it tells what is there without arms; errors as `background`."""
         domain = self._domain(domain)

@@ -1,8 +1,11 @@
 """Stages of a solver, on objectives that are known in closed form and on a predictor that is always right."""
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -15,11 +18,12 @@ from carts_core.optimization.evaluation import Evaluation
 from carts_core.optimization.fit import Fit, StopReason
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.search import start_explains_as_well
+from carts_core.optimization.solvers import FirstOrderDescent
 from carts_core.optimization.stages import run_stage, run_stages
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
+from carts_core.settings import DescentSolver, SurfaceSolver
 from carts_core.settings import FreeParameters as Free
-from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, PreferStart, RandomRestart, Stage
 
 
@@ -172,3 +176,33 @@ def test_the_start_is_never_preferred_where_a_calibration_is_free(tiny_sequence:
         fit = frame_fit(tiny_sequence, free, np.zeros(7))
         list(run_stages(stages, fit))
         assert fit.stop_reason is reason
+
+
+@pytest.mark.parametrize("method", ["adam", "gradient_descent"])
+def test_first_order_descent_takes_the_steps_of_torch(method: Literal["adam", "gradient_descent"]) -> None:
+    rate, chance = 0.01, torch.Generator().manual_seed(0)
+    start = torch.randn(20, generator=chance)
+    settings = DescentSolver(method=method, learning_rate=rate, decay=0.9, decay_every=7)
+    descent = FirstOrderDescent(settings, start, start - 0.1, start + 0.1)
+    at = start.clone()
+    theirs = torch.optim.Adam([at], lr=rate, eps=1e-10) if method == "adam" else torch.optim.SGD([at], lr=rate)
+    schedule = torch.optim.lr_scheduler.StepLR(theirs, 7, 0.9)
+    for _ in range(30):
+        gradient = torch.randn(20, generator=chance)
+        at.grad = gradient if method == "adam" else gradient / gradient.abs().max()
+        theirs.step()
+        schedule.step()
+        at.clamp_(start - 0.1, start + 0.1)
+        assert torch.equal(descent.step(gradient), at)
+
+
+def test_first_order_descent_imports_no_compiler() -> None:
+    code = (
+        "import sys, torch\n"
+        "from carts_core.optimization.solvers import FirstOrderDescent\n"
+        "from carts_core.settings import DescentSolver\n"
+        "zero = torch.zeros(3)\n"
+        "FirstOrderDescent(DescentSolver(), zero, zero - 1, zero + 1).step(zero + 0.5)\n"
+        "sys.exit('torch._dynamo' in sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -6,8 +6,9 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,20 @@ import numpy as np
 import pytest
 from places import place_of, view_of, widget
 from viewer_canvas import decoded
+from viewer_run import run_without_end
 from waiting import get, wait_for
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from carts_core.errors import ProjectError, SequenceError, SettingsError
+from carts_core.optimization import Backgrounds
 from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
+from carts_core.recording.cache import ByteCache
 from carts_core.resources import sample_sequence
 from carts_viewer import editing, intents, worker
+from carts_viewer import tab as tabs
 from carts_viewer.app import ViewerApp
 from carts_viewer.layers import Layer, mask
 from carts_viewer.overlay import OverlayRenderer
@@ -33,6 +38,7 @@ from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.project import SavedPanel
 from carts_viewer.scene_view import FRAME, OVERLAY
 from carts_viewer.serving import serve
+from carts_viewer.state import Phase
 from carts_viewer.storage import open_storage
 from tools.raw_tab import RawTab
 
@@ -41,19 +47,49 @@ def _picture(png: bytes) -> np.ndarray:
     return cv2.cvtColor(decoded(png), cv2.COLOR_BGRA2RGBA)
 
 
-def test_nothing_is_left_of_the_page_of_a_tab_some_time_after_it_has_left(
+def test_neither_page_nor_images_are_left_some_time_after_the_last_tab_has_left(
     open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    images, get_image = [], ByteCache.get
+
+    def get(cache: ByteCache, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
+        image = get_image(cache, key, make)
+        images.append(weakref.ref(image))
+        return image
+
     monkeypatch.setattr(worker, "MEMORY_KEPT", 0.5)
+    monkeypatch.setattr(ByteCache, "get", get)
     app = open_viewer()
     gc.disable()
     try:
         with RawTab(app.url) as tab:
             page = weakref.ref(view_of(app, tab).page)
+            background = weakref.ref(Backgrounds.of(app.sequence, ["left"], app.sequence.domains[0]))
             app.wait_until_shown()
-        wait_for(lambda: page() is None)
+            assert background() is not None and any(image() is not None for image in images)
+        wait_for(lambda: page() is None and background() is None and all(image() is None for image in images))
     finally:
         gc.enable()
+
+
+def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabs, "AWAY", 2.0)
+    app = open_viewer()
+    run_without_end(app)
+    with RawTab(app.url, key="one") as raw:
+        place = place_of(app, raw)
+        place.put(intents.Run())
+        wait_for(lambda: len(place.controller.state.run.curves.loss) > 1)
+    with RawTab(app.url, key="one"):
+        # It came back in time, so its run goes on for as long as it stays.
+        end = time.monotonic() + tabs.AWAY
+        wait_for(lambda: time.monotonic() > end)
+        assert place.controller.state.run.phase is Phase.RUNNING
+    wait_for(lambda: place.controller.state.run.phase is Phase.IDLE)
+    state = app.wait_until_shown()
+    assert "tab was closed" in (state.run.reason or "") and state.undoable == 1 and not state.unsaved
 
 
 def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_viewer: Callable[..., ViewerApp]) -> None:
