@@ -110,16 +110,19 @@ class Worker:
         self._publish()
 
     def _memory_wait(self, at_rest: bool) -> float | None:
-        """Return memory after some rest; gives how long to wait for that [s], None where it was done."""
-        now = time.monotonic()
-        if not at_rest:
+        """Return memory after some rest, and at work now and then where no page could be held up by that.
+
+        Gives how long to wait for it [s], None where it was done.
+        """
+        now, alone = time.monotonic(), not any(tab.view for tab in self._tabs)
+        if not at_rest and (not alone or self._worked_at is None):
             self._worked_at = now
         if self._worked_at is None:
             return None
         if now - self._worked_at < MEMORY_KEPT:
             return self._worked_at + MEMORY_KEPT - now
-        self._worked_at = None
-        if not any(tab.view for tab in self._tabs):
+        self._worked_at = None if at_rest else now
+        if alone and at_rest:
             self._attempt(self._tabs.forget_images)
             # Widgets of a page that is gone refer to one another. Beside a page, this would hold up what moves there.
             gc.collect()

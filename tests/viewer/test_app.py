@@ -72,6 +72,19 @@ def test_neither_page_nor_images_are_left_some_time_after_the_last_tab_has_left(
         gc.enable()
 
 
+def test_memory_is_returned_during_work_that_no_page_shows(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    returned: list[Phase] = []
+    app = open_viewer()
+    run_without_end(app)
+    app.queue.put(intents.Run())
+    wait_for(lambda: app.state.run.phase is Phase.RUNNING)
+    monkeypatch.setattr(worker, "return_memory", lambda: returned.append(app.state.run.phase))
+    monkeypatch.setattr(worker, "MEMORY_KEPT", 0.3)
+    wait_for(lambda: returned.count(Phase.RUNNING) > 1)
+
+
 def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
     open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
 ) -> None:
