@@ -167,7 +167,7 @@ def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
     if found is None:
         return
     verdict = fit.assessment = assess(problem.evidence(found.offsets, found.evaluation.loss))
-    if verdict.verdict is Verdict.GOOD or fit.stop_reason is StopReason.NOT_OPTIMIZED:
+    if verdict.certain or fit.stop_reason is StopReason.NOT_OPTIMIZED:
         return
     if verdict.verdict is Verdict.FAILED and bool(found.offsets.any()):
         estimate, fit.offsets = fit.offsets, problem.start

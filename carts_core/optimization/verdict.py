@@ -18,6 +18,13 @@ class Verdict(Enum):
     DOUBTFUL = "doubtful"
     FAILED = "failed"
 
+    @classmethod
+    def of(cls, probability: float) -> "Verdict":
+        """What a probability of failure [1] alone calls for."""
+        if probability >= _LIKELY:
+            return cls.FAILED
+        return cls.DOUBTFUL if probability >= _POSSIBLE else cls.GOOD
+
 
 @dataclass(frozen=True)
 class Assessment:
@@ -34,18 +41,35 @@ class Assessment:
     nothing_there: bool = False
     """Whether no arm is in view or seen at all, so that nothing could be fitted."""
 
+    @property
+    def certain(self) -> bool:
+        """Whether the fit is good, and so likely right that its deviations need not allow for a wrong fit."""
+        return self.verdict is Verdict.GOOD and self.probability < _UNCERTAIN
+
     def of(self, known: Uncertainty) -> Uncertainty:
         """What is known after the verdict, from what the curvature of the objective says.
 
-        A good fit is taken at its word, of a failed one nothing is known beyond what was expected before.
+        A certain fit is taken at its word, of a failed one nothing is known beyond what was expected before.
         """
-        if self.verdict is Verdict.GOOD:
+        if self.certain:
             return known
-        return known.doubted(self.probability if self.verdict is Verdict.DOUBTFUL else 1.0)
+        return known.doubted(1.0 if self.verdict is Verdict.FAILED else self.probability)
 
 
-def assess(found: Evidence) -> Assessment:
-    """The verdict that the evidence calls for."""
+_UNCERTAIN, _POSSIBLE, _LIKELY = 0.1, 0.13, 0.5
+"""Probability of failure from which deviations allow for a wrong fit, a fit is doubtful, and it has failed [1]; why, is
+in docs/explanation/decisions.md."""
+
+
+def assess(found: Evidence, *, strict: bool = False) -> Assessment:
+    """The verdict that the evidence calls for.
+
+    Args:
+        found: the evidence.
+        strict: whether a fit is doubtful as soon as its deviations allow for a wrong one; so it always is with given
+            masks, whose overlap is the Dice itself.
+    """
+    doubtful_from = _UNCERTAIN if strict or found.masked else _POSSIBLE
     probability = _probability_of_failure(found)
     for applies, reason, remedy in _NOTHING_THERE:
         if applies(found):
@@ -57,9 +81,9 @@ def assess(found: Evidence) -> Assessment:
     if arm_is_elsewhere(found):
         reason = "An arm is out of view where it was fitted, and something that looks like an arm is elsewhere."
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
-    if probability >= _POSSIBLE:
+    if probability >= doubtful_from:
         reason = f"The {what} supports the fit only in part: " + _weakest(found)
-        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, probability, found)
+        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
     if found.parts_predicted < _PART_UNSEEN:
         reason = "The wrist or the jaws of an arm are not predicted where they were fitted, so only the shaft is."
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
@@ -70,9 +94,6 @@ def arm_is_elsewhere(found: Evidence) -> bool:
     """Whether an arm is out of view where it was fitted, and something that looks like an arm is in the image."""
     return found.elsewhere >= _LOOKS_LIKE_ONE
 
-
-_POSSIBLE, _LIKELY = 0.1, 0.5
-"""Probability of failure from which a fit is doubtful, and from which it has failed [1]."""
 
 _UNSEEN, _AT_RANDOM = 0.05, 0.5
 """Share of an arm below which nothing of it is predicted, and

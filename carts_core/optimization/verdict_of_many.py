@@ -72,10 +72,12 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     """The verdict on a calibration, from the median evidence of its frames, with joints as measured.
 
+    All frames rely on it, and its masks can be right while it is off, so it is doubtful earlier than a frame.
+
     Args:
         frames: the evidence of each; at least one.
     """
-    found = assess(median_evidence(frames))
+    found = assess(median_evidence(frames), strict=True)
     if found.verdict is Verdict.GOOD:
         return replace(found, reason="The images support the calibration.")
     reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")

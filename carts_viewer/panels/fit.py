@@ -2,7 +2,7 @@
 
 import viser
 
-from carts_core.optimization import fit_words, undetermined_joints
+from carts_core.optimization import Verdict, fit_words, undetermined_joints
 from carts_core.project import FitVerdict
 from carts_viewer import intents
 from carts_viewer.panels.inputs import Emit, escaped, on_click
@@ -11,8 +11,6 @@ from carts_viewer.session import Session
 from carts_viewer.state import Phase, ViewState
 from carts_viewer.transport.tab_page import TabPage
 
-_POSSIBLE, _LIKELY = 0.1, 0.5
-"""Probabilities of a failure from which a single camera's fit is doubtful and has failed; as the verdict's own [1]."""
 _MEANING = (
     "What the images say of the fit. Good: rely on the mask. Doubtful: look at it. Failed: do not use it. Joints "
     "that the images leave open stay near their measured values; their deviations are under Values."
@@ -102,7 +100,7 @@ def fit_text(
 
 def quality(failure: float) -> str:
     """The verdict that a probability of failure calls for."""
-    return "failed" if failure >= _LIKELY else "doubtful" if failure >= _POSSIBLE else "good"
+    return Verdict.of(failure).value
 
 
 def _scores(state: ViewState, cameras: list[str]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from carts_core.optimization.evidence import evidence
 from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.observability import Uncertainty
 from carts_core.optimization.verdict import assess
+from carts_core.optimization.verdict_of_many import assess_calibration
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 
@@ -82,6 +83,42 @@ def test_a_mask_that_is_black_on_the_arms_or_shows_none_has_failed() -> None:
 def test_a_fit_whose_wrist_or_jaws_are_not_predicted_is_not_good(predicted: float, wanted: Verdict) -> None:
     found = assess(replace(CONVINCING, parts_predicted=predicted))
     assert found.verdict is wanted and ("wrist or the jaws" in found.reason) == (wanted is Verdict.DOUBTFUL)
+
+
+_HARDLY = {"loss": 0.033, "residual": 0.101, "agreement": 0.900, "unconditioned": 0.700, "overlap_with_change": 0.770}
+_WRONG = {"loss": 0.056, "residual": 0.228, "agreement": 0.846, "unconditioned": 0.791, "overlap_with_change": 0.772}
+
+
+@pytest.mark.parametrize(
+    ("seen", "wanted"),
+    [
+        (_HARDLY, Verdict.GOOD),
+        ({**_HARDLY, "loss": 0.046, "residual": 0.085, "agreement": 0.922, "overlap_with_change": None}, Verdict.GOOD),
+        (_WRONG, Verdict.DOUBTFUL),
+        (
+            {**_WRONG, "loss": 0.067, "residual": 0.248, "agreement": 0.841, "overlap_with_change": None},
+            Verdict.DOUBTFUL,
+        ),
+    ],
+    ids=["Dice .988", "Dice .990, smoke", "Dice .882", "Dice .892, smoke"],
+)
+def test_fits_of_instruments_that_no_training_has_are_doubtful_where_they_are_wrong(
+    seen: dict[str, float | None], wanted: Verdict
+) -> None:
+    found = assess(replace(CONVINCING, **seen))
+    assert found.verdict is wanted and Verdict.of(found.probability) is wanted
+
+
+def test_what_is_good_and_not_certain_widens_deviations_and_leaves_a_calibration_doubtful() -> None:
+    known, hardly = Uncertainty(("PSM1/yaw",), (0.01,), (0.05,)), replace(CONVINCING, **_HARDLY)
+    assert assess(hardly).of(known).std > known.std
+    assert assess_calibration([hardly]).verdict is Verdict.DOUBTFUL
+
+
+@pytest.mark.parametrize(("overlap", "wanted"), [(0.89, Verdict.DOUBTFUL), (0.91, Verdict.GOOD)])
+def test_a_fit_to_a_mask_is_good_from_a_dice_of_nine_tenths(overlap: float, wanted: Verdict) -> None:
+    masked = replace(CONVINCING, masked=True, agreement=overlap, changed=None, overlap_with_change=None)
+    assert assess(masked).verdict is wanted and Verdict.of(assess(masked).probability) is wanted
 
 
 def test_a_verdict_grows_worse_with_the_evidence() -> None:
