@@ -54,8 +54,11 @@ def mesh_parts(
         RobotError: it has too many triangles or parts.
         Exception: it is damaged; the class is that of the reader.
     """
-    content = io.BytesIO(read_bytes(path, MESH))
-    loaded = trimesh.load_scene(content, file_type=kind, resolver=_BesideTheMesh(str(path)))
+    content = read_bytes(path, MESH)
+    # A binary STL has 84 bytes before its triangles and 50 for each of them.
+    if kind == "stl" and len(content) > 84 + 50 * MOST_FACES and not content.startswith(b"solid"):
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+    loaded = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=_BesideTheMesh(str(path)))
     if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MOST_FACES:
         raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
     if len(loaded.graph.nodes_geometry) > MOST_PARTS:

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..files.reading import CALIBRATION, TABLE, read_bytes
 
-MOST_CELLS = 10_000_000
-"""Most values of a table."""
+MOST_CELLS, MOST_ROWS, MOST_COLUMNS = 10_000_000, 1_500_000, 10_000
+"""Most values, rows and columns of a table."""
 LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
 """Imported before the memory of a decoder is counted."""
 
@@ -29,7 +29,8 @@ def read_parquet(path: Path) -> dict[str, Any]:
         file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
         # A run of equal values takes some bytes, however long it is.
-        check_cells(sum(group.column(number).num_values for group in groups for number in range(group.num_columns)))
+        cells = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
+        check_size(-(-cells // max(file.metadata.num_columns, 1)), file.metadata.num_columns)
         table = file.read()
     except pyarrow.ArrowException as error:
         raise ValueError(str(error)) from error
@@ -100,11 +101,13 @@ def _name_of_object(name: str, value: Any) -> str:
     return "stereoParams" if name in ("None", "__function_workspace__") else ""
 
 
-def check_cells(count: int) -> None:
-    """Check the number of values of a table.
+def check_size(rows: int, columns: int = 1) -> None:
+    """Check the number of rows and columns of a table.
 
     Raises:
         ValueError: there are too many.
     """
-    if count > MOST_CELLS:
-        raise ValueError(f"it has {count:,} values; at most {MOST_CELLS:,} are read")
+    limits = (rows * columns, MOST_CELLS, "values"), (rows, MOST_ROWS, "rows"), (columns, MOST_COLUMNS, "columns")
+    for count, most, what in limits:
+        if count > most:
+            raise ValueError(f"it has {count:,} {what}; at most {most:,} are read")

@@ -37,8 +37,10 @@ from ..stopping import end_with_parent
 from ..wording import shortened
 from .reading import GIB, MIB, RefusedFileError
 
-_SECONDS, _SECONDS_PER_MIB = 3.0, 1.0
+_SECONDS, _SECONDS_PER_MIB = 2.5, 0.5
 _MEMORY, _MEMORY_PER_BYTE = 400 * MIB, 8
+_COUNTED = 128 * MIB
+"""Bytes of a file that add to the memory of its decoder; larger ones are read in parts."""
 _PATIENCE = 20
 """Waiting time allowed for each second of processor time, on a busy machine."""
 _IDLE = 10.0
@@ -71,7 +73,9 @@ class Limits:
         files = [path] if not path.is_dir() else path.iterdir()
         size = sum(file.stat().st_size for file in files if file.is_file())
         return Limits(
-            _SECONDS + _SECONDS_PER_MIB * size / MIB, _MEMORY + _MEMORY_PER_BYTE * size, _LARGEST_FILE + 100 * size
+            _SECONDS + _SECONDS_PER_MIB * size / MIB,
+            _MEMORY + _MEMORY_PER_BYTE * min(size, _COUNTED),
+            _LARGEST_FILE + 100 * size,
         )
 
 

@@ -34,6 +34,10 @@ def parsed_urdf(text: str, source: Path) -> Element:
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RobotError(f"robot {source} declares a document type or entities, which no URDF needs. Remove them.")
+    if text.count("<") > 2 * _MOST_ELEMENTS:
+        raise RobotError(
+            f"robot {source} has more than {_MOST_ELEMENTS:,} elements. Export it without what is not drawn."
+        )
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:

@@ -24,7 +24,7 @@ from fuzz.growing_files import CASES, READERS, right_file, right_folder
 SECONDS = 5.0
 """Of processor time, of the process and its children [s]."""
 MEMORY = 512 * 2**20
-"""Beyond that of the interpreter and what is imported in this process [bytes]."""
+"""For a file that is smaller; beyond that of the interpreter and what is imported in this process [bytes]."""
 INTERPRETER = 60 * 2**20
 """Memory of a child process that has imported little [bytes]."""
 PATIENCE = 180
@@ -66,7 +66,7 @@ def measured(kind: str, name: str, make: Callable[[Path], Path]) -> Cost:
     memory = seen["memory"]
     result = seen["result"]
     if result in ("read", "refused"):
-        result = "slow" if seen["seconds"] > SECONDS else "memory" if memory > MEMORY else result
+        result = "slow" if seen["seconds"] > SECONDS else "memory" if memory > max(MEMORY, size) else result
     return Cost(kind, name, result, size, seen["seconds"], memory, seen["detail"])
 
 

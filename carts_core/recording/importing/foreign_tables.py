@@ -103,19 +103,22 @@ def read_array(path: Path) -> np.ndarray:
 
 def _csv(path: Path) -> ForeignTable:
     text = read_text(path, TABLE).removeprefix("\ufeff")
-    numbered = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    lines = text.splitlines()
+    numbers = [number for number, line in enumerate(lines, start=1) if line.strip()]
+    lines = [lines[number - 1] for number in numbers]
     # Extracted dVRK topics begin with their name and type behind a mark.
-    while len(numbered) > 1 and numbered[0][1].lstrip().startswith("#") and not _begins_with_digit(numbered[1][1]):
-        numbered = numbered[1:]
-    if not numbered:
+    begin = 0
+    while begin + 1 < len(lines) and lines[begin].lstrip().startswith("#") and not _begins_with_digit(lines[begin + 1]):
+        begin += 1
+    numbers, lines = numbers[begin:], lines[begin:]
+    if not lines:
         return ForeignTable(path, {})
-    numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
     if lines[0].startswith("#"):
         lines[0] = lines[0].lstrip("# ")
     delimiter = _delimiter(lines[:50])
-    tables.check_cells(len(lines) * (lines[0].count(delimiter or " ") + 1))
-    rows = [line.split() for line in lines] if delimiter is None else list(csv.reader(lines, delimiter=delimiter))
-    rows, remarks = _even([[cell.strip() for cell in row] for row in rows], numbers)
+    tables.check_size(len(lines), lines[0].count(delimiter or " ") + 1)
+    cells = map(str.split, lines) if delimiter is None else csv.reader(lines, delimiter=delimiter)
+    rows, remarks = _even([[cell.strip() for cell in row] for row in cells], numbers)
     first, width = rows[0], len(rows[0])
     commas = delimiter != ","
     named = not all(_is_number(cell, commas) for cell in first)
