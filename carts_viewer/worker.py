@@ -18,6 +18,8 @@ _log = logging.getLogger(__name__)
 
 MEMORY_KEPT = 10.0
 """How long freed memory is kept for what comes next [s]."""
+MEMORY_KEPT_AT_WORK = 30.0
+"""The same during work beside an open page, where the return may delay a picture by some milliseconds [s]."""
 _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
 """Intents that may begin what takes long."""
 
@@ -38,6 +40,8 @@ class Worker:
         self._resting = False
         self._worked_at: float | None = 0.0
         """When something was done last [s, monotonic]; None where its memory is returned."""
+        self._returned_at = 0.0
+        """When memory was returned last [s, monotonic]."""
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:
@@ -110,11 +114,13 @@ class Worker:
         self._publish()
 
     def _memory_wait(self, at_rest: bool) -> float | None:
-        """Return memory after some rest, and at work now and then where no page could be held up by that.
+        """Return memory after some rest, and now and then during work, more rarely beside an open page.
 
         Gives how long to wait for it [s], None where it was done.
         """
         now, alone = time.monotonic(), not any(tab.view for tab in self._tabs)
+        if not (at_rest or alone) and now - self._returned_at > MEMORY_KEPT_AT_WORK:
+            self._return_memory()
         if not at_rest and (not alone or self._worked_at is None):
             self._worked_at = now
         if self._worked_at is None:
@@ -126,8 +132,12 @@ class Worker:
             self._attempt(self._tabs.forget_images)
             # Widgets of a page that is gone refer to one another. Beside a page, this would hold up what moves there.
             gc.collect()
-        return_memory()
+        self._return_memory()
         return None
+
+    def _return_memory(self) -> None:
+        return_memory()
+        self._returned_at = time.monotonic()
 
     def _handle(self, asked: Asked[Tab]) -> None:
         # One of a tab that is gone for good has nobody to do it for.

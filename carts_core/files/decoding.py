@@ -37,7 +37,7 @@ from ..stopping import end_with_parent
 from ..wording import shortened
 from .reading import GIB, MIB, RefusedFileError
 
-_SECONDS, _SECONDS_PER_MIB = 2.5, 0.5
+_SECONDS, _SECONDS_PER_MIB = 2.5, 0.2
 _MEMORY, _MEMORY_PER_BYTE = 400 * MIB, 8
 _COUNTED = 128 * MIB
 """Bytes of a file that add to the memory of its decoder; larger ones are read in parts."""

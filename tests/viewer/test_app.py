@@ -85,6 +85,21 @@ def test_memory_is_returned_during_work_that_no_page_shows(
     wait_for(lambda: returned.count(Phase.RUNNING) > 1)
 
 
+def test_memory_is_returned_during_work_beside_a_page(
+    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    returned: list[Phase] = []
+    app = open_viewer()
+    run_without_end(app)
+    with RawTab(app.url, key="one") as raw:
+        place = place_of(app, raw)
+        place.put(intents.Run())
+        wait_for(lambda: place.controller.state.run.phase is Phase.RUNNING)
+        monkeypatch.setattr(worker, "return_memory", lambda: returned.append(place.controller.state.run.phase))
+        monkeypatch.setattr(worker, "MEMORY_KEPT_AT_WORK", 0.3)
+        wait_for(lambda: returned.count(Phase.RUNNING) > 1)
+
+
 def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
     open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Bool
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, read_text
+from ...wording import shown
 from .found import MOST_IMAGES, MOST_KEYPOINTS, ForeignImage
 from .rasters import mask_of_polygon, mask_of_runs
 
@@ -43,6 +44,9 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         images = root.findall("image")
         if len(images) > MOST_IMAGES:
             raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+        name, times = Counter(image.get("name") for image in images).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"it has image {shown(str(name))} {times} times")
     except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
         raise SequenceError(f"{path} is not a CVAT file ({error}). Export it again.") from error
     for image in images:
