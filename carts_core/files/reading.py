@@ -73,6 +73,10 @@ class RefusedFileError(CartsError, OSError):
     """
 
 
+class LfsPointerError(RefusedFileError):
+    """A file stands for one that Git LFS has not fetched."""
+
+
 def is_regular(path: Path) -> bool:
     """Whether there is a regular file, directly or by links; False for names that no file can have."""
     try:
@@ -101,7 +105,7 @@ def open_regular(path: Path, kind: Kind) -> BinaryIO:
         if status.st_size > kind.limit:
             raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
         if status.st_size <= _LARGEST_POINTER and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
-            raise RefusedFileError(_POINTER_TEXT)
+            raise LfsPointerError(_POINTER_TEXT)
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from ..errors import RobotError
 from ..extras import needs_extra
 from ..files.decoding import decoded
-from ..files.reading import CALIBRATION, MESH, open_regular, parse_yaml, read_text
+from ..files.reading import CALIBRATION, MESH, LfsPointerError, open_regular, parse_yaml, read_text
 from ..wording import counted
 from .mesh_files import mesh_path
 from .psm_kinematics import CLASSIC, SI
@@ -26,7 +26,6 @@ _PREFIX = "PSM1_"
 _FIRST_SEEN = "roll_link"
 """This link and what hangs on it can be in view."""
 _CARRIED_BY = "insertion_link"
-_LFS = b"version https://git-lfs"
 _TABLE = Path("urdf/common/instruments/instruments.yaml")
 
 
@@ -178,7 +177,7 @@ def _relocate_meshes(root: ElementTree.Element, model: Path, folder: Path) -> No
         path = mesh_path((model / "urdf").resolve(), mesh.get("filename", ""))
         if not path.is_file():
             missing.append(mesh.get("filename", "").removeprefix(f"package://{PACKAGE}/"))
-        elif _starts_with(path, _LFS):
+        elif _is_pointer(path):
             pointers.append(str(path))
         mesh.set("filename", Path(os.path.relpath(path, folder.resolve())).as_posix())
     if pointers:
@@ -190,6 +189,9 @@ def _relocate_meshes(root: ElementTree.Element, model: Path, folder: Path) -> No
         raise RobotError(f"{model} lacks meshes of this instrument: {', '.join(missing)}. Check it out again, whole.")
 
 
-def _starts_with(path: Path, start: bytes) -> bool:
-    with open_regular(path, MESH) as stream:
-        return stream.read(len(start)) == start
+def _is_pointer(path: Path) -> bool:
+    try:
+        open_regular(path, MESH).close()
+    except LfsPointerError:
+        return True
+    return False

@@ -24,8 +24,8 @@ _HEADER = 2**18
 """Bytes at the beginning of an image that hold its traits."""
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits of a value that cameras have."""
-_SAMPLED = 12
-"""Images of a camera in which bits are counted, and masks in which grey borders are looked for."""
+_SAMPLED, _SAMPLED_MASKS = 12, 2
+"""Images of a camera in which bits are counted, and masks in which grey borders are looked for, when it is opened."""
 _NEAR = 16
 """Values of compressed masks this near to black or white are black or white."""
 _MOST_LABELS = 32
@@ -189,7 +189,7 @@ def read_labels(path: Path) -> LabelImage:
 def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
     """What is changed about some of the mask files; errors are left to those who use them."""
     found: list[str] = []
-    chosen = spread_files([*files])
+    chosen = spread_files([*files], _SAMPLED_MASKS)
     for file in chosen:
         try:
             found += read_labels(file).remarks
@@ -227,8 +227,12 @@ def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
 def is_deep(files: Sequence[Path]) -> bool:
     """Whether the first of the images has more than 8 bits."""
     try:
+        with open_regular(files[0], IMAGE) as stream:
+            head = stream.read(25)
+        if head.startswith((PNG, JPEG)):
+            return head.startswith(PNG) and head[-1] > 8  # Bit depth of the header chunk.
         return _decode(files[0], colour=True).pixels.dtype != np.uint8
-    except (SequenceError, IndexError):
+    except (SequenceError, OSError, IndexError):
         return False
 
 
@@ -243,11 +247,11 @@ def bits_of_files(files: Sequence[Path]) -> int:
     return _fewest_bits(largest)
 
 
-def spread_files(files: Sequence[Path]) -> list[Path]:
+def spread_files(files: Sequence[Path], most: int = _SAMPLED) -> list[Path]:
     """Some of the files, from the first to the last."""
     if not files:
         return []
-    rows = np.unique(np.linspace(0, len(files) - 1, min(_SAMPLED, len(files))).round().astype(int))
+    rows = np.unique(np.linspace(0, len(files) - 1, min(most, len(files))).round().astype(int))
     return [files[row] for row in rows]
 
 

@@ -1,10 +1,13 @@
-"""What keeps long recordings light: opening decodes nothing, and browsing keeps no more than the cache may hold."""
+"""Long recordings: opening decodes hardly anything, and browsing keeps no more than the cache may hold."""
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from carts_core.recording import Sequence
+from carts_core.recording.video_index import decoded_frames
 from tools.bench_recordings import browse, make_recording, open_seconds
 
 FRAMES = 60
@@ -27,17 +30,25 @@ def test_images_and_video_of_a_recording_have_the_same_frames(recording):
         assert abs(difference).mean() < abs(neighbour - video.frame(index).images["left"]).mean()
 
 
-def test_opening_decodes_no_image(recording, monkeypatch):
-    def refuse(*arguments: object):
+def test_opening_decodes_no_image_file_and_one_frame_of_a_video(recording, monkeypatch):
+    decoded = []
+
+    def counted(*arguments: Any) -> Iterator[Any]:
+        for frame in decoded_frames(*arguments):
+            decoded.append(frame)
+            yield frame
+
+    def refuse(*arguments: object) -> None:
         raise AssertionError("an image was decoded")
 
     monkeypatch.setattr("carts_core.recording.images.cv2.imdecode", refuse)
-    monkeypatch.setattr("carts_core.recording.video_index.decoded_frames", refuse)
-    monkeypatch.setattr("carts_core.recording.video.decoded_frames", refuse)
-    for path in recording.values():
-        sequence = Sequence.open(path)
-        with pytest.raises(AssertionError, match="an image was decoded"):
-            sequence.frame(0)
+    monkeypatch.setattr("carts_core.recording.video.decoded_frames", counted)
+    files, video = (Sequence.open(path) for path in recording.values())
+    assert len(decoded) == 1
+    video.frame(0)
+    assert len(decoded) == 1
+    with pytest.raises(AssertionError, match="an image was decoded"):
+        files.frame(0)
 
 
 def test_browsing_keeps_no_more_than_the_cache_may_hold(recording, monkeypatch):

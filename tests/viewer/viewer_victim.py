@@ -81,10 +81,10 @@ def check_whole(path: Path, frames: int) -> None:
     annotations = path / "annotations" / "instances_default.json"
     if annotations.exists():
         assert len(json.loads(annotations.read_text())["images"]) == frames, path
-        folders = ("images",)
+        folders = ()
     else:
         assert json.loads((path / "labels.json").read_text()).keys() == {"binary", "arms", "parts", "links"}, path
-        folders = ("images", "binary", "arms", "parts", "links")
+        folders = ("binary", "arms", "parts", "links")
     for folder in folders:
         pictures = list((path / folder).iterdir())
         assert len(pictures) == frames, path / folder
