@@ -37,8 +37,8 @@ def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _projects_of_the_shipped_sequence_beside_the_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "data"))
+def _data_of_the_user(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path_factory.mktemp("data")))
 
 
 @pytest.fixture(scope="session", autouse=True)

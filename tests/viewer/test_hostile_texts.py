@@ -236,8 +236,9 @@ def test_texts_of_a_recording_and_its_project_stay_texts_in_the_viewer(
         ):
             app.queue.put(step)
             app.wait_until_shown(60)
+            said = [f"ran.push({number})" for number in _numbers(app.state.error or "")]
+            wait_in(pages[0], f"{json.dumps(said)}.every(one => document.body.innerHTML.includes(one))")
             for page in pages:
-                page.wait_for_timeout(100)
                 check(page, texts)
         walk(pages[0], texts, lists=True)
         small.get_by_role("button", name="All controls").click()
