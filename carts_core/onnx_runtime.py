@@ -1,14 +1,42 @@
-"""ONNX Runtime without its telemetry: from 1.29 on it reports machine and models to Microsoft by default.
+"""Sessions of ONNX Runtime, loaded on first use and without its telemetry.
 
-Whoever needs `onnxruntime` imports it from here, since the library looks at the environment when it is loaded.
+ONNX Runtime reports machine and models to Microsoft by default from 1.29 on.
 """
 
 import os
+from typing import TYPE_CHECKING
 
-os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+from .process import memory_kept
 
-import onnxruntime
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
 
-onnxruntime.disable_telemetry_events()
 
-__all__ = ["onnxruntime"]
+def inference_session(graph: bytes, threads: int | None = None) -> "InferenceSession":
+    """A session of an ONNX graph on the CPU.
+
+    Args:
+        graph: content of an ONNX file.
+        threads: for one operator; None lets ONNX Runtime choose.
+
+    Raises:
+        ImportError: ONNX Runtime is not installed.
+        RuntimeError: it cannot load the graph.
+    """
+    # Read by the library when it is loaded.
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime  # noqa: PLC0415  slow to load, and not needed by torch
+
+    onnxruntime.disable_telemetry_events()
+    options = onnxruntime.SessionOptions()
+    if threads is not None:
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        # Waiting threads that spin take the cores from other work, such as torch's.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Its own pool has a block for every size of image and returns none.
+    options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # Its errors have no base class but this.
+        raise RuntimeError(str(error)) from error

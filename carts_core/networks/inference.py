@@ -26,8 +26,8 @@ from ..files.reading import VALUES, WEIGHTS, parse_json, read_bytes
 from ..fingerprints import fingerprint
 from ..model.mesh_cache import cache_dir
 from ..model.surface import SURFACE_CHANNELS
-from ..onnx_runtime import onnxruntime
-from ..process import inference_threads, memory_kept
+from ..onnx_runtime import inference_session
+from ..process import inference_threads
 from ..settings.optimization import Engine, Inference
 from .network import SurfaceNetwork
 
@@ -65,11 +65,11 @@ class OnnxSurface:
     def __init__(self, network: SurfaceNetwork, sha256: str) -> None:
         path = cache_dir() / f"surface-{sha256[:32]}-{_VERSION}.onnx"
         try:
-            self._session = _session(read_bytes(path, WEIGHTS))
+            self._session = inference_session(read_bytes(path, WEIGHTS), inference_threads())
         except (OSError, RuntimeError, ValueError):
             # It is not there yet, or was damaged.
             graph = _exported(network)
-            self._session = _session(graph)
+            self._session = inference_session(graph, inference_threads())
             _keep(path, graph)
 
     def __call__(
@@ -87,20 +87,6 @@ class OnnxSurface:
             raise RuntimeError(f"ONNX Runtime cannot run the graph: {error}") from error
         assert isinstance(maps, np.ndarray)
         return torch.from_numpy(maps)
-
-
-def _session(graph: bytes) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = inference_threads(), 1
-    # Waiting threads that spin take the cores from whatever else runs, such as torch.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Its own pool has a block for every size of image and returns none.
-    options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # Its errors have no base class but this.
-        raise RuntimeError(f"ONNX Runtime cannot load the graph: {error}") from error
 
 
 def _exported(network: SurfaceNetwork) -> bytes:

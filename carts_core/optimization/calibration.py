@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm as gaussian
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtrit
 
 from ..errors import SettingsError
 from ..model.landmarks import link_transforms
@@ -382,7 +381,7 @@ def _widened(
     # Welch's and Satterthwaite's degrees of freedom of a sum (An approximate distribution of estimates of variance
     # components, 1946).
     freedom = (count - 1) * (variance / frames.clamp(min=1e-30)).square()
-    wider = student.ppf(gaussian.cdf(1.0), freedom.clamp(max=1e9).numpy())
+    wider = stdtrit(freedom.clamp(max=1e9).numpy(), ndtr(1.0))
     return variance.sqrt() * torch.from_numpy(wider)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from .evidence import Evidence
 from .familiarity import RECOGNIZED, UNKNOWN_ROBOT_REMEDY, Familiarity, overlap_below_usual
@@ -138,4 +138,4 @@ def _chance(rises: Float[np.ndarray, " frames"]) -> float:
     """Probability of a mean rise that large where there is none [1]."""
     freedom = len(rises) - 1 + _SCATTER_FREEDOM
     squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
-    return float(student.sf(rises.mean() / np.sqrt(squares / freedom / len(rises)), freedom))
+    return float(stdtr(freedom, -rises.mean() / np.sqrt(squares / freedom / len(rises))))

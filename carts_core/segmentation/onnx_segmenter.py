@@ -7,7 +7,7 @@ decoder, which the exports of its successors keep.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,10 +15,12 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..errors import WeightsError
 from ..files.reading import WEIGHTS, read_bytes
-from ..onnx_runtime import onnxruntime
-from ..process import memory_kept
+from ..onnx_runtime import inference_session
 from ..wording import shortened
 from .prompt import Prompt
+
+if TYPE_CHECKING:
+    from ..onnx_runtime import InferenceSession
 
 _MEAN, _DEVIATION = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 """Of the colours of an image, as SAM's encoders take it, RGB in 0..255."""
@@ -38,9 +40,7 @@ class OnnxSegmenter:
         name: of the decoder's file, for people.
     """
 
-    def __init__(
-        self, encoder: onnxruntime.InferenceSession, decoder: onnxruntime.InferenceSession, side: int, name: str
-    ) -> None:
+    def __init__(self, encoder: "InferenceSession", decoder: "InferenceSession", side: int, name: str) -> None:
         self.name = name
         self._encoder, self._decoder, self._side = encoder, decoder, side
         self._wanted = {given.name: given for given in decoder.get_inputs()}
@@ -134,7 +134,7 @@ class OnnxSegmenter:
         return dict(self._last[1])
 
 
-def _run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _run(session: "InferenceSession", inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """All outputs by name."""
     names = [found.name for found in session.get_outputs()]
     values = session.run(None, dict(inputs))
@@ -172,7 +172,7 @@ def _typed(value: np.ndarray, kind: str) -> np.ndarray:
     return np.ascontiguousarray(value, types[kind])
 
 
-def _session(path: Path) -> onnxruntime.InferenceSession:
+def _session(path: Path) -> "InferenceSession":
     try:
         content = read_bytes(path, WEIGHTS)
     except (OSError, ValueError) as error:
@@ -182,12 +182,9 @@ def _session(path: Path) -> onnxruntime.InferenceSession:
             f"segmenter file {path} is a PyTorch file, which may run code of whoever made it when it is loaded. Export "
             f"it as ONNX. {_REMEDY}"
         )
-    options = onnxruntime.SessionOptions()
-    options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
-    options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # As above.
+        return inference_session(content)
+    except RuntimeError as error:
         raise WeightsError(
             f"segmenter file {path} is no ONNX graph that can be run ({shortened(str(error), 300)}). {_REMEDY}"
         ) from error

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ...model.scene import Scene
 from .points import ImagePoint, views_of
@@ -72,8 +72,8 @@ def agreement_with_points(
         freedom[list(view.rows)] += view.is_point
     counted = np.setdiff1d(np.flatnonzero(np.isfinite(found.distances)), found.contradicting)
     limits = np.full(len(points), np.inf)
-    limits[counted] = found.noise * np.sqrt(chi2.isf(_LEVEL / len(counted), freedom[counted]))
-    rms_limit = found.noise * np.sqrt(chi2.isf(_LEVEL, freedom[counted].sum()) / len(counted))
+    limits[counted] = found.noise * np.sqrt(chdtri(freedom[counted], _LEVEL / len(counted)))
+    rms_limit = found.noise * np.sqrt(chdtri(freedom[counted].sum(), _LEVEL) / len(counted))
     before = found.distances
     rms_before, rms_after = (float(np.sqrt((each[counted] ** 2).mean())) for each in (before, after))
     return PointAgreement(before, after, limits, rms_before, rms_after, float(rms_limit))
