@@ -31,6 +31,10 @@ class Import:
 
     def run(self) -> None:
         """Say what was found, and write the sequence file."""
+        from ..files.decoding import prepare
+
+        if self.source is not None:
+            prepare()  # While torch is loaded.
         from ..recording.importing.found import recording_name
         from ..recording.importing.importer import import_recording, known_kinds
 

@@ -38,7 +38,7 @@ from ..wording import shortened
 from .reading import GIB, MIB, RefusedFileError
 
 _SECONDS, _SECONDS_PER_MIB = 2.5, 0.2
-_MEMORY, _MEMORY_PER_BYTE = 400 * MIB, 8
+_MEMORY, _MEMORY_PER_BYTE = 320 * MIB, 8
 _COUNTED = 128 * MIB
 """Bytes of a file that add to the memory of its decoder; larger ones are read in parts."""
 _PATIENCE = 20
@@ -102,16 +102,33 @@ def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
 
 def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
     """As `decoded`, within any limits."""
-    with _LOCK:
-        decoder = _IDLE_DECODERS.pop() if _IDLE_DECODERS else Decoder()
+    decoder = acquire()
     try:
         return decoder.call(function, *arguments, limits=limits)
     finally:
-        with _LOCK:
-            if len(_IDLE_DECODERS) < _MOST_IDLE:
-                _IDLE_DECODERS.append(decoder)
-            else:
-                decoder.close()
+        release(decoder)
+
+
+def acquire() -> "Decoder":
+    """A decoder for calls that share what they open; an idle one where there is one."""
+    with _LOCK:
+        return _IDLE_DECODERS.pop() if _IDLE_DECODERS else Decoder()
+
+
+def release(decoder: "Decoder") -> None:
+    """Keep an acquired decoder for later calls, or end it where there are enough."""
+    with _LOCK:
+        if len(_IDLE_DECODERS) < _MOST_IDLE:
+            _IDLE_DECODERS.append(decoder)
+            return
+    decoder.close()
+
+
+def prepare() -> None:
+    """Start a child that will be needed soon, beside other work."""
+    decoder = Decoder()
+    decoder.start()
+    release(decoder)
 
 
 class Decoder:
@@ -167,8 +184,7 @@ class Decoder:
             DecodingLimitError: it was ended by the limits.
             ValueError: it has died, as of a fault in a library.
         """
-        if self._process is None or self._pipe is None:
-            self._start()
+        self.start()
         assert self._process is not None and self._pipe is not None
         patience = limits.seconds * _PATIENCE
         try:
@@ -188,7 +204,10 @@ class Decoder:
             raise _needs_memory(limits)
         raise ValueError(f"its decoder ended with status {status}: it is damaged, or made to do harm")
 
-    def _start(self) -> None:
+    def start(self) -> None:
+        """Start the child, unless it runs."""
+        if self._process is not None:
+            return
         here, there = Pipe()
         self._folder = tempfile.mkdtemp(prefix="carts-decoding-")
         paths = [os.path.abspath(path) for path in sys.path]

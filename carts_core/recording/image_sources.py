@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from ..decoders import bags
 from ..errors import SequenceError
 from ..extras import needs_extra
-from ..files.decoding import Decoder, Limits
+from ..files.decoding import Limits, acquire, release
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -65,7 +65,7 @@ class Cropped:
 
 
 class Bag:
-    """An opened ROS bag, read in a child process; use as a context, from one thread at a time.
+    """An opened ROS bag, read in a child process, one call at a time; use as a context.
 
     Args:
         path: ROS 1 bag, MCAP file or ROS 2 bag folder.
@@ -82,8 +82,9 @@ class Bag:
         if not path.exists():
             raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
         self.path = path
-        self._decoder, self._limits = Decoder(), Limits.of(path)
-        self.close = weakref.finalize(self, self._decoder.close)
+        self._lock = threading.Lock()
+        self._decoder, self._limits = acquire(), Limits.of(path)
+        self.close = weakref.finalize(self, release, self._decoder)
         self.topics: list[tuple[str, str]] = [(name, kind) for name, kind in self._call(bags.topics)]
 
     def __enter__(self) -> Self:
@@ -108,7 +109,8 @@ class Bag:
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            return self._decoder.call(function, self.path, *arguments, limits=self._limits)
+            with self._lock:
+                return self._decoder.call(function, self.path, *arguments, limits=self._limits)
         except (OSError, ValueError) as error:
             if self.path.is_file() and (self.path.parent / "metadata.yaml").is_file():
                 folder = self.path.parent
@@ -118,6 +120,15 @@ class Bag:
                 f"bag {self.path} cannot be read ({error}). It is damaged, was cut off, or is no ROS bag: copy it "
                 "again, or have ROS index it anew (rosbag reindex, ros2 bag reindex)."
             ) from error
+
+
+_SHARED: "weakref.WeakValueDictionary[tuple[Path, int], Bag]" = weakref.WeakValueDictionary()
+"""Bags that cameras use, by path and time of the last change [ns]."""
+
+
+def _shared(path: Path) -> Bag:
+    key = path.absolute(), path.stat().st_mtime_ns if path.exists() else 0
+    return _SHARED.get(key) or _SHARED.setdefault(key, Bag(path))
 
 
 class BagImages:
@@ -136,8 +147,7 @@ class BagImages:
         self.path = path
         self.topic = topic
         self._times = times
-        self._lock = threading.Lock()
-        self._bag = Bag(path)
+        self._bag = _shared(path)
         names = {name for name, _ in self._bag.topics}
         if topic not in names:
             raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {', '.join(sorted(names))}.")
@@ -152,8 +162,7 @@ class BagImages:
         Raises:
             SequenceError: there is none at that time, or it is damaged.
         """
-        with self._lock:
-            message = self._bag.message(self.topic, self._times[index])
+        message = self._bag.message(self.topic, self._times[index])
         if message is None:
             raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
         return decode_message(message, self.name(index))
