@@ -12,12 +12,13 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 
-def inference_session(graph: bytes, threads: int | None = None) -> "InferenceSession":
+def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = True) -> "InferenceSession":
     """A session of an ONNX graph on the CPU.
 
     Args:
         graph: content of an ONNX file.
         threads: for one operator; None lets ONNX Runtime choose.
+        fold: compute constants when the graph is loaded; those of a foreign graph may take any amount of memory.
 
     Raises:
         ImportError: ONNX Runtime is not installed.
@@ -36,7 +37,8 @@ def inference_session(graph: bytes, threads: int | None = None) -> "InferenceSes
     # Its own pool has a block for every size of image and returns none.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
     options.log_severity_level = 3
+    left_out = [] if fold else ["ConstantFolding"]
     try:
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"], disabled_optimizers=left_out)
     except Exception as error:  # Its errors have no base class but this.
         raise RuntimeError(str(error)) from error

@@ -5,8 +5,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
-
 MOST_THREADS = 4
 """More threads than this gain nothing on images as small as ours."""
 
@@ -52,6 +50,8 @@ def _leave_a_core_free() -> None:
     our own web server) holds one of them, each step waits for the scheduler: an iteration of 0.1 s then takes 2.6 s.
     """
     if "OMP_NUM_THREADS" not in os.environ:
+        import torch  # noqa: PLC0415  child processes that need no torch import this module, too
+
         torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MOST_THREADS)))
         _TUNED.core_left_free = True
 
@@ -62,7 +62,11 @@ def inference_threads() -> int:
     Its threads hand out work in small pieces, so that one that has to wait for a core holds up no other: with another
     process on one or on both of two cores, two threads took .73 and .53 of the time of one.
     """
-    return min(os.cpu_count() or 1, MOST_THREADS) if _TUNED.core_left_free else torch.get_num_threads()
+    if _TUNED.core_left_free:
+        return min(os.cpu_count() or 1, MOST_THREADS)
+    import torch  # noqa: PLC0415
+
+    return torch.get_num_threads()
 
 
 def _keep_memory() -> None:

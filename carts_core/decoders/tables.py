@@ -17,7 +17,7 @@ LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
 def read_parquet(path: Path) -> dict[str, Any]:
     """Columns of a Parquet file by name [rows]; [rows, values] where each row holds as many numbers.
 
-    Columns of texts and of rows of different lengths are lists.
+    Columns of texts and of rows of different lengths are lists; a field of a struct is the column `struct.field`.
 
     Raises:
         OSError, ValueError: it cannot be read, or has too many values.
@@ -32,6 +32,8 @@ def read_parquet(path: Path) -> dict[str, Any]:
         cells = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
         check_size(-(-cells // max(file.metadata.num_columns, 1)), file.metadata.num_columns)
         table = file.read()
+        while any(pyarrow.types.is_struct(column.type) for column in table.itercolumns()):
+            table = table.flatten()
     except pyarrow.ArrowException as error:
         raise ValueError(str(error)) from error
     columns = {}

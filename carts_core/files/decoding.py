@@ -146,7 +146,7 @@ class Decoder:
 
     def call(self, function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
         """The result of a function; errors as those of `decoded`."""
-        request = _packed([function.__module__, function.__qualname__, arguments, *vars(limits).values()])
+        request = _packed([os.getcwd(), function.__module__, function.__qualname__, arguments, *vars(limits).values()])
         try:
             if (reply := self._reply(request, limits)) is None:
                 # The child had been idle for so long that it ended when it was asked.
@@ -273,8 +273,9 @@ def serve() -> None:
 
 
 def _answer(request: bytes) -> bytes:
-    module, name, arguments, seconds, memory, written = _unpacked(request)
+    folder, module, name, arguments, seconds, memory, written = _unpacked(request)
     try:
+        os.chdir(folder)  # Paths may be relative, and the child may be older than the parent's folder.
         home = importlib.import_module(module)
         for library in getattr(home, "LIBRARIES", {}).get(name, ()):
             importlib.import_module(library)

@@ -128,7 +128,10 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
         FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
     """
     with open_regular(path, kind) as file:
-        content = file.read(kind.limit + 1)
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1)  # Reading allocates as much as is asked for.
+        if len(content) > size:
+            content += file.read(kind.limit + 1 - len(content))
     if len(content) > kind.limit:
         raise _too_large(kind, "grows while it is read")
     return content

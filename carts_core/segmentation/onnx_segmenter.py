@@ -183,7 +183,7 @@ def _session(path: Path) -> "InferenceSession":
             f"it as ONNX. {_REMEDY}"
         )
     try:
-        return inference_session(content)
+        return inference_session(content, fold=False)
     except RuntimeError as error:
         raise WeightsError(
             f"segmenter file {path} is no ONNX graph that can be run ({shortened(str(error), 300)}). {_REMEDY}"

@@ -147,9 +147,7 @@ def test_onnx_runtime_collects_nothing_about_whoever_uses_it(weights: Path, tmp_
     (graph,) = (tmp_path / "cache").glob("surface-*.onnx")
     session = f"import onnxruntime; onnxruntime.InferenceSession({str(graph)!r}, providers=['CPUExecutionProvider'])"
     if ours:
-        session = (
-            f"from carts_core.onnx_runtime import *; inference_session(open({str(graph)!r}, 'rb').read())"
-        )
+        session = f"from carts_core.onnx_runtime import *; inference_session(open({str(graph)!r}, 'rb').read())"
     # It collects nothing where it finds that it runs in a test.
     environment = {name: value for name, value in os.environ.items() if name in ("PATH", "PYTHONPATH", "LANG")}
     home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home" / "cache")}
