@@ -1,3 +1,3 @@
-"""The `carts` command, one module per subcommand; what takes long to import is imported when they run."""
+"""The `carts` command. Modules that take long to import are imported when a subcommand runs."""
 
 from .command_line import main as main

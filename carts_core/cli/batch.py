@@ -11,7 +11,7 @@ from ..console import Bar, Terminal
 from ..errors import CartsError, SettingsError
 from ..stopping import when_stopped
 from ..wording import counted
-from .selection import output_folder
+from .options import output_folder
 
 if TYPE_CHECKING:
     from ..batch.manifest import Job

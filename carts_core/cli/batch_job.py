@@ -23,11 +23,10 @@ from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
 from ..settings.optimization import Inference
 from .calibrate import Calibrate
-from .evaluate import Evaluate
 from .export import Export
-from .import_ import Import
-from .optimize import Optimize
-from .selection import NO_PROJECT, FromProject
+from .importing import Import
+from .optimize import Evaluate, Optimize
+from .options import NO_PROJECT, FromProject
 
 _COMMANDS: dict[Step, type] = {
     "import": Import,

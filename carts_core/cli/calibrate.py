@@ -1,4 +1,4 @@
-"""`carts calibrate`: base frames and cameras from many frames at once."""
+"""`carts hand-eye`, `carts time-offset` and `carts calibrate`: base frames, cameras, and the image delay."""
 
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -13,14 +13,140 @@ from ..errors import SettingsError
 from ..settings import CALIBRATION, FreeParameters
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
-from .observing import Observing
-from .selection import Selection, SequencePath, output_folder
-from .solver_options import CalibrationOptions
+from .options import CalibrationOptions, Observing, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence as Points
+
     from ..optimization import CalibrationOptimizer, CalibrationResult
-    from ..optimization.hand_eye import HandEyePrior
+    from ..optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint
     from ..recording import Sequence
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """Find base frames from points that were found by eye in 3 to 6 images; no initial pose is needed.
+
+    In `carts view` (New recording) the points are clicked. Here they are in a table; docs/howto/own_recording.md.
+    """
+
+    sequence: SequencePath
+    """Sequence file; base frames in it may be anything."""
+    points: Path
+    """CSV file with the columns frame (its id), camera, arm, landmark (tip, wrist yaw joint, wrist pitch joint,
+    shaft edge, shaft middle), u and v [px of the undistorted image, from its upper left corner]."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/hand_eye`."""
+    overwrite: bool = False
+    """Replace an earlier result there."""
+    focal_length: bool = False
+    """Find the focal lengths, too. Needs points at several depths; see the deviation that is said."""
+    free_cameras: tuple[str, ...] = ()
+    """Cameras whose pose relative to the others is not known."""
+    pixel_error: float = 2.0
+    """Expected error of a point [px]."""
+
+    def run(self) -> None:
+        """Solve and write; nothing is written after an error."""
+        from ..files import MARKER, published, write_text
+        from ..optimization.hand_eye import (
+            RESULT_FILE,
+            HandEyeSettings,
+            mounts_of_points,
+            moved_cameras,
+            read_points,
+            result_json,
+            solve_hand_eye,
+        )
+        from ..recording import Sequence, calibrated_sequence_file
+
+        console = Terminal()
+        settings = HandEyeSettings(self.pixel_error, self.focal_length, self.free_cameras)
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        points = read_points(self.points, sequence)
+        mounts = mounts_of_points(sequence, points)
+        result = solve_hand_eye(moved_cameras(sequence.scene, mounts), sequence.measured, points, settings)
+        result = replace(result, scene=moved_cameras(result.scene, mounts, back=True))
+        output = output_folder(self.output, sequence.name, "hand_eye")
+        with published(output, overwrite=self.overwrite) as folder:
+            text = calibrated_sequence_file(sequence.path, output.path, sequence.scene, result.scene, "hand-eye")
+            write_text(folder / "sequence.toml", text)
+            content = result_json(sequence, points, result, self.free_cameras)
+            write_text(folder / RESULT_FILE, json.dumps(content, indent=1))
+            write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
+        _print(console, sequence, points, result)
+        console.print(f"wrote {output}. Refine it over the recording: carts calibrate {output}/sequence.toml")
+
+
+def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]", result: "HandEyeResult") -> None:
+    used = len(result.distances) - len(result.contradicting)
+    console.print(f"{used} points agree to {result.error:.1f} px")
+    for (arm, camera), deviation in result.deviations.items():
+        console.print(
+            f"{arm} before {camera}: known to {deviation.sideways_mm:.1f} mm sideways, {deviation.depth_mm:.1f} mm in "
+            f"depth and {deviation.rotation_deg:.1f} deg"
+        )
+    for camera, deviation in result.focal_deviation.items():
+        focal = result.scene.camera(camera).intrinsics[0]
+        console.print(f"{camera}: focal length {focal:.0f} px, known to {100 * deviation:.0f} %")
+    for (arm, camera), more in result.missing.items():
+        console.print(f"{arm} before {camera} stays as it was: {more} more points are needed")
+    for index in result.contradicting:
+        point = points[index]
+        where = f"{point.arm} {point.landmark} in frame {sequence.frame_ids[point.frame]}, camera {point.camera}"
+        console.print(f"row {index + 2} ({where}) contradicts the others: {result.distances[index]:.0f} px off")
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """Estimate the delay between images and joint positions from how both move, and propose a time_offset.
+
+    Neither a hand-eye calibration nor a network is needed. The sequence file stays as it is.
+    """
+
+    sequence: SequencePath
+    """Sequence file whose rows are matched with frames by time ([frames])."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder to make for a sequence file with the proposed time_offset; by default it is only said."""
+    overwrite: bool = False
+    """Replace an earlier one there."""
+    camera: str | None = None
+    """Whose images count; by default the first camera's."""
+    domain: str | None = None
+    """Of the images; by default the first one."""
+    largest: float = 0.5
+    """How far from the present time_offset it is looked for first [s]; up to 3 s where that explains little."""
+
+    def run(self) -> None:
+        """Say what the motion says, and write a file where that was asked for."""
+        from ..files import MARKER, published, write_text
+        from ..recording import Sequence, calibrated_sequence_file, estimate_time_offset
+
+        console = Terminal()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        with Bar(console=console) as bar:
+            task = bar.add_task("motion in the images", total=None)
+            found = estimate_time_offset(
+                sequence,
+                self.camera,
+                domain=self.domain,
+                largest=self.largest,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )
+        console.print(found.sentence())
+        if found.proposed is None:
+            return
+        if self.output is None:
+            console.print(f"Write it under [frames] in {self.sequence}, or name a folder with -o.")
+            return
+        with published(self.output, overwrite=self.overwrite) as folder:
+            text = calibrated_sequence_file(
+                sequence.path, self.output, sequence.scene, sequence.scene, "time-offset", found.proposed
+            )
+            write_text(folder / "sequence.toml", text)
+            write_text(folder / MARKER, json.dumps({"format": "time-offset", "sequence": str(self.sequence)}, indent=1))
+        console.print(f"wrote {self.output}/sequence.toml")
+
 
 _SPREAD = "spread:"
 
@@ -61,7 +187,7 @@ class Calibrate:
         from ..optimization import Backgrounds, CalibrationOptimizer
         from ..optimization.hand_eye import read_prior
         from ..recording import Sequence
-        from .hints import calibration_hint, print_hints
+        from .printing import calibration_hint, print_hints
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)

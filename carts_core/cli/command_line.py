@@ -1,4 +1,4 @@
-"""The `carts` command. Each subcommand is a dataclass whose fields are its options and whose `run` does the work."""
+"""The `carts` command. Each subcommand is a dataclass of options whose `run` method does the work."""
 
 import contextlib
 import io
@@ -10,33 +10,39 @@ from contextlib import contextmanager
 from functools import reduce
 from importlib.metadata import version
 from operator import or_
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import tyro
 
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..imports import uncollected
+from ..settings import DescentSolver, SequenceSettings, SurfaceSolver
+from ..settings.serialization import described
+from ..settings.stages import Stage
 from ..stopping import PARENT, end_with_parent, exit_status, message, stopped_by_signals
 from ..wording import closest
-from .baseline import Baseline
 from .batch import Batch
-from .bench import Bench
-from .calibrate import Calibrate
-from .evaluate import Evaluate
-from .export import Export
-from .hand_eye import HandEye
-from .import_ import Import
-from .import_masks import ImportMasks
+from .calibrate import Calibrate, HandEye, TimeOffset
+from .export import Export, Render
+from .importing import Import, ImportMasks
+from .lab import Baseline, Bench, Synthesize, Train
 from .live import Live
-from .optimize import Optimize
-from .render import Render
-from .robot import RobotCommand
-from .robots import Robots
-from .synthesize import Synthesize
-from .time_offset import TimeOffset
-from .train import Train
+from .optimize import Evaluate, Optimize
+from .robots import RobotCommand, Robots
 from .view import View
+
+
+def settings_reference() -> str:
+    """What a settings file can hold, with defaults and meanings."""
+    parts = [
+        "Settings of `--settings FILE`, in the tables [solver] and [sequence]; --print-settings writes them all.",
+        *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
+        "Stages, each a table of [[solver.stages]] with its name under `stage`:",
+        *(described(kind) for kind in get_args(Stage)),
+    ]
+    return "\n\n".join(parts)
+
 
 _DESCRIPTION = (
     "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is. "
@@ -140,7 +146,6 @@ def _parsed(arguments: list[str]) -> Any:
 
 def print_all_help(arguments: list[str]) -> None:
     """Print a command's options and then all settings that a settings file can hold."""
-    from .help_all import settings_reference
 
     try:
         shown = [argument if argument != "--help-all" else "--help" for argument in arguments]

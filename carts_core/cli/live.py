@@ -11,8 +11,7 @@ import tyro
 from ..console import Terminal
 from ..errors import SettingsError
 from ..settings.live import StreamAddress
-from .selection import Network, Selection, SequencePath, check_writable
-from .solver_options import FreeInFrames
+from .options import FreeInFrames, Network, Selection, SequencePath, check_writable
 
 if TYPE_CHECKING:
     from ..live import Tracked

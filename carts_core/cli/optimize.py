@@ -1,8 +1,29 @@
-"""`carts optimize`: correct the kinematics of frames and write masks and kinematics."""
+"""`carts optimize` corrects the kinematics of frames; `carts evaluate` compares such results with the truth."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated
 
-from .optimize_options import OptimizeOptions
+import tyro
+
+from ..console import Terminal, track
+from ..errors import SettingsError
+from ..stopping import when_stopped
+from ..wording import counted
+from .options import (
+    FreeInFrames,
+    FromProject,
+    Mode,
+    Observing,
+    OptimizeOptions,
+    Perturbation,
+    Selection,
+    SequencePath,
+    SolverOptions,
+    check_writable,
+)
 
 
 @dataclass(frozen=True)
@@ -14,3 +35,103 @@ class Optimize(OptimizeOptions):
         from .optimizing import Optimizing
 
         Optimizing(self).run()
+
+
+STANDARD_OUTPUT = Path("-")
+_WIDTH = 110
+"""Characters of the table's lines in a file or a pipe."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Optimize frames and compare masks and joints with the truth, before and after.
+
+    They start as the project beside the sequence corrects them, or as measured without one.
+    """
+
+    sequence: SequencePath
+    """Sequence file."""
+    json: Path | None = None
+    """Write the scores of all frames and their means to this file, whose folders are made; `-` for the standard output,
+    with everything else on the standard error."""
+    mode: Mode = "frame"
+    """Optimize each frame alone, or all together, so that frames inform each other (docs: sequences)."""
+    together: bool = False
+    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
+    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
+
+    def __post_init__(self) -> None:
+        if self.json == STANDARD_OUTPUT:
+            pass
+        elif self.json is not None and self.json.is_dir():
+            raise SettingsError(f"--json {self.json} is a folder. Name a file.")
+        elif self.json is not None:
+            check_writable(self.json.parent)
+        if self.mode == "sequence":
+            self.solving.check_surface("--mode sequence")
+
+    def run(self) -> None:
+        """Print a table of means, and write the JSON file if one is named."""
+        from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
+        from ..files import write_text
+        from ..optimization import Backgrounds
+        from ..recording import Sequence
+        from .printing import base_frame_hint, kept_start_hint, print_hints, score_table, verdict_line
+
+        console = Terminal(stderr=self.json == STANDARD_OUTPUT)
+        if not console.is_terminal:
+            console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        frames = self.select.frame_indices(sequence)
+        cameras = self.select.camera_names(sequence.scene)
+        domains = self.select.domain_names(sequence)
+        sequence = self.source.corrected(sequence, frames, console)
+        observer = self.network.observer(self.solving.chosen, sequence)
+        observer.check(sequence, frames, cameras, domains)
+        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
+        found = run(
+            sequence,
+            observer.predictor,
+            frames=frames,
+            cameras=cameras,
+            domains=domains,
+            settings=self.solving.chosen,
+            free=self.solving.freed(self.free),
+            perturb_deg=self.start.perturb_deg,
+            seed=self.start.seed,
+            together=self.together,
+            given=observer.given,
+        )
+        total = len(frames) * len(cameras) * len(domains)
+        with when_stopped("nothing was written"):
+            scores = list(track(found, "optimizing", total=total, console=console))
+        console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
+        print_hints(console, self.network.caution)
+        for group in camera_groups(cameras, self.together):
+            where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
+            print_hints(
+                console,
+                kept_start_hint(where, [score.stopped for score in seen]),
+                base_frame_hint(where, [score.base_frame_gain for score in seen]),
+                verdict_line(where, [score.verdict for score in seen], [score.not_determined for score in seen]),
+            )
+        if any(score.verdict not in (None, "good") for score in scores):
+            print_hints(console, "The reasons of verdicts are in --json.")
+        required = self.solving.chosen.needs_background
+        for group in [] if observer.masked else camera_groups(cameras, self.together):
+            for domain in domains:
+                print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
+        if self.json is not None:
+            project = self.source.path(sequence.path)
+            made_from = {} if project is None else {"project": str(project)}
+            text = json.dumps({**self.network.observed, **made_from, **to_json(scores)}, indent=1)
+            if self.json == STANDARD_OUTPUT:
+                print(text)
+                return
+            write_text(self.json, text)
+            console.print(f"wrote {self.json}")

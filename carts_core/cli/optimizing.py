@@ -22,14 +22,17 @@ from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
 from ..wording import counted
-from .constant_corrections import constant_correction_hint
-from .frame_folder import FrameFolder, FrameResult
-from .hints import base_frame_hint, kept_start_hint, print_hints, sequence_hint, verdict_hints, verdict_line
-from .observing import RECORDING
-from .optimize_options import OptimizeOptions
-from .origins import Origin as MadeFrom
-from .origins import Origins
-from .selection import output_folder
+from .options import RECORDING, OptimizeOptions, output_folder
+from .printing import (
+    base_frame_hint,
+    constant_correction_hint,
+    kept_start_hint,
+    print_hints,
+    sequence_hint,
+    verdict_hints,
+    verdict_line,
+)
+from .results_folder import FrameFolder, FrameInputs, FrameResult, InputHashes
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class Optimizing:
                 f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
             )
 
-    def _to_do(self, part: _Part, now: Mapping[int, MadeFrom]) -> list[int]:
+    def _to_do(self, part: _Part, now: Mapping[int, InputHashes]) -> list[int]:
         """Positions of the chosen frames that are not there as they would be made now; says why."""
         output, ids = part.output, self._sequence.frame_ids
         there = {row.frame_id for row in output.rows}
@@ -134,7 +137,7 @@ class Optimizing:
             self._console.print(f"{output.folder}: {count} of {total} redone: {reason}")
         return [index for index in now if index not in faults or faults[index]]
 
-    def _tell_of_others(self, part: _Part, common: MadeFrom) -> None:
+    def _tell_of_others(self, part: _Part, common: InputHashes) -> None:
         """Of frames in the folder that were not chosen."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
@@ -146,7 +149,7 @@ class Optimizing:
             note = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
             self._console.print(f"{output.folder}: {note}")
 
-    def _origins(self, part: _Part) -> Origins:
+    def _origins(self, part: _Part) -> FrameInputs:
         asked, sequence = self._asked, self._sequence
         starts = Starts(sequence, part.domain, part.cameras, asked.start.perturb_deg, asked.start.seed)
 
@@ -159,7 +162,7 @@ class Optimizing:
         )
         load = starts.frame if asked.mode == "sequence" else load
         settings = json.dumps(self._settings())
-        return Origins(sequence, part.cameras, self._observer, load, backgrounds.images, settings)
+        return FrameInputs(sequence, part.cameras, self._observer, load, backgrounds.images, settings)
 
     def _kept(self, part: _Part) -> str:
         """What there is of a part that was stopped."""
@@ -169,7 +172,7 @@ class Optimizing:
             there = f"{done} of {counted(total, 'frame')} are solved and kept in {part.output.checkpoint}"
         return f"{there}; the same command goes on from there"
 
-    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, MadeFrom]) -> None:
+    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, InputHashes]) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         if not todo:
             return
@@ -210,7 +213,7 @@ class Optimizing:
             *verdict_hints(part.name, assessed),
         )
 
-    def _as_sequence(self, part: _Part, origins: Mapping[int, MadeFrom], common: MadeFrom) -> None:
+    def _as_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
         backgrounds = Backgrounds.of(sequence, cameras, part.domain)
         starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
@@ -277,7 +280,7 @@ class Optimizing:
         return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
     def _settings(self) -> dict[str, Any]:
-        """What was asked for; what it is applied to has fingerprints (`Origins`)."""
+        """What was asked for; what it is applied to has fingerprints (`FrameInputs`)."""
         asked = self._asked
         settings = {
             "sequence": str(asked.sequence.resolve()),

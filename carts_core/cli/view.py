@@ -9,7 +9,7 @@ import tyro
 
 from ..errors import SettingsError
 from ..imports import uncollected
-from .selection import Network
+from .options import Network
 
 if TYPE_CHECKING:
     from ..segmentation import Segmenter

@@ -12,11 +12,11 @@ import sys
 import threading
 from pathlib import Path
 
-from carts_core.cli import calibrate, main, optimizing, render, train
+from carts_core.cli import calibrate, export, lab, main, optimizing
 from carts_core.lab.training import training
 from carts_core.optimization import CalibrationOptimizer, SequenceOptimizer
 
-LOADED = (calibrate, optimizing, render, train, training, CalibrationOptimizer, SequenceOptimizer)
+LOADED = (calibrate, export, lab, optimizing, training, CalibrationOptimizer, SequenceOptimizer)
 """So that no child has to import what all of them need."""
 
 

@@ -12,7 +12,7 @@ import cv2
 import pytest
 
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.cli.selection import chosen_frames
+from carts_core.cli.options import chosen_frames
 from carts_core.errors import SettingsError
 
 SCORE_KEYS = {

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from carts_core import recording
-from carts_core.cli.constant_corrections import constant_correction_hint
+from carts_core.cli.printing import constant_correction_hint
 from carts_core.export import KinematicsRow
 
 JOINTS = ("yaw", "pitch", "insertion")

@@ -1,6 +1,6 @@
 """What commands suggest after their results."""
 
-from carts_core.cli.hints import base_frame_hint, kept_start_hint
+from carts_core.cli.printing import base_frame_hint, kept_start_hint
 
 
 def test_wrong_base_frames_are_named_with_the_ways_out_of_it() -> None:

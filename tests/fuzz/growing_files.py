@@ -26,7 +26,7 @@ from recordings import BagKind, write_bag  # pyright: ignore[reportMissingImport
 
 from carts_core.batch.manifest import read_manifest
 from carts_core.batch.state import read_state
-from carts_core.cli.solver_options import SolverOptions
+from carts_core.cli.options import SolverOptions
 from carts_core.errors import RobotError
 from carts_core.files import output_path
 from carts_core.files.decoding import decoded

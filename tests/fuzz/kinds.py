@@ -15,7 +15,7 @@ import torch
 import trimesh
 
 from carts_core.batch.manifest import read_manifest
-from carts_core.cli.solver_options import SolverOptions
+from carts_core.cli.options import SolverOptions
 from carts_core.export.kinematics import KinematicsRow, kinematics_csv, read_kinematics_csv
 from carts_core.lab.training.checkpoint import History, load_checkpoint, save_checkpoint
 from carts_core.live.messages import FrameMessage, ImageMessage, packed, receive

@@ -10,7 +10,7 @@ import torch
 from evidence import CONVINCING
 from tiny import tiny_scene
 
-from carts_core.cli.hints import verdict_hints
+from carts_core.cli.printing import verdict_hints
 from carts_core.evaluation import evaluate
 from carts_core.model.robot import Robot
 from carts_core.model.scene import SceneState

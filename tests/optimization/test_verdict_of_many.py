@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from evidence import CONVINCING
 
-from carts_core.cli.hints import calibration_hint, sequence_hint, verdict_line
+from carts_core.cli.printing import calibration_hint, sequence_hint, verdict_line
 from carts_core.optimization import Assessment, StopReason, Verdict
 from carts_core.optimization.familiarity import Familiarity
 from carts_core.optimization.verdict import assess

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.cli.solver_options import SolverOptions
+from carts_core.cli.options import SolverOptions
 from carts_core.errors import SettingsError
 from carts_core.settings import DescentSolver, SequenceSettings, SolverName, SurfaceSolver, presets, solver
 from carts_core.settings.serialization import changed, to_plain

@@ -1,11 +1,15 @@
-"""What a command suggests after its results."""
+"""Tables, verdicts and hints that commands print after their results."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
+from .. import recording
+from ..evaluation import FrameScore, mean_score
+from ..export.kinematics import KinematicsRow, joint_columns, joint_units, position_values
 from ..optimization import BASE_FRAME_GAIN, Assessment, SequenceAssessment, StopReason, Verdict, fit_words
 from ..wording import counted
 
@@ -103,3 +107,84 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
         f"difference between image and rendering by {100 * np.mean(known):.0f} %, which joints cannot. Try "
         "`carts calibrate`, or add --base-frames."
     )
+
+
+_FRAMES = 4
+"""Frames from which corrections can be called the same in all of them."""
+_LARGE = 5.0
+"""What joints are seldom off by in all frames, twice the prior of the default solver [deg, mm]."""
+
+
+def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
+    """What large corrections that are much the same in all frames may come from, or None if there are none.
+
+    Joints make up for a wrong focal length or base frame, so the image fits and the joints are wrong.
+
+    Args:
+        where: what tells people which frames are meant.
+        sequence: with the measured joint positions.
+        rows: results; those that were not optimized do not count.
+    """
+    scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+    rows = [row for row in rows if row.source == "optimized"]
+    if len(rows) < _FRAMES:
+        return None
+    before = [
+        np.concatenate([sequence.measured[arm.name][position[row.frame_id]] for arm in scene.arms]) for row in rows
+    ]
+    off = np.stack([position_values(scene, row) for row in rows]) - np.stack(before)
+    prismatic = np.array([unit == "m" for unit in joint_units(scene)])
+    shown = np.where(prismatic, 1e3 * off, np.degrees(off))
+    typical = np.median(shown, axis=0)
+    # Four of five frames agree with the median to within half of it.
+    spread = np.quantile(np.abs(shown - typical), 0.8, axis=0)
+    constant = np.flatnonzero((np.abs(typical) >= _LARGE) & (spread < np.abs(typical) / 2))
+    if not constant.size:
+        return None
+    names, units = joint_columns(scene), np.where(prismatic, "mm", "deg")
+    found = ", ".join(f"{names[joint]} {typical[joint]:+.1f} {units[joint]}" for joint in constant)
+    return (
+        f"{where}: corrections are large and much the same in all frames: {found}. Joints make up alike for wrong "
+        "intrinsics, base frames and joint zeros, so check these before you rely on joint positions. Masks fit anyway."
+    )
+
+
+def score_table(scores: list[FrameScore], title: str) -> Table:
+    """Means per domain and camera."""
+    table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
+    for column in (
+        "domain",
+        "camera",
+        "Dice\nbefore",
+        "\nafter",
+        "worst\nchange",
+        "MAE [deg]\nbefore",
+        "\nafter",
+        "std",
+        "steps",
+        "s",
+    ):
+        table.add_column(column, justify="left" if column in ("domain", "camera") else "right")
+    groups: dict[tuple[str, str], list[FrameScore]] = {}
+    for score in scores:
+        groups.setdefault((score.domain, score.camera), []).append(score)
+    for (domain, camera), group in groups.items():
+        mean = mean_score(group)
+        change = [s.dice_after - s.dice_before for s in group if s.dice_after is not None and s.dice_before is not None]
+        table.add_row(
+            domain,
+            camera,
+            _number(mean["dice_before"], 4),
+            _number(mean["dice_after"], 4),
+            _number(min(change, default=None), 4),
+            _number(mean["joint_mae_deg_before"], 2),
+            _number(mean["joint_mae_deg_after"], 2),
+            _number(mean["joint_std_deg"], 2),
+            _number(mean["iterations"], 1),
+            _number(mean["seconds"], 2),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

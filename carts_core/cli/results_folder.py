@@ -1,28 +1,205 @@
-"""A folder of masks and a table of kinematics, as `carts optimize` fills it."""
+"""Output folder of `carts optimize`: masks, a kinematics table, and per-frame provenance in results.json."""
 
 import json
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Several
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..errors import SettingsError
 from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv
+from ..export.kinematics import position_values, std_values
 from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
-from ..fingerprints import fingerprint
-from ..model.scene import SceneState
+from ..files.reading import TABLE, parse_json, read_bytes, typed
+from ..fingerprints import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
+from ..model.scene import Scene, SceneState
 from ..optimization import Assessment
-from ..recording import Sequence
+from ..recording import Frame, Sequence
 from ..rendering import Renderer
 from ..stopping import finished_first
-from .origins import Origin, changes
-from .result_records import Record, judged, read_records, records_text, row_fingerprint
-from .selection import check_writable
+from .options import Observer, check_writable
+
+InputHashes = Mapping[str, str]
+"""Kind of input -> its fingerprint; the kinds are those of `_CHANGED`."""
+
+_CHANGED = {
+    "code": "another version of the program made them",
+    "weights": "the weights changed",
+    "settings": "the settings changed",
+    "robot": "the robot changed",
+    "calibration": "the calibration changed",
+    "joints": "the measured joint positions changed",
+    "images": "the images changed",
+    "masks": "the masks changed",
+    "background": "the background changed",
+    "together": "they were solved together with other frames",
+}
+"""What to say where the fingerprint of an input is another one."""
+
+_CODE = (
+    "*.py",
+    "imaging/**/*.py",
+    "model/**/*.py",
+    "recording/*.py",
+    "evaluation/evaluate.py",
+    "evaluation/sequence.py",
+    "export/kinematics.py",
+    "export/png.py",
+    "networks/**/*.py",
+    "optimization/**/*.py",
+    "rendering/**/*.py",
+)
+
+
+class FrameInputs:
+    """Fingerprints of what frames are made from, as some cameras see them in a domain.
+
+    Args:
+        sequence, cameras: whose frames these are.
+        observer: who says what images show.
+        load: the frame at a position, its `measured` where the optimization starts.
+        backgrounds: camera name -> mean background that frames are compared with, where there is one.
+        settings: what was asked for, as JSON.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        cameras: tuple[str, ...],
+        observer: Observer,
+        load: Callable[[int], Frame],
+        backgrounds: Mapping[str, np.ndarray],
+        settings: str,
+    ) -> None:
+        self._sequence, self._load, self._observer = sequence, load, observer
+        recorded = [sequence.recorded_camera(name) for name in cameras]
+        self._common = {
+            "code": code_fingerprint(_CODE),
+            "weights": fingerprint(observer.weights, str(observer.predictor.device)),
+            "settings": fingerprint(settings),
+            "robot": fingerprint(*(robot_fingerprint(arm.robot) for arm in sequence.scene.arms)),
+            "calibration": calibration_fingerprint(sequence.scene, recorded),
+            "background": fingerprint([(name, backgrounds[name]) for name in sorted(backgrounds)]),
+        }
+
+    @property
+    def common(self) -> InputHashes:
+        """What all frames have in common."""
+        return self._common
+
+    def of(self, index: int) -> InputHashes:
+        """Of a frame that is corrected alone.
+
+        Raises:
+            SequenceError: one of its images cannot be read.
+        """
+        frame = self._load(index)
+        arms = self._sequence.measured
+        joints = [(name, frame.measured[name], arms[name][index]) for name in sorted(frame.measured)]
+        joints += sorted(frame.mounts.items())
+        images = [(name, frame.images[name]) for name in sorted(frame.images)]
+        origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
+        return origin | ({"masks": fingerprint(self._observer.inputs(frame))} if self._observer.masked else {})
+
+    def of_all(self, indices: Several[int]) -> InputHashes:
+        """Of frames that are corrected together: each depends on what all are made from."""
+        each = [self.of(index) for index in indices]
+        stamps = self._sequence.timestamps
+        times = [None if stamps is None else float(stamps[index]) for index in indices]
+        masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._observer.masked else {}
+        return {
+            **self._common,
+            **masks,
+            "joints": fingerprint(*(origin["joints"] for origin in each)),
+            "images": fingerprint(*(origin["images"] for origin in each)),
+            "together": fingerprint(indices, [self._sequence.frame_ids[index] for index in indices], repr(times)),
+        }
+
+
+def changes(before: InputHashes, now: InputHashes) -> str | None:
+    """What has changed, for people; None if nothing that both tell of has."""
+    different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
+    if "together" in different:
+        # With other frames, these are of other frames too.
+        different = [kind for kind in different if kind not in ("joints", "images", "masks")]
+    if "calibration" in different:
+        # Images are compared without their distortion, which belongs to the calibration.
+        different = [kind for kind in different if kind not in ("images", "masks", "background")]
+    if "joints" in different or "images" in different:
+        # A background is made from frames.
+        different = [kind for kind in different if kind != "background"]
+    return " and ".join(_CHANGED[kind] for kind in different) or None
+
+
+_FORMAT = "carts-results/1"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Of one frame."""
+
+    origin: Mapping[str, str]
+    """Kind of input -> its fingerprint."""
+    masks: Mapping[str, str]
+    """Camera -> fingerprint of the mask's file."""
+    row: str
+    """Fingerprint of the row in the table."""
+    threads: int
+    """How many threads torch had; results do not depend on it."""
+    verdict: str = ""
+    """`good`, `doubtful` or `failed`; empty where it was not asked for."""
+    reason: str = ""
+    """For the verdict, one sentence."""
+    probability: float | None = None
+    """That the mask is wrong [1]."""
+    not_determined: Several[str] | None = None
+    """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
+
+
+def judged(found: Assessment | None) -> dict[str, Any]:
+    """The fields of a record that tell of a verdict."""
+    if found is None:
+        return {}
+    return {"verdict": found.verdict.value, "reason": found.reason, "probability": round(found.probability, 6)}
+
+
+def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
+    """Of a row of the table, with the digits that it has there."""
+    values = np.concatenate([position_values(scene, row), std_values(scene, row)])
+    verdict = [row.verdict] if row.verdict else []
+    return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
+
+
+def records_text(records: Mapping[str, Record]) -> str:
+    """The file, one frame a line."""
+    lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in records.items()]
+    return f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
+
+
+def read_records(path: OutputPath) -> dict[str, Record]:
+    """Frame -> record. Nothing where the file is missing or damaged: then nothing there counts as known.
+
+    Raises:
+        SettingsError: a newer version of the program wrote the file.
+    """
+    if not holds_file(path):
+        return {}
+    try:
+        content = parse_json(read_bytes(path.path, TABLE), finite=False)
+        if content["format"] != _FORMAT:
+            raise SettingsError(
+                f"{path} has the format {content['format']!r}; this version knows {_FORMAT}. Use the version that "
+                "wrote it, or name another folder with --output."
+            )
+        return typed(content["frames"], dict[str, Record])
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}
 
 
 @dataclass(frozen=True)
@@ -31,7 +208,7 @@ class FrameResult:
 
     row: KinematicsRow
     state: SceneState
-    origin: Origin
+    origin: InputHashes
     """What it was made from."""
     assessment: Assessment | None = None
     """How far it can be relied on, where that is known."""
@@ -98,7 +275,7 @@ class FrameFolder:
                 self._records = read_records(self._records_file)
             yield
 
-    def fault(self, frame_id: str, origin: Origin) -> str | None:
+    def fault(self, frame_id: str, origin: InputHashes) -> str | None:
         """Why a frame in the table does not count, for people; None if it does.
 
         Args:

@@ -1,0 +1,246 @@
+"""`carts synthesize`, `carts train`, `carts baseline` and `carts bench`: the commands of `carts_core.lab`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.progress import TimeRemainingColumn
+
+from ..console import Bar, Terminal
+from ..errors import CartsError, SettingsError
+from ..files import output_path
+from ..settings import SynthesisConfig, TrainingConfig
+from ..settings.baseline import BaselineNetwork, BaselineTraining
+from ..stopping import when_stopped
+from ..wording import counted
+from .options import Network, check_device, output_folder
+
+if TYPE_CHECKING:
+    from ..lab.baselines.networks import TrainedBaseline
+
+
+@dataclass(frozen=True)
+class Synthesize:
+    """Make a sequence of two instruments, or of one arm of any other robot, over tissue, path-traced, with true and
+    measured kinematics, in all domains."""
+
+    output: Annotated[Path, tyro.conf.Positional]
+    """Folder to make; it must not exist."""
+    synthesis: Annotated[SynthesisConfig, tyro.conf.arg(name="")] = field(default_factory=SynthesisConfig)
+
+    def run(self) -> None:
+        """Write the sequence."""
+        from ..lab.synthesis.synthesize import synthesize
+
+        with Bar() as bar:
+            task = bar.add_task("synthesizing", total=None)
+            with when_stopped("frames that were made are kept beside the output; the same command goes on from there"):
+                path = synthesize(
+                    self.synthesis,
+                    self.output,
+                    lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+                )
+        bar.console.print(f"wrote {path}")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network on synthetic images; run it again to go on after an interruption."""
+
+    output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
+    """Folder for checkpoints, weights and the training report."""
+    for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
+    """Sequence file to adapt the shipped network to: its robots, cameras, distances and empty backgrounds. It ends when
+    it no longer gains, or after 400 --steps or --minutes of processor time. Weights are offered if no fit is worse."""
+    fits: int = 8
+    """With `--for`: made images on which fits before and after are compared; half as many frames of the recording."""
+    training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
+
+    def __post_init__(self) -> None:
+        if self.fits < 1:
+            raise SettingsError(f"--fits is {self.fits}; allowed is 1 or more.")
+
+    def run(self) -> None:
+        """Train to the end."""
+        from ..lab.training.progress import TrainingProgress
+        from ..lab.training.training import train
+
+        check_device(self.training.device)
+        console = Terminal()
+        if self.for_ is not None:
+            self._adapt(self.for_, console)
+            return
+        with Bar(*Bar.get_default_columns()[:-1], TimeRemainingColumn(), console=console) as bar:
+            task = bar.add_task("training", total=self.training.steps)
+
+            def report(progress: TrainingProgress) -> None:
+                text = f"loss {progress.loss:.3f}, {progress.seconds_per_step:.2f} s a step"
+                bar.update(task, completed=progress.step, total=progress.steps, description=text)
+
+            result = train(self.training, self.output, report)
+        console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")
+
+    def _adapt(self, recording: Path, console: Terminal) -> None:
+        """Adapt the shipped network to a recording, printing each validation; offer the weights if no fit is worse."""
+        from ..lab.training.adaptation import adapted_to, gain, offer
+        from ..lab.training.progress import TrainingProgress
+        from ..lab.training.training import train
+
+        said: dict[str, float] | None = None
+        with Bar(*Bar.get_default_columns()[:-1], TimeRemainingColumn(), console=console, transient=True) as bar:
+            task = bar.add_task("reading the recording", total=None)
+            config = adapted_to(recording, self.output, self.training)
+
+            def report(progress: TrainingProgress) -> None:
+                nonlocal said
+                text = f"step {progress.step}" if progress.step else "training"
+                bar.update(task, completed=progress.step, total=progress.steps, description=text)
+                if progress.validation is None or progress.first is None or progress.validation is said:
+                    return
+                said = progress.validation
+                console.print(f"step {progress.step}: {gain(progress.first, said)}", soft_wrap=True)
+
+            bar.update(task, description="making images to measure with")
+            result = train(config, self.output, report)
+
+            def compare(text: str, done: int, total: int) -> None:
+                bar.update(task, completed=done, total=total, description=text)
+
+            found = offer(config, result, compare, made=self.fits, own=max(1, self.fits // 2))
+        console.print(f"report:  {result.report}")
+        if result.first is not None:
+            console.print(f"kept, the best: {gain(result.first, result.validation)}", soft_wrap=True)
+        if result.validation.get("step") == 0:
+            console.print("No step gained anything, so the weights are those of the start.")
+        for line in found.lines:
+            console.print(line, soft_wrap=True)
+        if found.weights is None:
+            console.print(f"not offered, since worse: {'; '.join(found.worse)}", soft_wrap=True)
+            console.print(f"The weights are in {found.refused}. Go on with the network as it was.", soft_wrap=True)
+            return
+        console.print(f"weights: {found.weights}")
+        console.print(f"Use: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; run it again to go on."""
+
+    output: Annotated[Path, tyro.conf.Positional]
+    """Folder for checkpoint and weights."""
+    frames: Path = Path("runs/baseline_frames")
+    """Folder of training frames, made where they are missing, and shared by all baselines."""
+    network: Annotated[BaselineNetwork, tyro.conf.arg(name="")] = field(default_factory=BaselineNetwork)
+    training: BaselineTraining = field(default_factory=BaselineTraining)
+    """How it is trained."""
+
+    def run(self) -> None:
+        """Train to the end."""
+        from ..lab.baselines.training import prepare_frames, train_baseline
+
+        check_device(self.training.device)
+        console = Terminal()
+
+        def say(line: str) -> None:
+            console.print(line, soft_wrap=True)
+
+        with when_stopped(f"{self.output} holds what was trained; the same command goes on from there"):
+            frames = prepare_frames(output_path(self.frames), self.training, say)
+            result = train_baseline(self.network, self.training, frames, self.output, say)
+        say(f"weights: {result.weights}\n{result.steps} steps, Dice {result.dice:.3f} on frames not learned from")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure accuracy and speed of all methods, and write a report; run it again to go on after a stop."""
+
+    output: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
+    quick: bool = False
+    """Few frames and steps: some minutes instead of hours."""
+    real: Path | None = None
+    """Sequence file with real frames and masks, to be measured too, also with their instruments in other rooms."""
+    rooms: Path | None = None
+    """Folder of photographs to put instruments before, besides made rooms."""
+    report_only: bool = False
+    """Measure nothing; write the report of what is there."""
+    frames: int | None = None
+    """Frames of each sequence to evaluate, if not as many as usual."""
+    seed: int | None = None
+    """Seed of the synthetic sequence, if not the usual one."""
+    baselines: tuple[Path, ...] = ()
+    """Weights files of `carts baseline`: networks of others, a row each, evaluated on the frames of the main table."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def run(self) -> None:
+        """Measure what is not known yet and write the report."""
+        from importlib.metadata import version
+
+        from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
+        from ..lab.benchmark.hand_eye import known_hand_eye, measure_hand_eye
+        from ..lab.benchmark.measurement import code_fingerprint
+        from ..lab.benchmark.sources import (
+            family_sources,
+            real_source,
+            room_sources,
+            synthetic_room_source,
+            synthetic_source,
+        )
+        from ..lab.benchmark.timing import known_stages, measure_stages
+
+        console = Terminal()
+        scope = QUICK if self.quick else FULL
+        if self.frames is not None:
+            scope = scope.with_frames(self.frames)
+        name = "quick" if self.quick else "full"
+        folder = output_folder(self.output, "bench", name)
+        seed = TEST_SEED if self.seed is None else self.seed
+        extractor = self.network.load()
+        made = synthetic_source(scope, seed)
+        sources = [made, synthetic_room_source(made, self.rooms, scope, seed), *family_sources(scope, seed)]
+        if self.real is not None:
+            sources += [real_source(self.real, scope, seed), *room_sources(self.real, self.rooms, scope, seed)]
+        baselines = self._baselines()
+        runs = plan(scope, sources, list(baselines))
+        results = ResultsFile(folder / "measurements.jsonl")
+        benchmark = Benchmark(scope, sources, extractor, results, runs, baselines)
+        if results.unreadable:
+            console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
+        stages, hand_eye = folder / "stages.json", folder / "hand_eye.json"
+        if not self.report_only:
+            with when_stopped(f"{results.path} holds what was measured; the same command goes on from there"):
+                benchmark.run(console)
+                measure_stages(stages, extractor)
+                measure_hand_eye(hand_eye, extractor, scope.hand_eye_starts, console.print)
+        measurements = benchmark.measurements()
+        if not measurements:
+            raise CartsError(
+                f"{results.path} holds no measurement of these settings, weights and code. Run without --report-only."
+            )
+        facts = Facts(
+            scope=name,
+            planned=len(runs),
+            sources={source.name: source.description for source in sources},
+            weights=extractor.fingerprint,
+            code=code_fingerprint(),
+            version=version("carts"),
+        )
+        calibrations = known_hand_eye(hand_eye, extractor)
+        page = write_report(folder, measurements, facts, known_stages(stages, extractor), calibrations)
+        console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")
+
+    def _baselines(self) -> "dict[str, TrainedBaseline]":
+        """Row -> network."""
+        from ..lab.baselines.networks import read_baseline
+
+        found: dict[str, TrainedBaseline] = {}
+        for path in self.baselines:
+            trained = read_baseline(path)
+            if trained.row in found:
+                raise CartsError(
+                    f"--baselines names two files of the row {trained.row}; {path} is the second. Give one of each "
+                    "network and augmentation, and the other in a run of its own."
+                )
+            found[trained.row] = trained
+        return found

@@ -1,0 +1,663 @@
+"""Options that several commands share: frames, cameras, projects, networks, fitted masks, solver settings."""
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable
+from collections.abc import Sequence as Names
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tomlkit
+import tyro
+
+from ..errors import ProjectError, SettingsError
+from ..files import OutputPath, output_path
+from ..files.reading import SETTINGS, parse_toml, read_text
+from ..settings import CALIBRATION_SETTINGS, FreeParameters, SequenceSettings, SolverName, SolverSettings, SurfaceSolver
+from ..settings import solver as named_solver
+from ..settings.optimization import Inference
+from ..settings.serialization import changed, to_plain
+from ..wording import closest, counted, shown
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ..model.scene import Scene
+    from ..networks.extractor import FeatureExtractor
+    from ..optimization import GivenMasks, MaskPredictor
+    from ..optimization.measurement import Ignore
+    from ..project import ProjectState
+    from ..project.target_masks import MaskLayer
+    from ..recording import Frame, Sequence
+
+
+ALL = "all"
+
+Mode = Literal["frame", "sequence"]
+"""Each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of a sequence is worked on."""
+
+    frames: str | None = None
+    """Frames by their ids, as the recording and the page name them: `all` (the default), `007`, `001-010` in the
+    recording's order, several with commas, or `::3` for every third."""
+    positions: str | None = None
+    """Frames by position, counted from 1 as in the page, instead: `1-10,15`."""
+    camera: tuple[str, ...] = (ALL,)
+    """Cameras, by name."""
+    domain: tuple[str, ...] = ()
+    """Domains, by name, or `all`; the sequence's first one if none is named."""
+
+    def frame_indices(self, sequence: "Sequence") -> list[int]:
+        """Positions of the chosen frames.
+
+        Raises:
+            SettingsError: `frames` or `positions` is not readable, or names a frame that is not in the sequence.
+        """
+        return chosen_frames(self.frames, self.positions, sequence.frame_ids)
+
+    def camera_names(self, scene: "Scene") -> list[str]:
+        """Names of the chosen cameras.
+
+        Raises:
+            RobotError: there is no such camera.
+        """
+        if ALL in self.camera:
+            return [camera.name for camera in scene.cameras]
+        return [scene.camera(name).name for name in self.camera]
+
+    def domain_names(self, sequence: "Sequence") -> list[str]:
+        """Names of the chosen domains.
+
+        Raises:
+            SettingsError: there is no such domain.
+        """
+        if not self.domain:
+            return [sequence.domains[0]]
+        if ALL in self.domain:
+            return list(sequence.domains)
+        for name in self.domain:
+            if name not in sequence.domains:
+                known = f"Its domains are: {', '.join(sequence.domains)}.{closest(name, sequence.domains)}"
+                raise SettingsError(f"domain {name!r} is not in {sequence.path}. {known}")
+        return list(self.domain)
+
+
+def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) -> list[int]:
+    """0-based indices that `--frames` or `--positions` chooses.
+
+    Args:
+        frames: by id; all frames where neither is given.
+        positions: counted from 1.
+        ids: of the frames, in the recording's order.
+
+    Raises:
+        SettingsError: both are given, or one is not readable, or names a frame that the recording does not have.
+    """
+    if frames is not None and positions is not None:
+        raise SettingsError("--frames and --positions are both given. Give one of them.")
+    if positions is not None:
+        numbers = [str(position) for position in range(1, len(ids) + 1)]
+        return _chosen("--positions", positions, numbers, "Positions count from 1, as in the page; there are")
+    text = ALL if frames is None else frames
+    try:
+        return _chosen("--frames", text, ids, "Frames are named as in the recording and the page:")
+    except SettingsError as error:
+        if (today := _counted_from_0(text, ids)) is None:
+            raise
+        raise SettingsError(f"{error} Earlier versions counted from 0; then this was --frames {today}.") from None
+
+
+def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
+    """Indices of the names in a text of names, ranges and steps."""
+    place = {name: index for index, name in enumerate(names)}
+    known = f"{known} {names[0]} to {names[-1]}. Give `all`, `{names[0]}`, `{names[0]}-{names[-1]}` or `::3`."
+    if text == ALL:
+        return list(range(len(names)))
+    chosen: set[int] = set()
+    for part in [text] if text in place else text.split(","):
+        if (step := re.fullmatch("::([1-9][0-9]*)", part)) is not None:
+            chosen.update(range(0, len(names), int(step[1])))
+            continue
+        dashes = [match.start() for match in re.finditer("-", part)]
+        spans = [(part, part), *((part[:dash], part[dash + 1 :]) for dash in dashes)]
+        span = next((span for span in spans if place.keys() >= set(span)), None)
+        if span is None:
+            asked = next((name for name in spans[-1] if name and name not in place), part)
+            raise SettingsError(f"{option} {text}: there is no {shown(asked)}.{closest(asked, names)} {known}")
+        first, last = place[span[0]], place[span[1]]
+        if last < first:
+            raise SettingsError(f"{option} {text}: {span[1]} comes before {span[0]}. Give {span[1]}-{span[0]}.")
+        chosen.update(range(first, last + 1))
+    return sorted(chosen)
+
+
+def _counted_from_0(text: str, ids: Names[str]) -> str | None:
+    """A text of numbers and ranges counted from 0, as `--frames` once was, with ids instead; None for another one."""
+    if not re.fullmatch(r"\d+(-\d+)?(,\d+(-\d+)?)*", text) or max(map(int, re.findall(r"\d+", text))) >= len(ids):
+        return None
+    return re.sub(r"\d+", lambda number: ids[int(number[0])], text)
+
+
+NO_PROJECT = "none"
+"""The recording as measured, whatever project lies beside it."""
+
+
+@dataclass(frozen=True)
+class FromProject:
+    """Whose corrections are used."""
+
+    project: str | None = None
+    """Project whose corrections (joints, calibration, time offset, masks) are used: by default that beside the
+    sequence, if there is one; `none` for the recording as measured, or a file."""
+
+    @property
+    def named(self) -> bool:
+        """Whether a file was named."""
+        return self.project not in (None, NO_PROJECT)
+
+    def path(self, sequence_file: Path) -> Path | None:
+        """The project's file; None where there is none, or none is to be used.
+
+        Raises:
+            SettingsError: the file that was named is missing.
+        """
+        if self.project == NO_PROJECT:
+            return None
+        from ..project import default_path
+
+        path = Path(self.project) if self.project is not None else default_path(sequence_file)
+        if not path.is_file():
+            if self.project is None:
+                return None
+            raise SettingsError(f"--project {self.project} is missing. Name a project file, or `{NO_PROJECT}`.")
+        return path
+
+    def read(self, sequence: "Sequence") -> "ProjectState | None":
+        """The project as it is now; None where there is none, or none is to be used.
+
+        Raises:
+            SettingsError: the file that was named is missing.
+            ProjectError: it is of another sequence, or cannot be read.
+        """
+        path = self.path(sequence.path)
+        if path is None:
+            return None
+        from ..project import Project
+
+        try:
+            with Project.open(sequence, path, read_only=True) as project:
+                return project.state
+        except ProjectError as error:
+            raise ProjectError(f"{error} Or leave it out: --project {NO_PROJECT}.") from error
+
+    def sentence(self, sequence: "Sequence", project: "ProjectState | None", frames: Names[int]) -> str | None:
+        """Which project is used, with the review states of the chosen frames; None without one."""
+        if project is None:
+            return None
+        states = Counter(project.review(index).state.value for index in frames)
+        counts = ", ".join(f"{count} {state}" for state, count in states.most_common())
+        return (
+            f"as corrected in {self.path(sequence.path)}: {counts} of {counted(len(frames), 'frame')}; "
+            f"--project {NO_PROJECT} for the recording as measured"
+        )
+
+    def corrected(self, sequence: "Sequence", frames: Names[int], console: "Console") -> "Sequence":
+        """The sequence as its project corrects it, which is printed; as it is without one.
+
+        Raises:
+            CartsError: as `read`, or the project's time offset leaves a frame without joint positions.
+        """
+        project = self.read(sequence)
+        if project is None:
+            return sequence
+        from ..project.calibrated import corrected_sequence
+
+        console.print(self.sentence(sequence, project, frames), soft_wrap=True)
+        return corrected_sequence(sequence, project)
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Wrong joint positions on purpose, to see what becomes of them."""
+
+    perturb_deg: float = 0.0
+    """Start that many degrees (and millimetres) off on every measured joint: off the true joint positions where the
+    sequence has them, else off the measured ones. 0 starts at the measured ones."""
+    seed: int = 0
+    """Seed of the error's signs; these are the same in all frames in sequence mode."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.perturb_deg <= 180:
+            raise SettingsError(
+                f"--perturb-deg is {self.perturb_deg:g}; allowed is 0 to 180. Give a size; signs are drawn from --seed."
+            )
+        if self.seed < 0:
+            raise SettingsError(f"--seed is {self.seed}; allowed is 0 or more.")
+
+
+_ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}
+"""Devices that say who runs the surface network there."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """The networks and where they run."""
+
+    weights: tuple[Path, ...] = ()
+    """Weights files; a network that none is given of is the shipped one."""
+    device: str = "cpu"
+    """`cpu`, or a CUDA device such as `cuda` or `cuda:1` for the networks. On a CPU the surface network is run by torch
+    or ONNX Runtime (the same to 1e-4), whichever was faster when it was measured here, once; `cpu:torch` and `cpu:onnx`
+    name one."""
+
+    def __post_init__(self) -> None:
+        if self.device not in _ENGINES:
+            check_device(self.device)
+
+    @property
+    def processor(self) -> str:
+        """Device of the networks, as torch names it."""
+        return "cpu" if self.device in _ENGINES else self.device
+
+    @property
+    def inference(self) -> Inference:
+        """Who runs the surface network."""
+        return _ENGINES.get(self.device, "auto")
+
+    def load(self) -> "FeatureExtractor":
+        """The networks.
+
+        Raises:
+            WeightsError: a weights file cannot be used.
+            SettingsError: nobody here can run them as asked for.
+        """
+        from ..networks.extractor import FeatureExtractor
+
+        return FeatureExtractor.load(*self.weights, device=self.processor, inference=self.inference)
+
+
+def check_device(device: str) -> None:
+    """See that a device exists.
+
+    Raises:
+        SettingsError: it does not.
+    """
+    if device == "cpu":
+        return
+    import torch
+
+    kind, _, number = device.partition(":")
+    cards = torch.cuda.device_count()
+    if kind == "cuda" and cards and (not number or (number.isdigit() and int(number) < cards)):
+        return
+    known = ", ".join(["cpu", *_ENGINES, *(f"cuda:{card}" for card in range(cards))])
+    raise SettingsError(f"device {device!r} does not exist on this machine. Available: {known}.")
+
+
+def output_folder(named: Path | None, *default: str) -> OutputPath:
+    """The folder that a command writes to: the one that a person named, else the one of these names in `runs`.
+
+    Raises:
+        OutputError: one of the names cannot be part of a path.
+    """
+    return output_path(Path(), "runs", *default) if named is None else output_path(named)
+
+
+def check_writable(folder: Path) -> None:
+    """See that a folder can be written to or made, before any work is done.
+
+    Raises:
+        SettingsError: it cannot.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK)):
+        raise SettingsError(f"{folder} cannot be made or written to, because of {there}. Name another folder.")
+
+
+SequencePath = Annotated[Path, tyro.conf.Positional]
+"""A sequence file as the first argument."""
+
+
+@dataclass(frozen=True)
+class FreeInFrames(FreeParameters):
+    """The same without what is rarely needed for frames; --settings has it."""
+
+    locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Which solver, and with what settings."""
+
+    solver: Annotated[SolverName, tyro.conf.EnumChoicesFromValues] = SolverName.SURFACE
+    """Solver: `surface` is the default; `occluded` runs again without occluded pixels; `acs`, `acs_reference`, `l1` and
+    `paper` compare image features as the paper does; `none` only compares the start."""
+    settings: tuple[str, ...] = ()
+    """Settings that differ from the solver's: TOML files as --print-settings writes them, or single ones such as
+    `iterations=20`, `sequence.initial_frames=3` and `free.locked_cameras=["left"]`."""
+
+    def __post_init__(self) -> None:
+        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # A file that cannot be used is reported at once.
+
+    @property
+    def chosen(self) -> SolverSettings:
+        """The solver's settings."""
+        return changed(named_solver(self.solver), _table(self.settings, "solver"), "[solver]")
+
+    @property
+    def sequence(self) -> SequenceSettings:
+        """Settings of sequence mode."""
+        return changed(SequenceSettings(), _table(self.settings, "sequence"), "[sequence]")
+
+    def freed(self, free: FreeParameters) -> FreeParameters:
+        """What is free, from options and settings."""
+        return changed(free, _table(self.settings, "free"), "[free]")
+
+    def check_surface(self, what: str) -> None:
+        """Check that the solver is the one that estimates its uncertainty.
+
+        Raises:
+            SettingsError: it is not.
+        """
+        if not isinstance(self.chosen, SurfaceSolver):
+            raise SettingsError(f"{what} needs the solver surface; given is --solver {self.solver}. Leave it out.")
+
+    def printed(self) -> str:
+        """All settings as a settings file."""
+        return printed({"solver": to_plain(self.chosen), "sequence": to_plain(self.sequence)})
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Settings of a calibration."""
+
+    settings: tuple[str, ...] = ()
+    """Settings that differ from the default ones: TOML files as --print-settings writes them, or single ones such as
+    `iterations=20`."""
+
+    def __post_init__(self) -> None:
+        _ = self.chosen
+
+    @property
+    def chosen(self) -> SurfaceSolver:
+        """The solver's settings."""
+        return changed(CALIBRATION_SETTINGS, _table(self.settings, "solver"), "[solver]")
+
+    def printed(self) -> str:
+        """All settings as a settings file."""
+        return printed({"solver": to_plain(self.chosen)})
+
+
+def printed(tables: dict[str, Any]) -> str:
+    """Tables as TOML."""
+    return tomlkit.dumps(tables)
+
+
+def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
+    """A table of what --settings names; later ones win.
+
+    Raises:
+        SettingsError: a file cannot be read, or something is no TOML or has other tables.
+    """
+    found: dict[str, Any] = {}
+    for text in given:
+        single = "=" in text and not Path(text).exists()
+        content = _parsed(text, _of_solver(text) if single else _read(Path(text)))
+        strangers = set(content) - {"solver", "sequence", "free"}
+        if strangers or not all(isinstance(table, dict) for table in content.values()):
+            wrong = ", ".join(sorted(strangers)) or "values outside tables"
+            raise SettingsError(
+                f"--settings {text} has {wrong}; allowed are the tables [solver], [sequence] and [free]."
+            )
+        found.update(content.get(name, {}))
+    return found
+
+
+def _of_solver(text: str) -> str:
+    """A single setting as TOML; one without a table is the solver's, and a bare word is a text."""
+    key, _, value = (part.strip() for part in text.partition("="))
+    key = key if "." in key else f"solver.{key}"
+    try:
+        parse_toml(f"value = {value}")
+    except ValueError:
+        value = json.dumps(value)
+    return f"{key} = {value}"
+
+
+def _read(path: Path) -> str:
+    try:
+        return read_text(path, SETTINGS)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(
+            f"--settings {path} cannot be read: {error}. Name a file as --print-settings writes, or `NAME=VALUE`."
+        ) from error
+
+
+def _parsed(given: str, text: str) -> dict[str, Any]:
+    try:
+        return parse_toml(text)
+    except ValueError as error:
+        raise SettingsError(
+            f"--settings {given} is not TOML: {error}. Give a file as --print-settings writes, or `NAME=VALUE`."
+        ) from error
+
+
+RECORDING = "recording"
+"""Masks of the sequence file."""
+LAYERS: dict[str, "MaskLayer"] = {"imported": "imported", "painted": "painted"}
+"""Masks of its project."""
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Who says what images show."""
+
+    predictor: "FeatureExtractor | MaskPredictor"
+    weights: str
+    """Fingerprint of the networks and of who runs them; empty without any."""
+    masked: bool
+    """Whether masks are fitted."""
+    given: "GivenMasks | None" = None
+    """The masks that are fitted, where they are not those of the sequence file."""
+    every: bool = False
+    """Whether each frame needs a mask."""
+
+    @property
+    def ignore(self) -> "Ignore":
+        """Position of a frame -> camera name -> pixels that are not compared."""
+        return (lambda _: {}) if self.given is None else self.given.ignored
+
+    def completed(self, frame: "Frame") -> "Frame":
+        """A frame with the masks that are fitted, for cameras that the recording has no mask of."""
+        return frame if self.given is None else self.given.filled(frame)
+
+    def inputs(self, frame: "Frame") -> tuple[object, ...]:
+        """What of a frame's masks its result depends on, for a fingerprint."""
+        if self.given is None:
+            return tuple(sorted((frame.masks or {}).items()))
+        return tuple(sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored))
+
+    def check(
+        self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
+    ) -> None:
+        """See that all frames have what is to be fitted, before any of them is solved.
+
+        Raises:
+            SettingsError: they have not.
+        """
+        if not self.masked:
+            return
+        frames = list(frames)
+        for camera, domain in product(cameras, domains):
+            without = [index for index in frames if not self._has_mask(sequence, index, camera, domain)]
+            # With the network beside them, masks of others have to be of this recording, and its own may be missing.
+            if without and (self.every or (self.given is not None and len(without) == len(frames))):
+                raise SettingsError(
+                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
+                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose "
+                    "others with --frames and --camera, or leave them to the network with --observe both."
+                )
+
+    @property
+    def _origin(self) -> str:
+        return "mask" if self.given is None else self.given.origin
+
+    def _has_mask(self, sequence: "Sequence", index: int, camera: str, domain: str | None) -> bool:
+        if self.given is None:
+            return sequence.has_masks(camera, domain, index)
+        return self.given.there(index, camera)
+
+    def warnings(
+        self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
+    ) -> list[str]:
+        """What speaks against the network for these arms and images, from one frame; where masks are fitted, whether
+        some of the cameras that look together have none.
+
+        Args:
+            sequence, index, domain, cameras: which frame.
+            background: whether the solver knows the empty background.
+        """
+        if self.masked:
+            without = [camera for camera in cameras if not self._has_mask(sequence, index, camera, domain)]
+            if not without or len(without) == len(cameras):
+                return []
+            return [
+                f"Frame {sequence.frame_ids[index]} has no {self._origin} of camera {', '.join(without)}, so all "
+                f"cameras that look together ({', '.join(cameras)}) are left to the network there, masks or not. "
+                "Leave that camera out with --camera, or give it masks."
+            ]
+        from ..optimization import familiarity
+
+        frame = sequence.frame(index, domain, cameras)
+        found = familiarity(sequence.scene.with_cameras(cameras), frame, self.predictor)
+        return found.warnings(", ".join(cameras), background=background)
+
+
+@dataclass(frozen=True)
+class Observing(Network):
+    """What is fitted, the networks, and where they run."""
+
+    observe: Literal["network", "masks", "both"] = "network"
+    """What is fitted: predictions of the network, the sequence's masks (no network is loaded), or both: the masks, with
+    parts and normals from the network, which serves frames without a mask alone."""
+    masks: str = RECORDING
+    """Which masks are fitted: `recording` for those of the sequence file, `imported` or `painted` for those of its
+    project (`carts import-masks`, `carts view`) or, as in `other.carts:painted`, of another one, or a file or folder of
+    masks (docs: masks)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.masks != RECORDING and self.observe == "network":
+            raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave both out.")
+        if self.masks in (RECORDING, *LAYERS):
+            return
+        named = self._layer[0] or Path(self.masks)
+        if not named.exists():
+            raise SettingsError(
+                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, those of another project as "
+                "in other.carts:painted, or a file or folder of masks."
+            )
+
+    def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
+        """Who says what the images of a sequence show, for a solver.
+
+        Raises:
+            SettingsError: the solver compares features of images.
+            WeightsError: weights cannot be used.
+            ProjectError, SequenceError: masks cannot be read.
+        """
+        if self.observe != "network" and not isinstance(settings, SurfaceSolver):
+            raise SettingsError(
+                f"--observe {self.observe} needs the solver surface, occluded or none; the one given compares features "
+                "of images. Leave out --solver or --observe."
+            )
+        if self.observe == "masks" and self.weights:
+            raise SettingsError("--observe masks loads no network, but --weights was given. Leave one of them out.")
+        from ..optimization import MaskPredictor, NetworkPredictor
+
+        given = self._given(sequence)
+        masks, origin = (None, "mask") if given is None else (given.masks, given.origin)
+        if self.observe == "masks":
+            only = MaskPredictor(None, masks, origin=origin)
+            return Observer(only, "", masked=True, given=given, every=True)
+        extractor = self.load()
+        if self.observe == "both":
+            both = MaskPredictor(NetworkPredictor(extractor), masks, origin=origin)
+            return Observer(both, extractor.fingerprint, masked=True, given=given)
+        return Observer(extractor, extractor.fingerprint, masked=False)
+
+    @property
+    def _layer(self) -> "tuple[Path | None, MaskLayer | None]":
+        """Project (None for the one beside the sequence) and its layer that are fitted; no layer where others are."""
+        from ..project.place import SUFFIX
+
+        project, _, name = self.masks.rpartition(":")
+        layer = LAYERS.get(name)
+        if layer is None or (project and not project.endswith(SUFFIX)):
+            return None, None
+        return Path(project) if project else None, layer
+
+    def _given(self, sequence: "Sequence") -> "GivenMasks | None":
+        """The masks to be fitted, where they are not those of the sequence file."""
+        if self.masks == RECORDING:
+            return None
+        from ..project import Project
+        from ..project.target_masks import file_masks, project_masks
+
+        path, layer = self._layer
+        if layer is None:
+            return file_masks(Path(self.masks), sequence)
+        with Project.open(sequence, path, read_only=True) as project:
+            state = project.state
+        return project_masks(layer, state, sequence)
+
+    @property
+    def observed(self) -> dict[str, str]:
+        """What is fitted, for a file of results."""
+        elsewhere = {} if self.masks == RECORDING else {"masks": self.masks}
+        return {"observed": self.observe, **elsewhere}
+
+    @property
+    def caution(self) -> str | None:
+        """What to know of Dice scores: whether they are against what was fitted."""
+        if self.observe == "network":
+            return None
+        against = "the masks that were fitted" if self.masks == RECORDING else "them where the recording has no masks"
+        return f"Dice is against {against}, so it says how well they fit and not how right they are."
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """The sequence, the chosen frames, and how they are corrected."""
+
+    sequence: SequencePath
+    """Sequence file."""
+    output: Path | None = None
+    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras under --together."""
+    overwrite: bool = False
+    """Start over: everything that the folder holds is made again."""
+    mode: Mode = "frame"
+    """Correct each frame alone, or all together, so that frames inform each other (docs: sequences)."""
+    together: bool = False
+    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
+    keyframes: Path | None = None
+    """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
+    start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
+    select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
+    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
+
+    def __post_init__(self) -> None:
+        if self.keyframes is not None and self.mode != "sequence":
+            raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
+        if self.mode == "sequence":
+            self.solving.check_surface("--mode sequence")
