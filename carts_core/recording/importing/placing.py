@@ -76,7 +76,8 @@ def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], No
         gaps = np.maximum(np.abs(wanted - times[before]), np.abs(times[after] - wanted))
         keep &= gaps <= MAX_GAP
         spacing = np.diff(times)
-        if (long := spacing > MAX_GAP).any():
+        # A log of one row for each image may be slow throughout.
+        if len(spacing) and (long := spacing > max(MAX_GAP, 2.0 * float(np.median(spacing)))).any():
             note(
                 Note(
                     "warning",

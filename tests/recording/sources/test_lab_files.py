@@ -279,6 +279,7 @@ def without_gap(found: FoundRecording) -> None:
 
 
 def slowly(found: FoundRecording) -> None:
+    assert not any("gap" in note.text for note in found.notes)
     assert found.arms[0].times is not None and np.diff(found.arms[0].times) == pytest.approx(1.0)
 
 
