@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from carts_core.model.landmarks import Landmark, LandmarkKind, landmarks, link_transforms
+from carts_core.model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
 from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import ImagePoint
 

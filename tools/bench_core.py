@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from carts_core.console import Terminal
-from carts_core.lab.benchmark.timing import optimizer_figures, render_figures
+from carts_core.lab.benchmark.measurement import optimizer_figures, render_figures
 from carts_core.process import tune_process
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence

@@ -16,9 +16,8 @@ from carts_core.files import append_line, output_path, output_stream
 from carts_core.lab.baselines.networks import read_baseline
 from carts_core.lab.benchmark import TEST_SEED, Run
 from carts_core.lab.benchmark.counterfactual import Counterfactual
-from carts_core.lab.benchmark.methods import METHODS
 from carts_core.lab.benchmark.runner import SourceBench
-from carts_core.lab.benchmark.scope import FULL
+from carts_core.lab.benchmark.scope import FULL, METHODS
 from carts_core.lab.benchmark.sources import Source
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.recording import Sequence

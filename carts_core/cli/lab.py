@@ -63,8 +63,7 @@ class Train:
 
     def run(self) -> None:
         """Train to the end."""
-        from ..lab.training.progress import TrainingProgress
-        from ..lab.training.training import train
+        from ..lab.training.training import TrainingProgress, train
 
         check_device(self.training.device)
         console = Terminal()
@@ -84,8 +83,7 @@ class Train:
     def _adapt(self, recording: Path, console: Terminal) -> None:
         """Adapt the shipped network to a recording, printing each validation; offer the weights if no fit is worse."""
         from ..lab.training.adaptation import adapted_to, gain, offer
-        from ..lab.training.progress import TrainingProgress
-        from ..lab.training.training import train
+        from ..lab.training.training import TrainingProgress, train
 
         said: dict[str, float] | None = None
         with Bar(*Bar.get_default_columns()[:-1], TimeRemainingColumn(), console=console, transient=True) as bar:
@@ -179,7 +177,7 @@ class Bench:
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
         from ..lab.benchmark.hand_eye import known_hand_eye, measure_hand_eye
-        from ..lab.benchmark.measurement import code_fingerprint
+        from ..lab.benchmark.measurement import code_fingerprint, known_stages, measure_stages
         from ..lab.benchmark.sources import (
             family_sources,
             real_source,
@@ -187,7 +185,6 @@ class Bench:
             synthetic_room_source,
             synthetic_source,
         )
-        from ..lab.benchmark.timing import known_stages, measure_stages
 
         console = Terminal()
         scope = QUICK if self.quick else FULL

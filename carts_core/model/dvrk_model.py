@@ -16,7 +16,7 @@ from ..extras import needs_extra
 from ..files.decoding import decoded
 from ..files.reading import CALIBRATION, MESH, LfsPointerError, open_regular, parse_yaml, read_text
 from ..wording import counted
-from .mesh_files import mesh_path
+from .meshes import mesh_path
 from .psm_kinematics import CLASSIC, SI
 from .psm_urdf import carrier
 from .xacro_guard import expanded

@@ -1,4 +1,9 @@
-"""Parts that surgical instruments have in common, whatever their links are called."""
+"""Parts that surgical instruments have in common, and the channels of surface maps.
+
+A surface map has `SURFACE_CHANNELS` channels: the share of each pixel that each of `PARTS` covers, in [0, 1], and the
+mean unit normal of the covering surface times that coverage, in the camera's frame (x right, y down, z forward).
+Background is zero. The renderer makes surface maps of a state, and the surface network predicts them from an image.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,3 +74,12 @@ def _shaft_movers(robot: Robot, movers: Int[np.ndarray, " links"]) -> int:
     longest = int(np.argmax([extent[-1] for extent in extents]))
     slender = extents[longest][-2] < SLENDER * extents[longest][-1]
     return int(movers[robot.meshes[longest].link]) if slender else 0
+
+
+COVERAGE = slice(0, len(PARTS))
+"""Channels of the coverage per part."""
+
+NORMALS = slice(len(PARTS), len(PARTS) + 3)
+"""Channels of the normal."""
+
+SURFACE_CHANNELS = len(PARTS) + 3

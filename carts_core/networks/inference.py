@@ -25,7 +25,7 @@ from ..files import output_path, write_bytes, write_new
 from ..files.reading import VALUES, WEIGHTS, parse_json, read_bytes
 from ..fingerprints import fingerprint
 from ..model.mesh_cache import cache_dir
-from ..model.surface import SURFACE_CHANNELS
+from ..model.parts import SURFACE_CHANNELS
 from ..onnx_runtime import inference_session
 from ..process import inference_threads
 from ..settings.optimization import Engine, Inference

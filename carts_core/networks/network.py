@@ -16,8 +16,7 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ..errors import SettingsError
-from ..model.parts import PARTS
-from ..model.surface import SURFACE_CHANNELS
+from ..model.parts import PARTS, SURFACE_CHANNELS
 from ..settings import Architecture
 from ..threads import one_thread
 
@@ -197,7 +196,7 @@ _HIDDEN = 24
 
 @dataclass(frozen=True)
 class SurfaceLogits:
-    """A predicted surface map before its coverage is made one of shares; see `carts_core.model.surface`."""
+    """A predicted surface map before its coverage is made one of shares; see `carts_core.model.parts`."""
 
     coverage: Float[Tensor, "batch parts+1 h w"]
     """Log odds of background and of each part."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from ..errors import SettingsError
-from ..model.landmarks import link_transforms
+from ..model.keypoints import link_transforms
 from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame

@@ -18,8 +18,8 @@ from torch import Tensor
 from ..errors import SequenceError
 from ..imaging.haze import dehazed, transmission
 from ..imaging.window import Window
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import Scene
-from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..recording import MeanBackground
 from ..threads import total
 from .inputs import box_mean, pixel_weights, smoothed, stacked_images

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..imaging.window import Window
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import SceneState
-from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..threads import total
 from .failure import ArmEvidence, log_odds_of_failure
 from .frame_images import FrameImages

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from ..imaging.window import Window
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import Scene
-from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import SurfaceSolver

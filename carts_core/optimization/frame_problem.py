@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from ..model.parts import COVERAGE
 from ..model.scene import Scene
-from ..model.surface import COVERAGE
 from ..settings import SurfaceSolver
 from ..settings.stages import FINEST, AlignEdges, Descend, Given, Observe, SilhouetteSearch, first_observe
 from ..threads import total

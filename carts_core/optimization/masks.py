@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import SettingsError
 from ..imaging.window import Window
-from ..model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ..model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ..recording import Frame
 from .predictor import FramePredictor, SurfacePredictor
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..imaging.window import Window
+from ..model.parts import COVERAGE
 from ..model.scene import SceneState
-from ..model.surface import COVERAGE
 from ..settings.stages import Observe
 from ..threads import total
 from .frame_images import FrameImages

@@ -14,7 +14,7 @@ from ..recording import Frame
 
 
 class FramePredictor(Protocol):
-    """Predicts the surface maps of one frame's images (`carts_core.model.surface`)."""
+    """Predicts the surface maps of one frame's images (`carts_core.model.parts`)."""
 
     @property
     def masked(self) -> bool:

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..imaging.window import Window
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import SceneState
-from ..model.surface import COVERAGE, SURFACE_CHANNELS
 from ..settings.stages import SilhouetteSearch
 from .frame_images import FrameImages
 from .predictor import FramePredictor

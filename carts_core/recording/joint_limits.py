@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ..files.reading import ROBOT, read_text
 from ..model.instruments import robot_file
-from ..model.urdf_check import parsed_urdf
+from ..model.robot import parsed_urdf
 
 ANGLE_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
 """[rad] of one unit; "percent" is not among them, since it counts from the middle of the limits."""

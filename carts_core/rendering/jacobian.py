@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..compiled import compiled
-from ..model.surface import NORMALS
+from ..model.parts import NORMALS
 from .points import VisiblePoints
 
 _HALF = np.float32(0.5)

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..model.keypoints import Keypoint
+from ..model.parts import NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
-from ..model.surface import NORMALS, SURFACE_CHANNELS
 from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .jacobian import JacobianBlock, Tangents, map_jacobian
 from .motion import carry_motion
@@ -24,7 +24,7 @@ class SurfaceRendering:
     """Surface maps of all cameras, without autograd."""
 
     maps: Float[Tensor, "cameras 6 height width"]
-    """See `carts_core.model.surface`."""
+    """See `carts_core.model.parts`."""
     image: Float[Tensor, "cameras 3 height width"]
     """Shaded, linear RGB in [0, 1]."""
     jacobian: tuple[JacobianBlock, ...]
@@ -169,7 +169,7 @@ class Renderer:
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
-        """Surface maps of all hypotheses, see `carts_core.model.surface`, and nothing else."""
+        """Surface maps of all hypotheses, see `carts_core.model.parts`, and nothing else."""
         Ts, intrinsics = self._views(state)
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
         face_ids, inverse_depth = self._visibility(views_T, views_K)

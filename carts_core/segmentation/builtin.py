@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from ..model.surface import COVERAGE, SURFACE_CHANNELS
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..networks import FeatureExtractor
 from .prompt import Prompt
 

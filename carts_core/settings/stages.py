@@ -22,7 +22,7 @@ class Given(StrEnum):
 @dataclass(frozen=True)
 class Observe:
     """Have the network predict the surface map of the images: per pixel the coverage of each part of the arms, and the
-    normal (`carts_core.model.surface`). `Descend` and `AlignEdges` never call the network; a `RandomRestart` and a
+    normal (`carts_core.model.parts`). `Descend` and `AlignEdges` never call the network; a `RandomRestart` and a
     `PreferStart` observe once more, and verdicts (`OtherBackground`, `RejectFailed`) need it for their evidence.
     """
 

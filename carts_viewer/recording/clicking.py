@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carts_core.errors import CartsError
-from carts_core.model.landmarks import SHAFT_EDGE, TIP, LandmarkKind, landmarks, link_transforms
+from carts_core.model.keypoints import SHAFT_EDGE, TIP, LandmarkKind, landmarks, link_transforms
 from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import HandEyeResult, HandEyeSettings, ImagePoint, solve_hand_eye
 from carts_core.recording import Sequence

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from carts_core.evaluation.calibration import beyond_prior
-from carts_core.model.landmarks import link_transforms
+from carts_core.model.keypoints import link_transforms
 from carts_core.optimization import CalibrationResult
 from carts_core.optimization.hand_eye import ImagePoint, PointAgreement, PoseDeviation, agreement_with_points
 from carts_core.wording import counted

@@ -9,7 +9,7 @@ from unittest import mock
 
 from carts_core.cli import calibrate
 from carts_core.cli.command_line import main
-from carts_core.lab.benchmark import Measurement, Run, Score, hand_eye, runner, timing
+from carts_core.lab.benchmark import Measurement, Run, Score, hand_eye, measurement, runner
 from carts_core.lab.synthesis import synthesize
 from carts_core.lab.synthesis.synthesize import _Tracing
 from carts_core.lab.training.training import train
@@ -86,9 +86,9 @@ def _bench(work: Path) -> None:
     with (
         mock.patch.object(runner.SourceBench, "measure", measured),
         mock.patch.object(hand_eye, "_run", _once(hand_eye._run, lambda condition, seed, _: (condition, seed))),
-        mock.patch.object(timing, "render_figures", lambda *_: {"a": 1.0}),
-        mock.patch.object(timing, "network_figures", lambda *_: {"b": 1.0}),
-        mock.patch.object(timing, "optimizer_figures", lambda *_: {"c": 1.0}),
+        mock.patch.object(measurement, "render_figures", lambda *_: {"a": 1.0}),
+        mock.patch.object(measurement, "network_figures", lambda *_: {"b": 1.0}),
+        mock.patch.object(measurement, "optimizer_figures", lambda *_: {"c": 1.0}),
     ):
         _command("bench", "--quick")(work)
 

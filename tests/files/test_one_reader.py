@@ -13,8 +13,7 @@ READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt", "fromfi
 ALLOWED = {
     "files": "decides what may be read",
     "project": "reads its own database, lock and log",
-    "lab/benchmark/measurement.py": "reads the source of the package",
-    "lab/benchmark/timing.py": "reads the machine's description",
+    "lab/benchmark/measurement.py": "reads the source of the package and the machine's description",
     "lab/synthesis": "reads what it wrote",
     "cli/results_folder.py": "reads what an earlier run of the same command wrote",
     "checkpoint.py": "reads what an earlier run of the same command wrote",

@@ -31,8 +31,8 @@ from carts_core.errors import RobotError
 from carts_core.files import output_path
 from carts_core.files.decoding import decoded
 from carts_core.files.reading import ROBOT, read_text
-from carts_core.model.mesh_files import read_mesh
-from carts_core.model.urdf_check import parsed_urdf
+from carts_core.model.meshes import read_mesh
+from carts_core.model.robot import parsed_urdf
 from carts_core.model.xacro_guard import expanded
 from carts_core.networks.weights import read_weights
 from carts_core.project import Project

@@ -9,8 +9,8 @@ import pytest
 from perfect_predictor import PerfectPredictor
 from torch.nn import functional
 
+from carts_core.model.parts import COVERAGE
 from carts_core.model.scene import Scene
-from carts_core.model.surface import COVERAGE
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
 from carts_core.settings import presets

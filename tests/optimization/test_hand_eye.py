@@ -14,7 +14,7 @@ from tiny import tiny_scene
 from carts_core.cli import main
 from carts_core.errors import RobotError, SettingsError
 from carts_core.model.camera import Camera
-from carts_core.model.landmarks import link_transforms
+from carts_core.model.keypoints import link_transforms
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
 from carts_core.optimization.hand_eye import HandEyeSettings, ImagePoint, agreement_with_points, solve_hand_eye

@@ -10,7 +10,7 @@ import torch
 
 from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
-from carts_core.model.surface import COVERAGE
+from carts_core.model.parts import COVERAGE
 from carts_core.optimization import FrameOptimizer, ImagePredictor, SurfaceSolver, Verdict
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer

@@ -13,7 +13,7 @@ from torch.nn import functional
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.imaging.window import Window
-from carts_core.model.surface import COVERAGE
+from carts_core.model.parts import COVERAGE
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import torch
 
-from carts_core.model.parts import PARTS, link_parts
+from carts_core.model.parts import COVERAGE, NORMALS, PARTS, SURFACE_CHANNELS, link_parts
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene, SceneState
-from carts_core.model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import Variables
 from carts_core.rendering import Renderer

@@ -20,7 +20,7 @@ from ...errors import SettingsError, WeightsError
 from ...extras import needs_extra
 from ...files import OutputPath, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json, read_bytes
-from ...model.surface import SURFACE_CHANNELS
+from ...model.parts import SURFACE_CHANNELS
 from ...networks.network import FeatureNetwork
 from ...networks.weights import read_weights, tensor_bytes
 from ...settings import Architecture

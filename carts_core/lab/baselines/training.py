@@ -20,8 +20,8 @@ from torch.nn import functional
 from ...errors import SettingsError, WeightsError
 from ...files import OutputPath, holds_file, locked_folder, output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular
+from ...model.parts import COVERAGE, NORMALS
 from ...model.robot import Robot
-from ...model.surface import COVERAGE, NORMALS
 from ...networks.network import channels_last
 from ...networks.weights import tensor_bytes
 from ...resources import shipped_robot
@@ -30,8 +30,8 @@ from ...settings.baseline import Augmentation, BaselineNetwork, BaselineTraining
 from ...stopping import finished_first
 from ..randomization import SURFACE_UNIT, SurfaceGenerator
 from ..training.checkpoint import History, load_checkpoint, save_checkpoint
+from ..training.tasks import dice
 from ..training.training import schedule
-from ..training.validation import dice
 from .networks import Baseline, save_baseline, segmentation_models, start_from
 
 Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

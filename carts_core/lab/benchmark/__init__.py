@@ -3,10 +3,10 @@
 from .measurement import Measurement as Measurement
 from .measurement import ResultsFile as ResultsFile
 from .measurement import Score as Score
-from .plan import plan as plan
 from .report import Facts as Facts
 from .report import write_report as write_report
 from .runner import Benchmark as Benchmark
+from .runner import plan as plan
 from .scope import FULL as FULL
 from .scope import QUICK as QUICK
 from .scope import Run as Run

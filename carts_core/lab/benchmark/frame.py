@@ -1,34 +1,40 @@
-"""One run: a method on one frame, every iterate scored."""
+"""Single runs: a method on one frame or a sequence of frames, scored against the truth."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
 
 from ...evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ...model.keypoints import keypoints
+from ...model.parts import COVERAGE
 from ...model.perturbation import perturb
 from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import (
     Backgrounds,
+    CalibrationOptimizer,
     FrameOptimizer,
     FreeParameters,
+    SequenceOptimizer,
     SolverSettings,
     SurfacePredictor,
     SurfaceSolver,
 )
 from ...optimization.observability import Uncertainty
 from ...recording import Frame
+from ...recording.background import spread
 from ...rendering import Renderer
-from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score
-from .methods import METHODS
-from .scope import Run
-from .timing import machine
+from ...settings import DescentSolver
+from ..baselines.networks import TrainedBaseline
+from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score, machine
+from .scope import METHODS, Run
+from .sources import Recording
 
 _SEED = 0
 """Of the signs of errors made on purpose."""
@@ -274,3 +280,194 @@ def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtra
     mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
     seconds = time.perf_counter() - began
     return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(extractor.device))
+
+
+def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:
+    """The scene with base frames from so many frames of the recording, evenly spread, as one camera sees them.
+
+    Neither masks nor true joint positions are looked at.
+    """
+    chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
+    optimizer = CalibrationOptimizer(
+        recording.scene,
+        chosen,
+        extractor,
+        cameras=[camera],
+        backgrounds=Backgrounds.of(recording, [camera], "regular"),
+    )
+    for _ in optimizer:
+        pass
+    return optimizer.result().scene
+
+
+def correct_together(
+    runs: Iterable[Run],
+    recording: Recording,
+    extractor: FeatureExtractor,
+    truths: Mapping[int, Truth],
+    renderer: Renderer,
+) -> list[Measurement]:
+    """Correct frames as a sequence, and score them when all are done.
+
+    Seconds are those spent on a frame over all visits, reading its image included.
+
+    Args:
+        runs: one per frame, of one domain and error at the start.
+        recording: where the frames are from.
+        extractor: the networks.
+        truths: position of the frame -> what its estimate is compared with.
+        renderer: of the camera that takes part, at its size.
+    """
+    by_frame = {run.frame: run for run in runs}
+    (domain,) = {run.domain for run in by_frame.values()}
+    scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
+
+    def frame_at(index: int) -> Frame:
+        frame = recording.frame(index, domain, cameras)
+        return replace(frame, measured=start_of(scene, frame, by_frame[index], truths[index].measured_joints))
+
+    stamps = recording.timestamps
+    optimizer = SequenceOptimizer(
+        scene,
+        frame_at,
+        {index: None if stamps is None else float(stamps[index]) for index in by_frame},
+        extractor,
+        backgrounds=Backgrounds.of(recording, cameras, domain),
+    )
+    for _ in optimizer:
+        pass
+    found = []
+    for index, estimate in sorted(optimizer.estimates.items()):
+        truth, state = truths[index], scene.state(frame_at(index).measured, mounts=frame_at(index).mounts)
+        before = truth.score(state, None, None, renderer, 0.0)
+        after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
+        assessment = estimate.assessment
+        found.append(
+            Measurement(
+                by_frame[index],
+                after,
+                (),
+                (),
+                estimate.start,
+                machine(extractor.device),
+                before,
+                verdict=assessment and assessment.verdict.value,
+                probability=assessment and assessment.probability,
+                within=truth.within(scene, estimate.joint_positions, estimate.joint_std),
+            )
+        )
+    return found
+
+
+STEPS = 10
+"""Of each frame but the first. TC-CaRTS (arXiv 2212.00072) is said to need far fewer than CaRTS's 30."""
+
+
+def correct_forwards(
+    runs: Iterable[Run],
+    recording: Recording,
+    extractor: FeatureExtractor,
+    truths: Mapping[int, Truth],
+    renderer: Renderer,
+    first: DescentSolver,
+) -> list[Measurement]:
+    """Correct frames in their order with ACS, each from its measured joints plus the previous frame's correction.
+
+    This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). What we have of that paper, its
+    abstract, does not say enough of the others: a network that corrects kinematics, and a regularization.
+
+    Args:
+        runs: one per frame, of one domain and error at the start.
+        recording: where the frames are from.
+        extractor: the networks.
+        truths: position of the frame -> what its estimate is compared with.
+        renderer: of the camera that takes part, at its size.
+        first: settings of the first frame; the others take `STEPS` steps of the same schedule.
+    """
+    scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
+    found: list[Measurement] = []
+    correction: dict[str, np.ndarray] = {}
+    for run in sorted(runs, key=lambda run: run.frame):
+        frame, truth = recording.frame(run.frame, run.domain, cameras), truths[run.frame]
+        backgrounds = Backgrounds.of(recording, cameras, run.domain, required=True)
+        measured = start_of(scene, frame, run, truth.measured_joints)
+        start = {arm: values + correction.get(arm, 0.0) for arm, values in measured.items()}
+        settings = DescentSolver.paper(STEPS) if found else first
+        began = time.perf_counter()
+        optimizer = FrameOptimizer(scene, frame, backgrounds, extractor, start=start, settings=settings, live=False)
+        for _ in optimizer:
+            pass
+        seconds, best = time.perf_counter() - began, optimizer.best
+        assert best is not None and optimizer.stop_reason is not None
+        correction = {arm: values - measured[arm] for arm, values in best.joint_positions().items()}
+        found.append(
+            Measurement(
+                run,
+                truth.score(best.state, best.uncertainty, best.loss, renderer, seconds),
+                (),
+                (),
+                "warm" if found else "cold",
+                machine(extractor.device),
+                truth.score(scene.state(measured), None, None, renderer, 0.0),
+            )
+        )
+    return found
+
+
+def segment_with(
+    trained: TrainedBaseline, run: Run, scene: Scene, frame: Frame, truth: Truth, device: torch.device
+) -> Measurement:
+    """The mask of one image, at the size that the network was trained for; what it is given counts for its time.
+
+    Args:
+        trained: the network.
+        run: which.
+        scene: with the camera that is scored.
+        frame: its image, and the measured joint positions.
+        truth: what the mask is compared with.
+        device: where the network runs.
+    """
+    network = trained.network.to(device)
+    size = network.settings.size
+    rendering = _Rendering(scene, truth.camera, size) if network.settings.looks_at_kinematics else None
+    image = frame.images[truth.camera]
+    began = time.perf_counter()
+    given = rendering.of(frame).to(device) if rendering else None
+    with torch.no_grad():
+        probability = network(_tensor(image, size, device), given).sigmoid()
+    return _measured(run, probability, image, began, truth)
+
+
+def segment_rendered(run: Run, scene: Scene, frame: Frame, extractor: FeatureExtractor, truth: Truth) -> Measurement:
+    """The surface network's mask, given the rendering at the measured joint positions."""
+    rendering = _Rendering(scene, truth.camera, extractor.working_size)
+    image = frame.images[truth.camera]
+    began = time.perf_counter()
+    tensor = _tensor(image, extractor.working_size, extractor.device)
+    surface = extractor.surface(tensor, rendering.of(frame).to(extractor.device))
+    return _measured(run, surface[:, COVERAGE].sum(1, keepdim=True), image, began, truth)
+
+
+class _Rendering:
+    """What is rendered of the measured joint positions, at the network's size."""
+
+    def __init__(self, scene: Scene, camera: str, size: tuple[int, int]) -> None:
+        self._scene = scene.with_cameras([camera])
+        self._renderer = Renderer(self._scene, width=size[0], height=size[1])
+
+    def of(self, frame: Frame) -> Float[Tensor, "1 6 h w"]:
+        return self._renderer.surface_maps(self._scene.state(frame.measured, mounts=frame.mounts))
+
+
+def _tensor(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], device: torch.device) -> Float[Tensor, "1 3 h w"]:
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
+
+
+def _measured(
+    run: Run, probability: Float[Tensor, "1 1 h w"], image: UInt8[np.ndarray, "h w 3"], began: float, truth: Truth
+) -> Measurement:
+    full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    seconds = time.perf_counter() - began
+    mask = full >= 0.5
+    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(probability.device))

@@ -38,8 +38,7 @@ from .tables import (
     stage_table,
     worse_table,
 )
-from .targets import image_alone_table, targets
-from .verdicts import deviation_table, family_table, verdict_table
+from .targets import deviation_table, family_table, image_alone_table, targets, verdict_table
 
 PAGE = """<!doctype html>
 <html lang="en">

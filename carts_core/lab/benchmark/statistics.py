@@ -7,11 +7,10 @@ import numpy as np
 
 from ...settings import DOMAINS
 from . import paper
+from .conditions import OCCLUSION
 from .measurement import Measurement, Score
-from .methods import MAIN
-from .occlusion import OCCLUSION
 from .rooms import Half
-from .scope import FAMILY, PAPERS_STEPS, ROOMS
+from .scope import FAMILY, MAIN, PAPERS_STEPS, ROOMS
 
 ANY = object()
 """Matches every error at the start."""

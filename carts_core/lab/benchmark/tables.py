@@ -12,11 +12,10 @@ from typing import get_args
 from ...html import Cell, Table
 from ...wording import counted
 from . import paper
+from .conditions import OCCLUSION, SHARE
 from .measurement import TOLERANCE, WIDE_TOLERANCE, Measurement, Score
-from .methods import BASELINES, METHODS, RENDERING
-from .occlusion import OCCLUSION, SHARE
 from .rooms import Half
-from .scope import PAPERS_STEPS, SYNTHETIC
+from .scope import BASELINES, METHODS, PAPERS_STEPS, RENDERING, SYNTHETIC
 from .statistics import (
     DOMAIN_LABELS,
     GAINED,

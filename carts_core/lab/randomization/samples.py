@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from ...model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...model.robot import Robot
 from ...model.scene import SceneState
-from ...model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...networks.extractor import hybrid
 from ...settings import ImageSettings
 from .arms import (
@@ -306,7 +306,7 @@ _UNKNOWN = 0.08
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """One sample; see `carts_core.model.surface` for the maps."""
+    """One sample; see `carts_core.model.parts` for the maps."""
 
     observed: Int[np.ndarray, "h w 3"]
     """RGB uint8."""

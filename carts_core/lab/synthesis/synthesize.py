@@ -22,9 +22,18 @@ from ...model.instruments import SCHEME, SHIPPED
 from ...model.scene import Arm
 from ...resources import shipped_robot
 from ...settings import SynthesisConfig
-from .any_robot import check_instrument_distance, enlarged, enlargement, measurement_error, plan_arm, small_world
 from .domains import Conditions, View, exposure_gain
-from .motion import measure, plan_motion, sample_times
+from .motion import (
+    check_instrument_distance,
+    enlarged,
+    enlargement,
+    measure,
+    measurement_error,
+    plan_arm,
+    plan_motion,
+    sample_times,
+    small_world,
+)
 from .path_tracer import PathTracer, Stage
 from .scene import KINDS, Tissue, grow_tissue, is_instrument, load_robot, place_arms, place_cameras
 

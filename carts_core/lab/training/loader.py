@@ -17,8 +17,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
 from ...stopping import end_with_parent
-from .task import Batch
-from .tasks import task_of
+from .tasks import Batch, task_of
 
 VALIDATION_STREAM = 1
 _TRAINING_STREAM = 0

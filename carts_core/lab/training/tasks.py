@@ -1,9 +1,430 @@
-"""The networks that can be trained, by name."""
+"""Training tasks: samples, loss and validation metrics of each network."""
 
-from ...settings import NetworkName
-from .feature_task import FeatureTask
-from .surface_task import SurfaceTask
-from .task import Task
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ...model.parts import COVERAGE, NORMALS, PARTS
+from ...model.robot import Robot
+from ...networks.network import FeatureNetwork, SurfaceNetwork
+from ...settings import NetworkName, ObjectiveWeights, TrainingConfig
+from ..randomization import SURFACE_UNIT, PairGenerator, SurfaceGenerator, SurfaceSample, TrainingPair
+
+Batch = tuple[Tensor, ...]
+"""Tensors of bytes, each with a leading dimension of samples."""
+
+
+class Task(Protocol):
+    """A network, what it learns from, and how well it does; without state, so that workers can make their own."""
+
+    columns: ClassVar[dict[str, str]]
+    """Validation figures: name -> heading in the report."""
+    score: ClassVar[str]
+    """The figure that tells whether a network has become better; higher is better."""
+
+    def network(self, config: TrainingConfig) -> nn.Module:
+        """A network with random weights."""
+        ...
+
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[int], Any]:
+        """Makes the sample of a number, counted from 0; every stream of a seed has others."""
+        ...
+
+    def flipped(self, sample: Any, horizontally: bool, vertically: bool) -> Any:
+        """A sample mirrored; a mirrored instrument is still one."""
+        ...
+
+    def tensors(self, sample: Any) -> Batch:
+        """A sample as tensors of bytes."""
+        ...
+
+    def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss, and each term before weighting."""
+        ...
+
+    def validate(self, network: Any, batch: Batch) -> dict[str, float]:
+        """Figures of a folded network, by the names in `columns`."""
+        ...
+
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """Whether a figure besides `score` has become worse than at the start, so that weights are not kept."""
+        ...
+
+    def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+        """Example predictions of a folded network: per sample, titled pictures."""
+        ...
+
+
+def flips(array: np.ndarray, horizontally: bool, vertically: bool) -> np.ndarray:
+    """An image [h, w, ...] mirrored."""
+    return array[:: -1 if vertically else 1, :: -1 if horizontally else 1]
+
+
+def byte_tensor(array: np.ndarray) -> Tensor:
+    """An image [h, w, channels] as a tensor [channels, h, w]."""
+    return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
+
+
+@torch.no_grad()
+def validate(
+    network: FeatureNetwork, images: Float[Tensor, "pairs 2 3 h w"], classes: Int[Tensor, "pairs 2 h w"], batch: int = 4
+) -> dict[str, float]:
+    """Run a folded network over a validation set: means of
+
+    - `dice_observed`, `dice_hybrid`: Dice of the predicted mask on observed and on hybrid images,
+    - `similarity_aligned`: cosine between features of observed and hybrid image where both show an instrument,
+    - `similarity_misaligned`: the same where only one of them does.
+    """
+    dices, aligned, misaligned = [], [], []
+    for start in range(0, len(images), batch):
+        chunk = images[start : start + batch].to(next(network.parameters()).device)
+        mask = (classes[start : start + batch] > 0).to(chunk.device)
+        features = network.features(chunk.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+        predicted = (network.head(features)[:, 0] > 0).unflatten(0, chunk.shape[:2])
+        dices.append(dice(predicted, mask))
+        of_pair = features.unflatten(0, chunk.shape[:2])
+        similarity = functional.cosine_similarity(of_pair[:, 0], of_pair[:, 1], dim=1)
+        aligned.append(similarity[mask[:, 0] & mask[:, 1]])
+        misaligned.append(similarity[mask[:, 0] ^ mask[:, 1]])
+    mean = torch.cat(dices).mean(0)
+    return {
+        "dice_observed": float(mean[0]),
+        "dice_hybrid": float(mean[1]),
+        "similarity_aligned": float(torch.cat(aligned).mean()),
+        "similarity_misaligned": float(torch.cat(misaligned).mean()),
+    }
+
+
+def dice(predicted: Tensor, truth: Tensor) -> Tensor:
+    """Dice of boolean masks [..., h, w]; 1 where both are empty."""
+    overlap = (predicted & truth).sum((-2, -1))
+    return (2 * overlap + 1e-9) / (predicted.sum((-2, -1)) + truth.sum((-2, -1)) + 1e-9)
+
+
+def pooled_dice(predicted: Bool[Tensor, "n h w"], truth: Bool[Tensor, "n h w"]) -> float:
+    """Dice of the pixels of all images together; 1 where both are empty.
+
+    A mean over images would hang on those that show no arm: their own Dice is 1, or 0 as soon as one pixel is wrong.
+    """
+    return float(dice(predicted.flatten(0, 1), truth.flatten(0, 1)))
+
+
+_NEIGHBOURHOOD = 21
+_TINY = 1e-8
+_OTHER_PART = 0.6
+
+
+def feature_loss(
+    network: FeatureNetwork,
+    images: Float[Tensor, "batch pair 3 h w"],
+    classes: Int[Tensor, "batch pair h w"],
+    weights: ObjectiveWeights,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted loss of a batch of pairs, and each term before weighting.
+
+    Args:
+        network: the network that is trained.
+        images: observed image and hybrid image of each pair, RGB in [0, 1].
+        classes: 0 background, 1 shaft, 2 head.
+        weights: of the terms.
+    """
+    features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+    logits = network.head(features)[:, 0]
+    target = (classes > 0).flatten(0, 1).to(logits.dtype)
+    of_pair = features.unflatten(0, images.shape[:2])
+    terms = {
+        "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
+        "dice": soft_dice_loss(logits.sigmoid(), target),
+        "consistency": consistency_loss(of_pair[:, 0], of_pair[:, 1], classes[:, 0], classes[:, 1]),
+    }
+    return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
+
+
+def soft_dice_loss(probability: Float[Tensor, "batch h w"], target: Float[Tensor, "batch h w"]) -> Float[Tensor, ""]:
+    """One minus the Dice score of probabilities, averaged over images."""
+    overlap = (probability * target).sum((1, 2))
+    return 1 - ((2 * overlap + 1) / (probability.sum((1, 2)) + target.sum((1, 2)) + 1)).mean()
+
+
+def consistency_loss(
+    features_a: Float[Tensor, "batch channels h w"],
+    features_b: Float[Tensor, "batch channels h w"],
+    classes_a: Int[Tensor, "batch h w"],
+    classes_b: Int[Tensor, "batch h w"],
+) -> Float[Tensor, ""]:
+    """How far cosine similarities are from what alignment needs, near the instruments (where ACS attends).
+
+    Where both images show the same class the cosine should be 1; where one shows background and the other an
+    instrument, not above 0; where one shows the shaft and the other the head, not above 0.6. Each of these counts by
+    its own mean, since background would outweigh instruments otherwise.
+    """
+    overlap = (features_a * features_b).sum(1)
+    similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
+    instrument = ((classes_a > 0) | (classes_b > 0)).to(similarity.dtype)
+    near = dilated(instrument)
+    same = (classes_a == classes_b).to(similarity.dtype)
+    moved = ((classes_a > 0) != (classes_b > 0)).to(similarity.dtype)
+    other_part = instrument * (classes_a != classes_b) * (1 - moved)
+    return (
+        weighted_mean(1 - similarity, same * instrument)
+        + weighted_mean(1 - similarity, same * near * (1 - instrument))
+        + weighted_mean(similarity.clamp(min=0), moved)
+        + weighted_mean((similarity - _OTHER_PART).clamp(min=0), other_part)
+    )
+
+
+def dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
+    """The mask and its neighbourhood."""
+    # A square's maximum is the maximum along rows of the maxima along columns.
+    rows = functional.max_pool2d(mask[:, None], (_NEIGHBOURHOOD, 1), 1, (_NEIGHBOURHOOD // 2, 0))
+    return functional.max_pool2d(rows, (1, _NEIGHBOURHOOD), 1, (0, _NEIGHBOURHOOD // 2))[:, 0]
+
+
+def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Mean under weights; about zero where all weights are."""
+    return (values * weights).sum() / (weights.sum() + 1)
+
+
+class FeatureTask:
+    """See `Task`. A batch is images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images."""
+
+    columns: ClassVar[dict[str, str]] = {
+        "dice_observed": "Dice, observed",
+        "dice_hybrid": "Dice, hybrid",
+        "similarity_aligned": "cosine, aligned",
+        "similarity_misaligned": "cosine, misaligned",
+    }
+    score: ClassVar[str] = "dice_observed"
+
+    def network(self, config: TrainingConfig) -> FeatureNetwork:
+        """A network with random weights."""
+        return FeatureNetwork(config.architecture)
+
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> PairGenerator:
+        """An endless source of pairs."""
+        return PairGenerator([Robot.load(path) for path in config.robots], config.images, stream)
+
+    def flipped(self, sample: TrainingPair, horizontally: bool, vertically: bool) -> TrainingPair:
+        """A pair mirrored."""
+        parts = sample.observed, sample.observed_classes, sample.hybrid, sample.hybrid_classes
+        return TrainingPair(*(flips(part, horizontally, vertically) for part in parts))
+
+    def tensors(self, sample: TrainingPair) -> Batch:
+        """A pair as tensors of bytes."""
+        images = np.stack([sample.observed, sample.hybrid]).transpose(0, 3, 1, 2)
+        classes = np.stack([sample.observed_classes, sample.hybrid_classes])
+        return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(np.ascontiguousarray(classes))
+
+    def loss(self, config: TrainingConfig, network: FeatureNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss, and each term before weighting."""
+        images, classes = batch
+        return feature_loss(network, images.float() / 255, classes, config.objective)
+
+    def validate(self, network: FeatureNetwork, batch: Batch) -> dict[str, float]:
+        """Figures of a folded network."""
+        return validate(network, batch[0].float() / 255, batch[1])
+
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """See `Task`; the score says all."""
+        return False
+
+    @torch.no_grad()
+    def panels(self, network: FeatureNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+        """Example predictions of a folded network."""
+        rows = []
+        for pair, truth in zip(batch[0].float() / 255, batch[1].cpu().numpy() > 0, strict=True):
+            features = network.features(pair.to(next(network.parameters()).device))
+            predicted = (network.head(features)[:, 0] > 0).cpu().numpy()
+            similarity = functional.cosine_similarity(features[:1], features[1:], dim=1)[0].cpu().numpy()
+            shown = pair.permute(0, 2, 3, 1).cpu().numpy()
+            rows.append(
+                [
+                    ("observed", shown[0]),
+                    ("its prediction", _confusion(predicted[0], truth[0])),
+                    ("hybrid", shown[1]),
+                    ("its prediction", _confusion(predicted[1], truth[1])),
+                    ("cosine of features", similarity),
+                ]
+            )
+        return rows
+
+
+def _confusion(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """True positives white, true negatives black, false positives orange, false negatives red, as in the paper."""
+    image = np.zeros((*truth.shape, 3))
+    image[predicted & truth] = 1, 1, 1
+    image[predicted & ~truth] = 1, 0.6, 0.1
+    image[~predicted & truth] = 0.9, 0.1, 0.1
+    return image
+
+
+_PART_WORSE, _TIP_WORSE = 0.005, 0.2
+"""What counts as worse: a part's Dice lower by this much [1], tips farther off by this much [px]."""
+_LOST = 20.0
+"""Error of a tip that is not predicted, and the most that one counts [px]."""
+_SMOOTH = 0.2
+_AT_ONCE = 8
+
+
+class SurfaceTask:
+    """See `Task`. A batch is images, given surface maps and true surface maps."""
+
+    columns: ClassVar[dict[str, str]] = {
+        "dice": "Dice of the arms",
+        "dice_given": "Dice of the given kinematics",
+        "part_accuracy": "pixels with the right part",
+        **{f"dice_{part}": f"Dice of the part {part}" for part in PARTS},
+        "tip_error": "error of tips [px]",
+        "normal_error_deg": "error of normals [deg]",
+    }
+    score: ClassVar[str] = "dice"
+
+    def network(self, config: TrainingConfig) -> SurfaceNetwork:
+        """A network with random weights."""
+        return SurfaceNetwork(config.architecture)
+
+    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
+        """An endless source of samples."""
+        return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
+
+    def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:
+        """A sample mirrored; normals turn with it."""
+        observed, given, surface = (
+            flips(part, horizontally, vertically) for part in (sample.observed, sample.given, sample.surface)
+        )
+        turn = np.ones(surface.shape[2], np.int8)
+        turn[NORMALS.start] = -1 if horizontally else 1
+        turn[NORMALS.start + 1] = -1 if vertically else 1
+        return SurfaceSample(observed, given * turn, surface * turn)
+
+    def tensors(self, sample: SurfaceSample) -> Batch:
+        """A sample as tensors of bytes."""
+        return byte_tensor(sample.observed), byte_tensor(sample.given), byte_tensor(sample.surface)
+
+    def loss(self, config: TrainingConfig, network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss, and each term before weighting."""
+        images, given, surface = _floats(batch)
+        predicted = network(images, given)
+        coverage = surface[:, COVERAGE]
+        near = dilated((coverage.sum(1) > 0).float())
+        background = (1 - coverage.sum(1, keepdim=True)).clamp(min=0)
+        entropy = functional.cross_entropy(predicted.coverage, torch.cat([background, coverage], 1), reduction="none")
+        difference = functional.smooth_l1_loss(predicted.normals, surface[:, NORMALS], reduction="none", beta=_SMOOTH)
+        terms = {
+            "everywhere": entropy.mean(),
+            "near": weighted_mean(entropy, near),
+            "dice": _part_dice_loss(predicted.map()[:, COVERAGE], coverage),
+            "normals": weighted_mean(difference.sum(1), near),
+        }
+        weights = config.surface_objective
+        return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
+
+    @torch.no_grad()
+    def validate(self, network: SurfaceNetwork, batch: Batch) -> dict[str, float]:
+        """Figures of a folded network."""
+        images, given, surface = _floats(batch)
+        seen = _seen(network, images, given)
+        true, guess = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (surface, seen))
+        known = given[:, COVERAGE].sum(1) > 0.5
+        ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
+        cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
+        parts = {f"dice_{name}": _pooled_part(seen, surface, part) for part, name in enumerate(PARTS)}
+        return {
+            **parts,
+            "tip_error": tip_error(seen, surface),
+            "dice": pooled_dice(guess, true),
+            "dice_given": pooled_dice(known, true),
+            "part_accuracy": float((ours[:, COVERAGE].argmax(1) == theirs[:, COVERAGE].argmax(1)).float().mean()),
+            "normal_error_deg": float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).mean()),
+        }
+
+    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
+        """Whether a part is seen worse than at the start, or tips are farther off."""
+        # Runs of earlier versions have no such figures.
+        names = [name for name in (f"dice_{part}" for part in PARTS) if name in first]
+        parts = any(now[name] < first[name] - _PART_WORSE for name in names)
+        return parts or now["tip_error"] > first.get("tip_error", math.inf) + _TIP_WORSE
+
+    @torch.no_grad()
+    def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+        """Example predictions of a folded network."""
+        images, given, surface = _floats(batch)
+        seen = _seen(network, images, given)
+        rows = []
+        for image, wrong, found, true in zip(images, given, seen, surface, strict=True):
+            rows.append(
+                [
+                    ("observed", image.permute(1, 2, 0).numpy()),
+                    ("given", _colors(wrong[COVERAGE])),
+                    ("predicted parts", _colors(found[COVERAGE])),
+                    ("true parts", _colors(true[COVERAGE])),
+                    ("predicted normals", _colors(0.5 + 0.5 * found[NORMALS])),
+                    ("true normals", _colors(0.5 + 0.5 * true[NORMALS])),
+                ]
+            )
+        return rows
+
+
+def _pooled_part(seen: Tensor, surface: Tensor, part: int) -> float:
+    guess, true = (maps[:, COVERAGE][:, part] > 0.5 for maps in (seen, surface))
+    return pooled_dice(guess, true)
+
+
+def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n channels h w"]) -> float:
+    """Mean distance of predicted tips from true ones, over images that show the jaws [px].
+
+    The tip is the pixel of the jaws that is farthest from the middle of the shaft, or of what is seen of the arm.
+    """
+    errors = []
+    for ours, theirs in zip(seen[:, COVERAGE] > 0.5, surface[:, COVERAGE] > 0.5, strict=True):
+        middle = _middle(theirs)
+        if middle is None or (true := _farthest(theirs[-1], middle)) is None:
+            continue
+        found = _farthest(ours[-1], middle)
+        errors.append(_LOST if found is None else min(float((found - true).norm()), _LOST))
+    return float(np.mean(errors)) if errors else 0.0
+
+
+def _middle(parts: Tensor) -> Tensor | None:
+    """Middle of the shaft, or of the arm where no shaft is seen; None without any."""
+    pixels = (parts[0] if parts[0].any() else parts.any(0)).nonzero()
+    return pixels.float().mean(0) if len(pixels) else None
+
+
+def _farthest(mask: Tensor, middle: Tensor) -> Tensor | None:
+    pixels = mask.nonzero().float()
+    return pixels[(pixels - middle).norm(dim=1).argmax()] if len(pixels) else None
+
+
+def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    images, given, surface = batch
+    images = (images.float() / 255).contiguous(memory_format=torch.channels_last)
+    return images, given.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
+
+
+def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
+    """What the network sees in many images, where these are; it may be on another device."""
+    device = next(network.parameters()).device
+    parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)
+    return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])
+
+
+def _part_dice_loss(
+    predicted: Float[Tensor, "batch parts h w"], coverage: Float[Tensor, "batch parts h w"]
+) -> Float[Tensor, ""]:
+    assert predicted.shape[1] == len(PARTS)
+    overlap = (predicted * coverage).sum((2, 3))
+    return 1 - ((2 * overlap + 1) / (predicted.sum((2, 3)) + coverage.sum((2, 3)) + 1)).mean()
+
+
+def _colors(channels: Float[Tensor, "3 h w"]) -> np.ndarray:
+    return channels.clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
 def task_of(network: NetworkName) -> Task:

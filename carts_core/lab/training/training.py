@@ -1,29 +1,230 @@
-"""Training of the feature network: `train` runs, resumes and reports."""
+"""Training of the networks: `train` runs, resumes and reports."""
 
 import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import matplotlib
+import numpy as np
 import torch
+from matplotlib.figure import Figure
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from ...console import in_markdown
 from ...errors import SettingsError
-from ...files import locked_folder, output_path
-from ...networks.network import UNet, channels_last
+from ...files import OutputPath, locked_folder, output_path, output_stream, write_text
+from ...networks.network import Network, UNet, channels_last
 from ...networks.weights import read_weights, save_weights
 from ...settings import Architecture, TrainingConfig
 from ...stopping import finished_first, when_stopped
 from ...wording import counted
 from .checkpoint import History, load_checkpoint, save_checkpoint
-from .growth import grow
 from .loader import training_batches, validation_set
-from .progress import TrainingProgress, TrainingResult
-from .report import write_report
-from .task import Batch
-from .tasks import task_of
+from .tasks import Batch, task_of
+
+
+def grow(larger: Network, trained: nn.Module) -> Network:
+    """Put the weights of a trained network into a larger one of the same kind, so that it gives the same output.
+
+    New channels keep their random weights, but no trained channel reads them yet; new convolutions at the end of a
+    block pass trained channels on unchanged.
+
+    Args:
+        larger: a fresh network; changed in place and returned.
+        trained: a network with as many channels or fewer, and as many convolutions per block or fewer.
+
+    Raises:
+        SettingsError: some layer of `trained` is larger than that of `larger`, or has no counterpart in it.
+    """
+    old_layers, new_layers = dict(trained.named_modules()), dict(larger.named_modules())
+    for name in old_layers:
+        if name not in new_layers:
+            raise SettingsError(
+                f"layer {name} of the weights has no counterpart; ask for as many convolutions or more."
+            )
+    before: nn.BatchNorm2d | None = None
+    with torch.no_grad():
+        for name, layer in new_layers.items():
+            old = old_layers.get(name)
+            if isinstance(layer, nn.Conv2d):
+                assert old is None or isinstance(old, nn.Conv2d)
+                _embed_convolution(name, layer, old, before)
+            elif isinstance(layer, nn.BatchNorm2d):
+                if old is None:
+                    assert before is not None
+                    _pass_through(layer, before)
+                else:
+                    assert isinstance(old, nn.BatchNorm2d)
+                    for own, theirs in zip(layer.state_dict().values(), old.state_dict().values(), strict=True):
+                        _put(name, own, theirs)
+                    before = old
+    return larger
+
+
+def _embed_convolution(name: str, layer: nn.Conv2d, old: nn.Conv2d | None, before: nn.BatchNorm2d | None) -> None:
+    if old is None:
+        assert before is not None
+        kept = before.num_features
+        layer.weight[:kept] = 0
+        middle = layer.kernel_size[0] // 2
+        layer.weight[range(kept), range(kept), middle, middle] = 1
+        return
+    layer.weight[: old.out_channels] = 0
+    _put(name, layer.weight, old.weight)
+    if layer.bias is not None and old.bias is not None:
+        _put(name, layer.bias, old.bias)
+
+
+def _pass_through(layer: nn.BatchNorm2d, before: nn.BatchNorm2d) -> None:
+    """Undo the normalisation of what the ReLU after `before` lets through, taken to be normally distributed."""
+    kept = before.num_features
+    shift, scale = before.bias, before.weight.abs().clamp(min=1e-6)
+    ratio = shift / scale
+    share, density = (
+        0.5 * (1 + torch.erf(ratio / math.sqrt(2))),
+        torch.exp(-ratio.square() / 2) / math.sqrt(2 * math.pi),
+    )
+    mean = shift * share + scale * density
+    variance = ((shift.square() + scale.square()) * share + shift * scale * density - mean.square()).clamp(min=1e-4)
+    assert layer.running_mean is not None and layer.running_var is not None
+    layer.running_mean[:kept], layer.running_var[:kept] = mean, variance
+    layer.bias[:kept], layer.weight[:kept] = mean, (variance + layer.eps).sqrt()
+
+
+def _put(name: str, own: Tensor, theirs: Tensor) -> None:
+    if own.ndim != theirs.ndim or any(size < needed for size, needed in zip(own.shape, theirs.shape, strict=True)):
+        raise SettingsError(
+            f"layer {name} of the weights has shape {tuple(theirs.shape)} and does not fit into {tuple(own.shape)}. "
+            "Ask for an architecture that is as large or larger everywhere."
+        )
+    own[tuple(slice(size) for size in theirs.shape)] = theirs
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Where a run stands; one per logged step."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps in all; an estimate in a run of limited time."""
+    loss: float
+    """Loss, averaged over the last steps."""
+    seconds_per_step: float
+    """Wall time per step [s]."""
+    validation: dict[str, float] | None
+    """The newest validation."""
+    first: dict[str, float] | None
+    """The first one of the run, wherever that was interrupted since."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a finished run leaves behind."""
+
+    weights: Path
+    """Weights file, ready for `FeatureExtractor.load`."""
+    report: Path
+    """The training report."""
+    validation: dict[str, float]
+    """Figures of the saved weights."""
+    first: dict[str, float] | None
+    """Figures of the run's first validation; None of a run that had none."""
+    seconds: float
+    """Wall time spent in training steps, over all resumed parts [s]."""
+
+
+matplotlib.use("Agg")
+
+Panels = list[list[tuple[str, np.ndarray]]]
+"""Per sample, titled pictures; one without colours runs from -1 to 1."""
+
+
+def write_report(folder: OutputPath, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
+    """Write `curves.png`, `predictions.jpg` and `README.md`; returns the path of the page."""
+    with output_stream(folder / "curves.png") as stream:
+        _curves(history, columns).savefig(stream, format="png", dpi=110)
+    with output_stream(folder / "predictions.jpg") as stream:
+        _predictions(examples).savefig(stream, format="jpg", dpi=110, pil_kwargs={"quality": 85})
+    page = folder / "README.md"
+    write_text(page, _page(config, history, columns))
+    return page.path
+
+
+def _curves(history: History, columns: dict[str, str]) -> Figure:
+    figure = Figure(figsize=(3.3 * (1 + len(columns)), 3.4), layout="constrained")
+    loss_axes, *others = figure.subplots(1, 1 + len(columns))
+    steps = [entry["step"] for entry in history.losses]
+    for name in history.losses[0] if history.losses else ():
+        if name not in ("step", "loss"):
+            values = [entry[name] for entry in history.losses]
+            loss_axes.plot(steps, values, label=name.replace("_", " "), linewidth=0.9)
+    loss_axes.set(title="training loss, per term", xlabel="step", yscale="log")
+    if loss_axes.lines:
+        loss_axes.legend(fontsize=8)
+    steps = [entry["step"] for entry in history.validations]
+    for axes, (name, title) in zip(others, columns.items(), strict=True):
+        axes.plot(steps, [entry.get(name, math.nan) for entry in history.validations], ".-")
+        axes.set(title=f"validation: {title}", xlabel="step")
+    for axes in (loss_axes, *others):
+        axes.grid(alpha=0.3)
+        axes.title.set_fontsize(9)
+    return figure
+
+
+def _predictions(examples: Panels) -> Figure:
+    titles = [title for title, _ in examples[0]]
+    figure = Figure(figsize=(2.2 * len(titles), 1.75 * len(examples)), layout="constrained")
+    rows = figure.subplots(len(examples), len(titles), squeeze=False)
+    for row, panels in zip(rows, examples, strict=True):
+        for axes, (_, panel) in zip(row, panels, strict=True):
+            flat = panel.ndim == 2
+            axes.imshow(panel, vmin=-1 if flat else None, vmax=1 if flat else None, cmap="RdYlGn")
+            axes.set_axis_off()
+    for axes, title in zip(rows[0], titles, strict=True):
+        axes.set_title(title, fontsize=9)
+    return figure
+
+
+def _page(config: dict, history: History, columns: dict[str, str]) -> str:
+    steps = int(history.losses[-1]["step"]) if history.losses else 0
+    lines = [
+        f"# Training of the {config['network']} network",
+        "",
+        f"{counted(steps, 'step')} of {counted(config['batch_size'], 'sample')}, "
+        f"{counted(round(history.seconds / 60), 'minute')}, robots: "
+        f"{', '.join(map(in_markdown, config['robots']))}.",
+        "",
+        "![curves](curves.png)",
+        "",
+        f"| step | {' | '.join(columns.values())} |",
+        "|---" * (1 + len(columns)) + "|",
+    ]
+    for entry in history.validations:
+        figures = " | ".join(f"{entry.get(name, math.nan):.4f}" for name in columns)
+        lines.append(f"| {entry['step']} | {figures} |")
+    lines += [
+        "",
+        "Validation images are made like the training images, from random numbers that training never sees.",
+        "",
+        "![example predictions](predictions.jpg)",
+        "",
+        "In predictions of masks, white is a true positive, black a true negative, orange a false positive and red a",
+        "false negative. Parts are red (shaft), green (wrist) and blue (jaws).",
+        "",
+        "## Settings",
+        "",
+        "```json",
+        json.dumps(config, indent=2).replace("`", "\\u0060"),
+        "```",
+        "",
+    ]
+    return "\n".join(lines)
+
 
 _LOG_EVERY = 10
 _EXAMPLES = 6

@@ -22,9 +22,7 @@ from ..mesh_cache import cache_dir
 from ..psm_kinematics import CLASSIC, SI, PsmGeometry
 from ..psm_urdf import carrier, joint, quarter_turns
 from .catalogue import BY_NAME, SI_SUFFIX, Instrument
-from .solids import Solid, cylinder
-from .tips import FIRST, SECOND, Electrode, Jaws
-from .wrist import CHEEK_OUTSIDE, wide_body, wide_cables
+from .shapes import CHEEK_OUTSIDE, FIRST, SECOND, Electrode, Jaws, Solid, cylinder, wide_body, wide_cables
 
 SCHEME = "builtin:"
 SHIPPED = "psm_lnd"

@@ -6,7 +6,7 @@ Wrist lengths are those of the dVRK's tool files. Shapes are ours: simple ones o
 from dataclasses import dataclass
 from typing import Literal
 
-from .tips import ClipApplier, Electrode, Hub, Jaws, Scissors, Tip
+from .shapes import ClipApplier, Electrode, Hub, Jaws, Scissors, Tip
 
 Generation = Literal["classic", "si"]
 SI_SUFFIX = "_si"

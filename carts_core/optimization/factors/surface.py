@@ -1,6 +1,6 @@
 """The surface factor: surface maps of a state against predicted ones, under one blur.
 
-What the network predicts (parts and normals, see `carts_core.model.surface`) the renderer knows exactly for every
+What the network predicts (parts and normals, see `carts_core.model.parts`) the renderer knows exactly for every
 state, so no background, no shading and no network enter a step, and residuals have a Jacobian. A robust weight per
 pixel keeps what cannot be explained (an occluder, a false detection) from pulling.
 """
@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...imaging.window import Window
+from ...model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...model.scene import Scene, SceneState
-from ...model.surface import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...rendering import JacobianBlock, Renderer, SurfaceRendering
 from ...settings import SurfaceSolver
 from ...threads import one_thread, total

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SettingsError
-from ...model.landmarks import Landmark, LandmarkKind, landmarks, link_transforms
+from ...model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
 from ...model.scene import Scene
 
 NEAREST = 1e-3

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, methods, plan
+from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, plan
+from carts_core.lab.benchmark.scope import METHODS
 from carts_core.lab.synthesis import DOMAINS
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import SolverSettings
@@ -40,14 +41,14 @@ TINY = Scope(
 @pytest.fixture
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two steps for every iterative method."""
-    for name, method in list(methods.METHODS.items()):
+    for name, method in list(METHODS.items()):
         if method.settings is not None:
             make = method.settings
 
             def short(steps: int, make: Callable[[int], SolverSettings] = make) -> SolverSettings:
                 return replace(make(steps), iterations=2)
 
-            monkeypatch.setitem(methods.METHODS, name, replace(method, settings=short))
+            monkeypatch.setitem(METHODS, name, replace(method, settings=short))
 
 
 @pytest.fixture

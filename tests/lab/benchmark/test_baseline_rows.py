@@ -10,7 +10,7 @@ from carts_core.console import Terminal
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
 from carts_core.lab.benchmark import Benchmark, Measurement, Target, plan
-from carts_core.lab.benchmark.methods import BASELINES
+from carts_core.lab.benchmark.scope import BASELINES
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import main_tables
 from carts_core.lab.benchmark.targets import image_alone_table, image_alone_targets

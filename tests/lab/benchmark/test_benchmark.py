@@ -26,10 +26,10 @@ from carts_core.lab.benchmark import (
     synthetic_room_source,
     write_report,
 )
+from carts_core.lab.benchmark.conditions import NO_ARM, OTHER_INSTRUMENT, WRONG
 from carts_core.lab.benchmark.runner import SourceBench
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import sequence_table
-from carts_core.lab.benchmark.wrong_inputs import NO_ARM, OTHER_INSTRUMENT, WRONG
 
 QUIET = Console(quiet=True)
 RUNS = 62

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.lab.benchmark.crossing import crossed
+from carts_core.lab.benchmark.conditions import crossed
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence

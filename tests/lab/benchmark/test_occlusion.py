@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carts_core.lab.benchmark.occlusion import SHARE, occlude
+from carts_core.lab.benchmark.conditions import SHARE, occlude
 from carts_core.recording import Sequence
 
 

@@ -8,10 +8,7 @@ import pytest
 from handmade import make_measurement
 
 from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, plan, synthetic_source, targets
-from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
-from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.verdicts import deviation_table, family_table, verdict_table
-from carts_core.lab.benchmark.wrong_inputs import (
+from carts_core.lab.benchmark.conditions import (
     NO_ARM,
     OTHER_CAMERA,
     OTHER_FRAME,
@@ -20,6 +17,9 @@ from carts_core.lab.benchmark.wrong_inputs import (
     with_other_instruments,
     wrong_inputs,
 )
+from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
+from carts_core.lab.benchmark.statistics import Measurements
+from carts_core.lab.benchmark.targets import deviation_table, family_table, verdict_table
 from carts_core.recording import Sequence
 
 

@@ -10,7 +10,7 @@ from carts_core.errors import RobotError, SettingsError
 from carts_core.evaluation import dice
 from carts_core.lab.benchmark.hand_eye import write_arm
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
-from carts_core.lab.synthesis.any_robot import enlarged, enlargement, measurement_error
+from carts_core.lab.synthesis.motion import enlarged, enlargement, measurement_error
 from carts_core.lab.synthesis.scene import place_cameras
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence

@@ -11,12 +11,20 @@ import torch
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SequenceError, SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
-from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, adapted_to, gain
+from carts_core.lab.training.adaptation import (
+    BACKGROUNDS,
+    STEPS,
+    Judgement,
+    MadeFits,
+    OwnFits,
+    adapted_to,
+    edge_support,
+    gain,
+    made_images,
+)
 from carts_core.lab.training.checkpoint import load_checkpoint
-from carts_core.lab.training.judging import Judgement, MadeFits, OwnFits, edge_support, made_images
-from carts_core.lab.training.surface_task import SurfaceTask, tip_error
+from carts_core.lab.training.tasks import SurfaceTask, dice, pooled_dice, tip_error
 from carts_core.lab.training.training import train
-from carts_core.lab.training.validation import dice, pooled_dice
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
 from carts_core.recording import Sequence

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.lab.training.growth import grow
+from carts_core.lab.training.training import grow
 from carts_core.networks.network import SurfaceNetwork
 from carts_core.settings import Architecture
 

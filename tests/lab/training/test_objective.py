@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.lab.training.objective import consistency_loss, feature_loss, soft_dice_loss
+from carts_core.lab.training.tasks import consistency_loss, feature_loss, soft_dice_loss
 from carts_core.networks.network import FeatureNetwork
 from carts_core.settings import ObjectiveWeights
 

@@ -1,17 +1,204 @@
-"""Tips of instruments. Jaw link's frame, millimetres.
+"""Shapes of the built-in instruments [mm]: closed meshes from cross-sections, the wide wrist, and the tips.
 
-y points to the tip and z is the yaw axis. A jaw lies on the side of its sign along x, its gripping face near
-x = 0.
+Meshes of an instrument may overlap, since the renderer draws the outside of their union. The wrist is in the wrist
+pitch link's frame: x to the tip, the pitch axis along z through the origin, the yaw axis parallel to y at x = the
+wrist's length. Tips are in the jaw link's frame: y to the tip, the yaw axis along z; a jaw lies on the side of its sign
+along x, its gripping face near x = 0.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from .solids import Solid, bar, cylinder, plate, together, wire
+_AXES = {"x": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "y": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "z": np.eye(3)}
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed surface, or several of them."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    """[mm]"""
+    faces: Int[np.ndarray, "F 3"]
+    """Counter-clockwise seen from outside."""
+
+    def mirrored(self, axis: int) -> "Solid":
+        """The solid with the sign of one coordinate changed."""
+        vertices = self.vertices.copy()
+        vertices[:, axis] *= -1
+        return Solid(vertices, self.faces[:, ::-1])
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
+        """The solid, displaced [mm]."""
+        return Solid(self.vertices + np.array([x, y, z]), self.faces)
+
+
+def together(parts: Iterable[Solid]) -> Solid:
+    """Several solids as one mesh."""
+    vertices, faces, count = [], [], 0
+    for part in parts:
+        vertices.append(part.vertices)
+        faces.append(part.faces + count)
+        count += len(part.vertices)
+    return Solid(np.concatenate(vertices), np.concatenate(faces))
+
+
+def loft(rings: Float[np.ndarray, "rings n 3"]) -> Solid:
+    """The solid through a stack of star-shaped rings of equally many points [mm], closed by flat ends."""
+    rings = np.asarray(rings, dtype=float)
+    count, n, _ = rings.shape
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    faces = [np.stack([np.full(n, count * n), j, i], 1)]
+    for a in range(0, (count - 1) * n, n):
+        b = a + n
+        faces += [np.stack([a + i, a + j, b + j], 1), np.stack([a + i, b + j, b + i], 1)]
+    last = (count - 1) * n
+    faces.append(np.stack([np.full(n, count * n + 1), last + i, last + j], 1))
+    triangles = np.concatenate(faces)
+    p, q, r = (vertices[triangles[:, k]] for k in range(3))
+    if np.einsum("ij,ij->", p, np.cross(q, r)) < 0:
+        triangles = triangles[:, ::-1]
+    return Solid(vertices, triangles)
+
+
+def turned(profile: Sequence[tuple[float, float]], axis: str, segments: int = 28) -> Solid:
+    """A profile of (radius, height) [mm] turned about an axis; heights rise, radii are above 0."""
+    angles = np.arange(segments) * (2 * np.pi / segments)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(segments)], axis=1)
+    rings = [circle * (radius, radius, 0.0) + (0.0, 0.0, height) for radius, height in profile]
+    return loft(np.array(rings) @ np.asarray(_AXES[axis], dtype=float).T)
+
+
+def cylinder(radius: float, low: float, high: float, axis: str, segments: int = 28) -> Solid:
+    """A cylinder from `low` to `high` [mm] along an axis, with a small bevel."""
+    bevel = min(0.12, 0.2 * radius, 0.2 * (high - low))
+    profile = [(radius - bevel, low), (radius, low + bevel), (radius, high - bevel), (radius - bevel, high)]
+    return turned(profile, axis, segments)
+
+
+def plate(outline: Sequence[tuple[float, float]], low: float, high: float, axis: str) -> Solid:
+    """A star-shaped outline with a small bevel, from `low` to `high` [mm] along an axis.
+
+    Args:
+        outline: corners [mm], (y, z) for axis "x", (z, x) for axis "y", (x, y) for axis "z".
+        low, high: ends along the axis.
+        axis: "x", "y" or "z".
+    """
+    corners = np.asarray(outline, dtype=float)
+    centre = corners.mean(0)
+    bevel = min(0.15, 0.2 * (high - low))
+    reach = np.linalg.norm(corners - centre, axis=1, keepdims=True)
+    inner = centre + (corners - centre) * (1 - bevel / np.maximum(reach, 4 * bevel))
+    rings = [
+        np.column_stack([flat, np.full(len(flat), height)])
+        for flat, height in ((inner, low), (corners, low + bevel), (corners, high - bevel), (inner, high))
+    ]
+    return loft(np.array(rings) @ np.asarray(_AXES[axis], dtype=float).T)
+
+
+def wire(path: Float[np.ndarray, "n 3"], radii: float | Sequence[float], sides: int = 12) -> Solid:
+    """A round wire along a polyline [mm]; its cross-section is carried along without twist."""
+    points = np.asarray(path, dtype=float)
+    steps = np.diff(points, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    tangents = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    normal = np.cross(tangents[0], np.eye(3)[np.argmin(np.abs(tangents[0]))])
+    angles = np.arange(sides) * (2 * np.pi / sides)
+    rings = []
+    for point, tangent, radius in zip(points, tangents, np.broadcast_to(radii, len(points)), strict=True):
+        normal = normal - (normal @ tangent) * tangent
+        normal /= np.linalg.norm(normal)
+        across = np.cross(tangent, normal)
+        rings.append(point + radius * (np.outer(np.cos(angles), normal) + np.outer(np.sin(angles), across)))
+    return loft(np.array(rings))
+
+
+def bar(stations: Float[np.ndarray, "n 5"], roundness: float = 0.35) -> Solid:
+    """A bar along y with a rounded rectangle as its cross-section.
+
+    Args:
+        stations: y, lower and upper x, lower and upper z [mm] of each cross-section, y rising.
+        roundness: radius of the corners, a part of the smaller side's half.
+    """
+    quarter = np.linspace(-np.pi / 2, 0.0, 3)
+    rings = []
+    for y, x_low, x_high, z_low, z_high in np.asarray(stations, dtype=float):
+        half = np.array([x_high - x_low, z_high - z_low]) / 2
+        radius = roundness * half.min()
+        centre = np.array([x_low + x_high, z_low + z_high]) / 2
+        corners = []
+        for number, (sx, sz) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
+            angles = quarter + number * np.pi / 2
+            middle = centre + (half - radius) * (sx, sz)
+            corners.append(middle + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+        outline = np.concatenate(corners)
+        rings.append(np.stack([outline[:, 0], np.full(len(outline), y), outline[:, 1]], axis=1))
+    return loft(np.array(rings))
+
+
+CHEEK_OUTSIDE = 4.2
+"""Half the wrist's width along the yaw axis."""
+CHEEK_INSIDE = 2.95
+_NECK = 1.2
+"""Half the thickness of the part between the shaft's fork arms."""
+_END = 4.1
+"""How far the cheeks reach beyond the yaw axis."""
+
+
+def wide_body(length: float) -> Solid:
+    """Neck, block and the two cheeks that hold the tip, with pins and pulleys.
+
+    Args:
+        length: from the pitch axis to the yaw axis [mm].
+    """
+    neck = [(-2.4, 1.2), (-1.2, 2.4), (0.0, 2.85), (1.0, 3.3), (2.0, 3.8), (4.5, 4.0)]
+    outline = [*((x, -y) for x, y in neck), *neck[::-1]]
+    parts = [plate(outline, -_NECK, _NECK, "z"), _block(length)]
+    for side in (1.0, -1.0):
+        low, high = sorted((side * CHEEK_INSIDE, side * CHEEK_OUTSIDE))
+        parts.append(_cheek(length, side))
+        parts.append(cylinder(0.9, low - 0.05, high + 0.05, "y", 18).moved(x=length))
+        pulleys = [turned([(1.9, a), (1.55, (a + b) / 2), (1.9, b)], "z", 20) for a, b in ((1.25, 2.08), (2.12, 2.95))]
+        for pulley in pulleys:
+            placed = pulley.moved(x=3.2, y=-2.2)
+            parts.append(placed if side > 0 else Solid(placed.vertices * (1, -1, -1), placed.faces))
+    return together(parts)
+
+
+def _block(length: float) -> Solid:
+    """The middle part that carries the cheeks: as wide as they are, and slimmer towards the jaws."""
+    rings = []
+    for x, y, z in ((2.9, 3.6, 2.9), (3.3, 4.0, 3.3), (length - 5.8, 4.0, 3.4), (length - 5.0, 3.4, 2.6)):
+        half = np.array([(1, 0.55), (0.8, 1), (-0.8, 1), (-1, 0.55), (-1, -0.55), (-0.8, -1), (0.8, -1), (1, -0.55)])
+        rings.append(np.column_stack([np.full(len(half), x), half * (y, z)]))
+    return loft(np.array(rings))
+
+
+def _cheek(length: float, side: float) -> Solid:
+    """The plate beside the tip's hub: straight flanks, round about the yaw axis, domed outside."""
+    angles = np.deg2rad(np.linspace(-75, 75, 11))
+    nose = np.stack([length + _END * np.cos(angles), 3.95 * np.sin(angles)], axis=1)
+    flank = np.array([(6.0, 3.45), (3.6, 3.3), (2.7, 2.6), (2.5, 1.2)])
+    outline = np.concatenate([nose, flank, (flank * (1, -1))[::-1]])
+    centre = np.array([length / 2 + 2.5, 0.0])
+    rings = []
+    for y, share in ((CHEEK_INSIDE, 0.97), (3.15, 1.0), (3.45, 1.0), (3.8, 0.95), (4.05, 0.84), (CHEEK_OUTSIDE, 0.62)):
+        x, z = (centre + share * (outline - centre)).T
+        rings.append(np.stack([x, np.full(len(x), side * y), z], axis=1))
+    return loft(np.array(rings))
+
+
+def wide_cables(length: float) -> Solid:
+    """The two cables that run between the cheeks to the tip's hub."""
+    run = np.array([(2.5, -0.3, 2.5), (5.0, 0.4, 3.3), (length - 1.5, 0.9, 3.5), (length + 0.5, 0.9, 3.45)])
+    first = wire(run, 0.25, 6)
+    return together([first, Solid(first.vertices * (1, -1, -1), first.faces)])
+
 
 Table = tuple[tuple[float, float], ...]
 """Pairs of a place along the blade, 0 at its root and 1 at its end, and a length [mm]."""

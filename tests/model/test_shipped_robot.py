@@ -1,7 +1,5 @@
 """The procedural PSM: its files, its kinematics, and its likeness to an independent model of the same instrument."""
 
-import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +11,10 @@ from manifold3d import Manifold
 from scipy.spatial import KDTree
 
 from carts_core.errors import RobotError
-from carts_core.lab.synthesis import psm
 from carts_core.model.robot import Robot
 from carts_core.rendering import visibility
 from carts_core.resources import shipped_robot
+from tools import shipped_robot as cad
 
 JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
 MESHES = sorted((shipped_robot().parent / "meshes").glob("*.ply"))
@@ -25,7 +23,7 @@ MESHES = sorted((shipped_robot().parent / "meshes").glob("*.ply"))
 @pytest.fixture(scope="module")
 def regenerated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("psm")
-    psm.write(folder)
+    cad.write(folder)
     return folder
 
 
@@ -41,7 +39,7 @@ def model() -> yourdfpy.URDF:
 
 
 def _random_positions(count: int, seed: int) -> np.ndarray:
-    limits = np.array([*(row.limits for row in psm.DH_TABLE if row.kind != "fixed"), psm.JAW_LIMITS])
+    limits = np.array([*(row.limits for row in cad.DH_TABLE if row.kind != "fixed"), cad.JAW_LIMITS])
     return np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1], (count, len(JOINTS)))
 
 
@@ -133,17 +131,9 @@ def test_overall_dimensions_are_those_of_the_instrument() -> None:
 
 
 def test_a_part_that_is_empty_is_reported_by_name() -> None:
-    part = psm.Part("left_out", "roll_link", psm.METAL, lambda: Manifold.cube((1, 1, 1)) - Manifold.cube((2, 2, 2)))
+    part = cad.Part("left_out", "roll_link", cad.METAL, lambda: Manifold.cube((1, 1, 1)) - Manifold.cube((2, 2, 2)))
     with pytest.raises(RobotError, match=r"left_out.*not a closed solid"):
-        psm.to_mesh(part)
-
-
-def test_without_manifold3d_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("carts_core.lab.synthesis.psm")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "manifold3d", None)
-    with pytest.raises(RobotError, match=r"carts\[synthesis\]"):
-        importlib.import_module("carts_core.lab.synthesis.psm")
+        cad.to_mesh(part)
 
 
 def _silhouette(robot: Robot, q: np.ndarray, T_camera_base: np.ndarray) -> np.ndarray:
