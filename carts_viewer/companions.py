@@ -11,7 +11,7 @@ from pathlib import Path
 from carts_core.errors import CartsError
 from carts_core.files import OutputPath, output_path, remove_file, set_aside, write_text
 from carts_core.files.reading import Kind, read_text
-from carts_core.project.place import data_dir
+from carts_core.project.identity import data_dir
 
 _FILE = Kind("decision", 64)
 _LONGEST_CAUSE = 300

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
 from carts_core.project import Edits, Figures, Kind, Provenance, Source
-from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer.imported import with_imported
 from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.session import Session

@@ -6,7 +6,7 @@ from functools import cache
 
 from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
-from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer.compare import composed, other_pose
 from carts_viewer.imported import with_imported
 from carts_viewer.layers import Layer, Rgba, imported, paint_over, parts

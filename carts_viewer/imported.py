@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from carts_core.model.scene import Scene
 from carts_core.project import Key, ProjectState
-from carts_core.project.target_masks import ignored_labels
+from carts_core.project.masks import ignored_labels
 from carts_core.recording import Frame
 
 

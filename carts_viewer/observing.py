@@ -7,7 +7,7 @@ from typing import Literal, get_args
 from carts_core.errors import SettingsError
 from carts_core.optimization import GivenMasks
 from carts_core.project import ProjectState
-from carts_core.project.target_masks import project_masks
+from carts_core.project.masks import project_masks
 from carts_core.recording import Sequence as Recording
 
 Observe = Literal["network", "masks", "both"]

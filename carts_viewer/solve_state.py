@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from carts_core.project import ProjectState
-from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.project.values import WHOLE_PROJECT
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from carts_core.model.mesh_cache import cache_dir, read
-from carts_core.project.place import data_dir
+from carts_core.project.identity import data_dir
 
 TUNED = "from carts_core.process import tune_process; tune_process()"
 

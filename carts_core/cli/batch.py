@@ -89,7 +89,7 @@ class Batch:
         import os
 
         from ..batch.pool import Pool
-        from ..extras import needs_extra
+        from ..imports import needs_extra
         from .batch_job import BatchWork, with_project
 
         workers, work = (

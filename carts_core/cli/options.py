@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..optimization import GivenMasks, MaskPredictor
     from ..optimization.measurement import Ignore
     from ..project import ProjectState
-    from ..project.target_masks import MaskLayer
+    from ..project.masks import MaskLayer
     from ..recording import Frame, Sequence
 
 
@@ -597,7 +597,7 @@ class Observing(Network):
     @property
     def _layer(self) -> "tuple[Path | None, MaskLayer | None]":
         """Project (None for the one beside the sequence) and its layer that are fitted; no layer where others are."""
-        from ..project.place import SUFFIX
+        from ..project.identity import SUFFIX
 
         project, _, name = self.masks.rpartition(":")
         layer = LAYERS.get(name)
@@ -610,7 +610,7 @@ class Observing(Network):
         if self.masks == RECORDING:
             return None
         from ..project import Project
-        from ..project.target_masks import file_masks, project_masks
+        from ..project.masks import file_masks, project_masks
 
         path, layer = self._layer
         if layer is None:

@@ -50,7 +50,7 @@ _CODE = (
     "evaluation/evaluate.py",
     "evaluation/sequence.py",
     "export/kinematics.py",
-    "export/png.py",
+    "export/encodings.py",
     "networks/**/*.py",
     "optimization/**/*.py",
     "rendering/**/*.py",

@@ -22,10 +22,8 @@ from ..model.camera import HALF_PIXEL
 from ..model.scene import Arm, SceneState
 from ..rendering.geometry import link_transforms, vertices_in_camera
 from ..rendering.rasterizer import rasterize
-from .dataset import Dataset, View
-from .monitor import Monitor
-from .png import mask_png
-from .rle import bounding_box
+from .dataset import Dataset, Monitor, View
+from .encodings import bounding_box, mask_png
 
 _MM = 1000.0
 _NOWHERE = [-1, -1, -1, -1]

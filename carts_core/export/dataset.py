@@ -1,10 +1,12 @@
-"""The images of an export with the labels of their pixels, one at a time."""
+"""Images of an export with the labels of their pixels, one at a time, with progress and cancellation."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -20,9 +22,41 @@ from ..recording import Sequence
 from ..rendering import Renderer
 from ..settings import Images, Parts
 from ..wording import counted
+from .encodings import image_png
 from .frames import ExportFrame
-from .monitor import Monitor
-from .png import image_png
+
+T = TypeVar("T")
+
+
+class ExportCancelled(CartsError):
+    """The export was stopped on request; nothing of it is left."""
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """What an export reports to and asks, between two of its steps."""
+
+    progress: Callable[[int, int], None] | None = None
+    """Called with the number of steps done and of all."""
+    cancelled: Callable[[], bool] | None = None
+    """Asked before every step, for example `threading.Event().is_set`."""
+
+    def track(self, steps: Items[T]) -> Iterator[T]:
+        """The steps one by one, reported when they are done.
+
+        Raises:
+            ExportCancelled: `cancelled` said so.
+        """
+        for done, step in enumerate(steps):
+            self._check()
+            yield step
+            if self.progress is not None:
+                self.progress(done + 1, len(steps))
+        self._check()
+
+    def _check(self) -> None:
+        if self.cancelled is not None and self.cancelled():
+            raise ExportCancelled("the export was cancelled. Nothing was written.")
 
 
 @dataclass(frozen=True)

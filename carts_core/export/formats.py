@@ -7,19 +7,26 @@ from pathlib import Path
 
 from ..files import MARKER, OutputPath, published, published_file, write_text
 from ..settings import FormatName
+from .annotation_formats import (
+    write_coco,
+    write_coco_keypoints,
+    write_cvat,
+    write_datumaro,
+    write_masks,
+    write_voc,
+    write_yolo,
+)
 from .bop import write_bop
-from .coco import write_coco
-from .coco_keypoints import write_coco_keypoints
-from .cvat import write_cvat
-from .dataset import Dataset
-from .datumaro import write_datumaro
-from .dvrk import write_dvrk, write_dvrk_2_3, write_dvrk_suj
-from .kinematics_files import write_kinematics_csv, write_kinematics_json, write_kinematics_npz
-from .masks import write_masks
-from .monitor import Monitor
+from .dataset import Dataset, Monitor
+from .kinematics_files import (
+    write_dvrk,
+    write_dvrk_2_3,
+    write_dvrk_suj,
+    write_kinematics_csv,
+    write_kinematics_json,
+    write_kinematics_npz,
+)
 from .video import write_video
-from .voc import write_voc
-from .yolo import write_yolo
 
 
 @dataclass(frozen=True)

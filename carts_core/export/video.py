@@ -1,4 +1,4 @@
-"""A video per camera (H.264 in MP4) with the rendered arms over the frames and a line along their masks."""
+"""Overlays of the rendered arms on the recorded images, as pictures and as a video per camera (H.264 in MP4)."""
 
 from contextlib import ExitStack
 from fractions import Fraction
@@ -6,13 +6,45 @@ from fractions import Fraction
 import av
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+import torch
+from jaxtyping import Bool, UInt8
 
 from ..files import OutputPath, output_stream, unique_file_names
 from ..model.camera import Camera
-from .dataset import Dataset, View
-from .monitor import Monitor
-from .overlay import image_and_mask, outlined, overlay
+from ..model.scene import SceneState
+from ..rendering import Renderer
+from .dataset import Dataset, Monitor, View
+
+_CONTOUR = (80, 255, 120)
+
+
+def image_and_mask(
+    renderer: Renderer, state: SceneState
+) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
+    """The first camera's rendering as RGB, and its mask."""
+    with torch.no_grad():
+        rendering = renderer(state)
+    image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
+    return image, rendering.silhouette[0].numpy() > 0.5
+
+
+def overlay(
+    frame: UInt8[np.ndarray, "height width 3"],
+    image: UInt8[np.ndarray, "height width 3"],
+    mask: Bool[np.ndarray, "height width"],
+    opacity: float,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The rendering blended over the frame where the mask is, RGB."""
+    return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)
+
+
+def outlined(
+    frame: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The frame with a bright line along the rim of the mask, RGB."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(frame.copy(), contours, -1, _CONTOUR, 1)
+
 
 _DEFAULT_RATE = 25.0
 _OPACITY = 0.5

@@ -3,14 +3,6 @@
 No other module opens a file for writing; `tests/files/test_one_writer.py` sees to it.
 """
 
-from .foreign import csv_cell as csv_cell
-from .foreign import text_of_cell as text_of_cell
-from .locks import BusyError as BusyError
-from .locks import lock_holder as lock_holder
-from .locks import locked_folder as locked_folder
-from .locks import open_lock as open_lock
-from .locks import sign_lock as sign_lock
-from .locks import try_lock as try_lock
 from .paths import OutputPath as OutputPath
 from .paths import allowed_names as allowed_names
 from .paths import check_name as check_name
@@ -21,11 +13,19 @@ from .paths import unique_file_names as unique_file_names
 from .publish import MARKER as MARKER
 from .publish import published as published
 from .publish import published_file as published_file
+from .writing import BusyError as BusyError
 from .writing import append_line as append_line
+from .writing import csv_cell as csv_cell
 from .writing import holds_file as holds_file
+from .writing import lock_holder as lock_holder
+from .writing import locked_folder as locked_folder
+from .writing import open_lock as open_lock
 from .writing import output_stream as output_stream
 from .writing import remove_file as remove_file
 from .writing import set_aside as set_aside
+from .writing import sign_lock as sign_lock
+from .writing import text_of_cell as text_of_cell
+from .writing import try_lock as try_lock
 from .writing import write_bytes as write_bytes
 from .writing import write_new as write_new
 from .writing import write_text as write_text

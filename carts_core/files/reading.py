@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, TypeVar
 import msgspec
 
 from ..errors import CartsError
-from ..extras import needs_extra
+from ..imports import needs_extra
 from ..wording import shortened
 
 T = TypeVar("T")

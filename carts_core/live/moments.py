@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..model.scene import Scene
 from ..recording import Frame, Sequence
-from ..recording.joints import PLAUSIBLE
+from ..recording.kinematics_table import PLAUSIBLE
 from .messages import FrameMessage, StreamError, decoded
 
 

@@ -18,7 +18,7 @@ from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.scene import Scene
 from ..project import Edits, FitVerdict, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
-from ..recording.camera_motion import ORIENTATION, POSITION
+from ..recording.matching import ORIENTATION, POSITION
 from .estimate import LiveVerdict
 from .loop import Tracked
 from .moments import mounts_of

@@ -12,9 +12,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import RobotError
-from ..extras import needs_extra
 from ..files.decoding import decoded
 from ..files.reading import CALIBRATION, MESH, LfsPointerError, open_regular, parse_yaml, read_text
+from ..imports import needs_extra
 from ..wording import counted
 from .meshes import mesh_path
 from .psm_kinematics import CLASSIC, SI

@@ -12,9 +12,9 @@ import numpy as np
 
 from ..errors import OutputError
 from ..files import output_path, output_stream
-from ..files.locks import one_after_another
 from ..files.paths import home
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
+from ..files.writing import one_after_another
 from .meshes import Decimation, LinkMesh
 
 _VERSION = 3

@@ -2,17 +2,14 @@
 
 from .database import DamagedProject as DamagedProject
 from .identity import SequenceIdentity as SequenceIdentity
-from .imported import ImportReport as ImportReport
-from .imported import import_annotations as import_annotations
-from .keys import Edits as Edits
-from .keys import Key as Key
-from .keys import Kind as Kind
+from .identity import default_path as default_path
+from .identity import rescued_copies as rescued_copies
 from .layers import IgnoreRegion as IgnoreRegion
 from .layers import ImportedMask as ImportedMask
 from .layers import MaskCorrection as MaskCorrection
 from .layers import PartLabels as PartLabels
-from .place import default_path as default_path
-from .place import rescued_copies as rescued_copies
+from .masks import ImportReport as ImportReport
+from .masks import import_annotations as import_annotations
 from .project import Change as Change
 from .project import Project as Project
 from .project import read_state as read_state
@@ -26,12 +23,15 @@ from .state import next_unreviewed as next_unreviewed
 from .state import worst_first as worst_first
 from .values import CorrectedIntrinsics as CorrectedIntrinsics
 from .values import CorrectedTransform as CorrectedTransform
+from .values import Edits as Edits
 from .values import Figures as Figures
 from .values import FitVerdict as FitVerdict
 from .values import ImportedKeypoints as ImportedKeypoints
 from .values import ImportedLabels as ImportedLabels
 from .values import JointCorrection as JointCorrection
+from .values import Key as Key
 from .values import Keyframe as Keyframe
+from .values import Kind as Kind
 from .values import Provenance as Provenance
 from .values import Review as Review
 from .values import ReviewState as ReviewState

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from ..model.scene import Scene, SceneState
 from ..recording import Frame, Sequence
-from .keys import Key
 from .state import ProjectState
-from .values import Source
+from .values import Key, Source
 
 _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
 """Of a frame whose arms come from different sources, the first one of these counts."""

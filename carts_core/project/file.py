@@ -26,7 +26,8 @@ import numpy as np
 from jaxtyping import UInt8, UInt32
 
 from ..errors import ProjectError
-from . import database, digests
+from . import database
+from .database import verify
 
 LOG, JOURNAL = "-wal", "-journal"
 _OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | getattr(os, "O_NOCTTY", 0)
@@ -406,7 +407,7 @@ def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
             copy = open_copy(read_files(path), path)
             with closing(copy.connection):
                 check_copy(copy)
-                digests.verify(copy.connection)
+                verify(copy.connection)
                 return copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone()
     except ProjectError:
         return None

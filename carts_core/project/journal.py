@@ -8,13 +8,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from . import digests
-from .database import DamagedProject
-from .digests import as_number, checked_rows, row_digest
+from .database import TABLES, DamagedProject, Seal, as_number, check_seal, checked_rows, row_digest
 from .identity import SequenceIdentity
-from .keys import Edits, Key, Kind, check_edit, decode
 from .state import Entry, ExportRecord, ProjectState, Step
-from .values import Figures
+from .values import Edits, Figures, Key, Kind, check_edit, decode
 
 
 @dataclass
@@ -36,7 +33,7 @@ class Script:
     def insert(self, table: str, rows: Iterable[tuple]) -> None:
         """Add rows, in place of those of the same key."""
         sealed = [(*row, row_digest(table, row)) for row in rows]
-        columns = digests.TABLES[table]
+        columns = TABLES[table]
         marks = ", ".join("?" * (len(columns) + 1))
         statement = f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}, digest) VALUES ({marks})"
         self.statements.append((statement, sealed))
@@ -47,7 +44,7 @@ class Script:
         self.digests -= sum(as_number(digest) for (digest,) in found)
 
 
-def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
+def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     """The state that a project holds, and its seal. Every row is checked, values that undo brings back included.
 
     Raises:
@@ -76,7 +73,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, digests.Seal]:
     for *row, digest in checked_rows(connection, "exports"):
         total += digest
         exports.append(_record(*row))
-    seal = digests.check_seal(connection, total)
+    seal = check_seal(connection, total)
     steps.sort(key=lambda step: step.number)
     if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
         raise DamagedProject("its history has gaps")

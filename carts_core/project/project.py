@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from ..errors import ProjectError
 from ..wording import counted
 from . import database, journal
-from .identity import SequenceIdentity
-from .keys import WHOLE_PROJECT, Edits, Key, check_edit
-from .place import default_path
+from .identity import SequenceIdentity, default_path
 from .state import ExportRecord, ProjectState, Step, by_revision, step_at
 from .store import Store, Writable, open_or_begin, read_project
-from .values import Figures, FitVerdict
+from .values import WHOLE_PROJECT, Edits, Figures, FitVerdict, Key, check_edit
 
 if TYPE_CHECKING:
     from ..recording import Sequence

@@ -9,8 +9,21 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 from .identity import SequenceIdentity
-from .keys import CALIBRATION, WHOLE_PROJECT, Edits, Key, Kind, check_edit
-from .values import UNREVIEWED, Figures, FitVerdict, JointCorrection, Review, ReviewState, Source
+from .values import (
+    CALIBRATION,
+    UNREVIEWED,
+    WHOLE_PROJECT,
+    Edits,
+    Figures,
+    FitVerdict,
+    JointCorrection,
+    Key,
+    Kind,
+    Review,
+    ReviewState,
+    Source,
+    check_edit,
+)
 
 V = TypeVar("V")
 

@@ -17,14 +17,13 @@ from typing import Any
 from ..errors import CartsError, OutputError, ProjectError
 from ..files import write_new
 from ..wording import counted
-from . import database, digests, journal
+from . import database, journal
+from .database import NONCE_BYTES, TABLES, Seal, row_digest, seal, verify
 from .file import Copy, LostFile, ProjectFile, SealRow, check_copy, check_files, holder, open_copy, read_files
-from .identity import SequenceIdentity
+from .identity import SequenceIdentity, data_dir, rescue_paths
 from .journal import Script
-from .keys import Key, Kind, check_edit, decode
-from .place import data_dir, rescue_paths
 from .state import ProjectState
-from .values import Figures
+from .values import Figures, Key, Kind, check_edit, decode
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
 """What decoding of foreign values raises, besides `ProjectError`."""
@@ -52,7 +51,7 @@ def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
     """What can be read of a project of this sequence; None if that is nothing."""
     old = copy.connection
     rescued = Rescued(database.empty(identity))
-    tables = {table: list(_rows(copy, table, rescued)) for table in digests.TABLES}
+    tables = {table: list(_rows(copy, table, rescued)) for table in TABLES}
     tables["changes"] = [row for row in tables["changes"] if _fits(identity, row, rescued)]
     tables["figures"] = [row for row in tables["figures"] if _is_figure(identity, row, rescued)]
     names = {number: (name, time) for number, name, time in tables["steps"]}
@@ -67,7 +66,7 @@ def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
         _insert(new, "figures", [(*key, *values) for key, values in figures.items()])
         _insert(new, "exports", tables["exports"])
         new.execute("UPDATE project SET position = ?", (_position(old, numbers),))
-        digests.seal(new, b"")
+        seal(new, b"")
     rescued.kept = len(steps) + len(changes) + len(figures) + len(tables["exports"])
     if rescued.kept:
         return rescued
@@ -76,14 +75,14 @@ def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
 
 
 def _insert(new: sqlite3.Connection, table: str, rows: list[tuple]) -> None:
-    columns = digests.TABLES[table]
+    columns = TABLES[table]
     marks = ", ".join("?" * len(columns))
     new.executemany(f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({marks})", rows)
 
 
 def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
     """The rows that are as they were written, from both ends of the table up to where it cannot be read."""
-    connection, columns = copy.connection, ", ".join(digests.TABLES[table])
+    connection, columns = copy.connection, ", ".join(TABLES[table])
     sealed = database.version(connection) >= database.SEALED
     digest = "digest" if sealed else "NULL"
     seen: set[int] = set()
@@ -95,7 +94,7 @@ def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
                     if number in seen:
                         continue
                     seen.add(number)
-                    if (sealed and digests.row_digest(table, row) != written) or not _has_types(table, row):
+                    if (sealed and row_digest(table, row) != written) or not _has_types(table, row):
                         rescued.lost.append(f"a row of {table}")
                     else:
                         yield tuple(row)
@@ -168,7 +167,7 @@ class Store:
         incident: what has happened to the file that was opened, for people; None if nothing has.
     """
 
-    def __init__(self, memory: sqlite3.Connection, seal: digests.Seal, position: int, file: ProjectFile) -> None:
+    def __init__(self, memory: sqlite3.Connection, seal: Seal, position: int, file: ProjectFile) -> None:
         self.memory = memory
         self.path = file.path
         self.incident: str | None = None
@@ -360,7 +359,7 @@ def _begin(path: Path, identity: SequenceIdentity) -> None:
 
 def _load(
     path: Path, identity: SequenceIdentity | None, *, keep_what_is_left: bool
-) -> tuple[sqlite3.Connection, ProjectState, digests.Seal]:
+) -> tuple[sqlite3.Connection, ProjectState, Seal]:
     """A copy of the file in memory, migrated, and what it says."""
     content = read_files(path)
     try:
@@ -383,12 +382,12 @@ def _load(
     return copy.connection, state, seal
 
 
-def _checked(copy: Copy) -> tuple[ProjectState, digests.Seal]:
+def _checked(copy: Copy) -> tuple[ProjectState, Seal]:
     check_copy(copy)
     memory = copy.connection
     if database.SEALED <= database.version(memory) < len(database.MIGRATIONS):
-        digests.verify(memory)
-    database.migrate(memory, secrets.token_bytes(digests.NONCE_BYTES))
+        verify(memory)
+    database.migrate(memory, secrets.token_bytes(NONCE_BYTES))
     return journal.load(memory)
 
 

@@ -3,9 +3,9 @@
 from .background import MeanBackground as MeanBackground
 from .background import background_of_recording as background_of_recording
 from .background import spread as spread
-from .calibrated import calibrated_sequence_file as calibrated_sequence_file
-from .frame_reader import FrameReader as FrameReader
 from .sequence import Frame as Frame
+from .sequence import FrameReader as FrameReader
 from .sequence import Sequence as Sequence
+from .sequence_file import calibrated_sequence_file as calibrated_sequence_file
 from .time_delay import TimeOffsetEstimate as TimeOffsetEstimate
 from .time_delay import estimate_time_offset as estimate_time_offset

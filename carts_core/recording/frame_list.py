@@ -1,17 +1,91 @@
-"""The frames of a sequence: how they are called, when they were taken, and which frames of a video they are."""
+"""Frames of a sequence: ids, times and file names by pattern (`left/{frame}.jpg`, `{domain}/{index:06d}.png`,
+`left/*.jpg`).
+"""
 
+import re
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from string import Formatter
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..files import allowed_names, name_fault
-from ..wording import counted
-from .patterns import FrameId, expand
-from .table import Table, read_table
+from ..files.reading import LARGEST_NAME, check_path, is_regular
+from ..wording import closest, counted, shown
+from .kinematics_table import Table, read_table
 from .toml_table import TomlTable, check_file_name
-from .video_index import index_video
+from .video import index_video
+
+_WIDTH_DIGITS = 6
+_PLACEHOLDERS = ("frame", "index", "domain", "camera")
+EXAMPLES = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jpg"'
+
+
+class FrameId(str):
+    """A frame's id that a pattern can pad: `{frame}` is the text, `{frame:03d}` its number."""
+
+    def __format__(self, spec: str) -> str:
+        return format(int(self), spec) if spec.endswith("d") else format(str(self), spec)
+
+
+def expand(pattern: str, key: str, **values: object) -> str:
+    """`pattern` with its {placeholders} filled in.
+
+    Args:
+        pattern: as written in the sequence file.
+        key: how errors call it.
+        values: what may be filled in.
+
+    Raises:
+        SequenceError: an unknown placeholder, or a number format for an id that is no number.
+    """
+    try:
+        _check_format(pattern)
+        filled = pattern.format(**values)
+        check_path(filled)
+    except KeyError as error:
+        raise SequenceError(
+            f"{key}: {shown(pattern)} has the unknown placeholder {error}.{closest(str(error.args[0]), _PLACEHOLDERS)} "
+            f"Examples: {EXAMPLES}."
+        ) from error
+    except ValueError as error:
+        raise SequenceError(
+            f"{key}: {shown(pattern)} cannot be filled in with {shown(values)}: {error}. Examples: {EXAMPLES}."
+        ) from error
+    return filled
+
+
+@lru_cache(maxsize=64)
+def _check_format(pattern: str) -> None:
+    """Check that a pattern has nothing but placeholders, padded to a width that a file's name can have.
+
+    Raises:
+        KeyError: a placeholder is unknown, or asks for a part of a value.
+        ValueError: a format is malformed, nested or too wide.
+    """
+    for _, name, form, conversion in Formatter().parse(pattern):
+        if name is None:
+            continue
+        if name not in _PLACEHOLDERS:
+            raise KeyError(name)
+        if conversion or "{" in (form or ""):
+            raise ValueError("a placeholder takes a width such as 06d, and nothing else")
+        if any(len(width) > _WIDTH_DIGITS or int(width) > LARGEST_NAME for width in re.findall(r"[0-9]+", form or "")):
+            raise ValueError(f"a name is longer than {LARGEST_NAME} characters")
+
+
+def is_per_frame(pattern: str) -> bool:
+    """Whether the pattern gives every frame a name of its own."""
+    return re.search(r"\{(frame|index)\b", pattern) is not None
+
+
+def is_glob(pattern: str) -> bool:
+    """Whether the pattern stands for the sorted files that match it."""
+    return "*" in pattern or "?" in pattern
+
 
 _FRAME_ALONE = "{frame}"
 """The pattern of frames whose cells are their ids."""
@@ -182,3 +256,67 @@ def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ..
             "number. Frames of a video are counted 0, 1, 2, ..."
         )
     return tuple(int(number) for number in numbers)
+
+
+_SHOWN_MISSING = 3
+_MOST_WILD_PARTS = 2
+
+
+def frame_files(
+    folder: Path, pattern: str, key: str, frames: FrameList, *, domain: str, camera: str
+) -> tuple[Path, ...]:
+    """One path per frame, in the frames' order; the files need not exist.
+
+    Raises:
+        SequenceError: a wrong pattern, or a glob that matches another number of files than there are frames.
+    """
+    if is_per_frame(pattern):
+        return tuple(
+            folder / expand(pattern, key, frame=FrameId(frame_id), index=row, domain=domain, camera=camera)
+            for row, frame_id in enumerate(frames.frame_ids)
+        )
+    filled = expand(pattern, key, domain=domain, camera=camera)
+    fixed, found = _matching(folder / filled, key)
+    if len(found) != len(frames.frame_ids):
+        raise SequenceError(
+            f"{key}: {filled!r} matches {counted(len(found), 'file')} in {fixed}, but {frames.counted}. "
+            f"The n-th file belongs to the n-th of them: make them as many, "
+            "or name the files by frame, as in " + EXAMPLES + "."
+        )
+    return tuple(found)
+
+
+def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
+    """The folder above the first wildcard, and the files below it that match, in natural order."""
+    fixed = next(parent for parent in base.parents if not is_glob(str(parent)))
+    wild = base.relative_to(fixed)
+    if "**" in wild.parts or len(wild.parts) > _MOST_WILD_PARTS:
+        raise SequenceError(
+            f"{key}: {str(wild)!r} would search whole trees of folders. Wildcards are allowed from the last "
+            f"{_MOST_WILD_PARTS} parts of the path on, and ** is not; name the folder."
+        )
+    try:
+        return fixed, sorted(filter(is_regular, fixed.glob(str(wild))), key=_natural)
+    except (ValueError, OSError) as error:
+        raise SequenceError(f"{key}: {str(wild)!r} cannot be searched for: {error}. Examples: {EXAMPLES}.") from error
+
+
+def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: str = "") -> None:
+    """Check that every frame's file is there.
+
+    Raises:
+        SequenceError: some are not.
+    """
+    missing = [(file, frame_id) for file, frame_id in zip(files, frames.frame_ids, strict=True) if not is_regular(file)]
+    if missing:
+        shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
+        rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
+        raise SequenceError(
+            f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted} "
+            f"and every one needs its file: put them back, correct the pattern, or remove the rows.{hint}"
+        )
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key by which `frame9` comes before `frame10`."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -14,8 +14,8 @@ from jaxtyping import UInt8
 
 from ..decoders import bags
 from ..errors import SequenceError
-from ..extras import needs_extra
 from ..files.decoding import Limits, acquire, release
+from ..imports import needs_extra
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")

@@ -1,4 +1,4 @@
-"""Joint positions and camera poses at the times of the frames, from tables whose rows have times of their own."""
+"""Joint positions and camera poses at the times of the frames, from the rows of kinematics tables."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +8,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
+from ..model.ecm_kinematics import JOINT_NAMES, forward
 from ..wording import counted
-from .frame_list import FrameList
-from .table import Table
+from .frame_list import FrameList, FrameNames, list_of_rows, take_delimiter, take_frame_list, take_frame_names
+from .kinematics_table import PLAUSIBLE, JointColumns, Table, read_table
 from .toml_table import TomlTable
 
 INTERPOLATIONS = ("linear", "nearest")
@@ -193,3 +194,182 @@ def row_times(table: Table, column: str, asked_by: str) -> Float[np.ndarray, " r
             f"{times[row - 1]:.9g} s in line {table.lines[row - 1]}. Sort the rows by time, and keep one of each time."
         )
     return times
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The tables of a sequence, as `[kinematics]` and `[frames]` describe them."""
+
+    frames: FrameList
+    matching: TimeMatching | None
+    """How rows are matched with frames by time; None where every row is a frame."""
+    table: Table
+    """Measured joint positions."""
+    truth: Path | None
+    """Table of true joint positions."""
+    delimiter: str
+    names: FrameNames | None
+    """Where tables have the frames' ids; None where rows are matched by time."""
+    timestamp: str
+    """Column with a row's time; empty without one."""
+
+    def measured_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples:
+        """The measured joint positions of an arm, from its own `table` or that of the sequence.
+
+        Raises:
+            SequenceError: the table is missing, wrong, or has other frames.
+        """
+        own = arm.take("table", str, "")
+        return self._samples(self.read(arm.path(own)) if own else self.table, columns)
+
+    def truth_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples | None:
+        """The true joint positions of an arm, from its own `truth` or that of the sequence; None without either.
+
+        Raises:
+            SequenceError: the table is missing, wrong, or has other frames.
+        """
+        own = arm.take("truth", str, "")
+        path = arm.path(own) if own else self.truth
+        return None if path is None else self._samples(self.read(path), columns)
+
+    def read(self, path: Path) -> Table:
+        """Another table with the same frames, or of the same clock.
+
+        Raises:
+            SequenceError: the table is missing, wrong, or has other frames.
+        """
+        table = read_table(path, self.delimiter)
+        if self.names is not None:
+            _check_same_frames(table, self.names.of(table), self.frames.frame_ids)
+        return table
+
+    def times_of(self, table: Table) -> RowTimes:
+        """When the rows of a table were logged.
+
+        Raises:
+            SequenceError: there is no such column, or the times do not increase.
+        """
+        times = None if self.matching is None else row_times(table, self.timestamp, "`timestamp` in [kinematics]")
+        return RowTimes(table.path, table.lines, times)
+
+    def _samples(self, table: Table, columns: JointColumns) -> JointSamples:
+        return JointSamples(columns.read(table), self.times_of(table))
+
+
+def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
+    """The rows that the `[kinematics]` table describes.
+
+    Args:
+        section: `[kinematics]`.
+        frames_section: `[frames]`, whose times the rows are matched with; None where every row is a frame.
+
+    Raises:
+        SequenceError: a table is missing, or its frames, times or numbers are wrong.
+    """
+    delimiter = take_delimiter(section)
+    table = read_table(section.path(section.take("table", str)), delimiter)
+    timestamp, truth = section.take("timestamp", str, ""), section.take("truth", str, "")
+    if frames_section is None:
+        names, matching = take_frame_names(section), None
+        frames = list_of_rows(
+            table, names, timestamp, section, f"the kinematics table has {counted(len(table), 'row')}"
+        )
+    else:
+        for key in ("frame", "frame_id", "video_frame"):
+            if key in section:
+                raise section.error(key, "describes frames, which [frames] does here. Move it there.")
+        if not timestamp:
+            raise section.error(
+                "timestamp", "is missing: with [frames], rows are matched by time. Name the column with the time [s]."
+            )
+        names, matching = None, take_matching(frames_section)
+        frames = take_frame_list(frames_section)
+        frames_section.finish()
+    section.finish()
+    return Rows(frames, matching, table, section.path(truth) if truth else None, delimiter, names, timestamp)
+
+
+def _check_same_frames(table: Table, ids: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+    if len(ids) != len(wanted):
+        raise SequenceError(
+            f"{table.path} has {counted(len(ids), 'row')}, but the kinematics table has {len(wanted)}. "
+            "All tables of a sequence must have the same frames in the same order."
+        )
+    for given, expected, line in zip(ids, wanted, table.lines, strict=True):
+        if given != expected:
+            raise SequenceError(
+                f"{table.path}, line {line} is frame {given!r}, but the kinematics table has frame {expected!r} there. "
+                "All tables of a sequence must have the same frames in the same order."
+            )
+
+
+POSES = ("T_world_mount", "T_mount_world")
+POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+"""Columns of a pose by default [m], unit quaternion."""
+
+_UNITS = {"m": 1.0, "mm": 1e-3}
+_NORM_TOLERANCE = 0.01
+"""How far the length of a quaternion may be from 1."""
+_FARTHEST = 100.0
+"""[m]"""
+
+
+def take_camera_motion(table: TomlTable, rows: Rows) -> PoseSamples | None:
+    """The key `motion` of a `[[cameras]]` table; None without one.
+
+    Raises:
+        SequenceError: the table is missing, has other frames, or a pose is impossible.
+    """
+    given = table.take("motion", (str, dict), {})
+    if not given:
+        return None
+    values = {"table": given} if isinstance(given, str) else given
+    section = TomlTable(values, table.file, f"{table.where}: motion")
+    poses = rows.read(section.path(section.take("table", str)))
+    joints = section.take("ecm_joints", list, [])
+    if joints:
+        Ts = forward(_numbers(section, "ecm_joints", poses, joints, len(JOINT_NAMES)))
+        _check_joints(section, poses, joints)
+    else:
+        Ts = _poses(section, poses)
+    section.finish()
+    return PoseSamples(Ts, rows.times_of(poses))
+
+
+def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
+    kind = section.take_choice("pose", POSES, POSES[0])
+    unit = _UNITS[section.take_choice("length_unit", tuple(_UNITS), "m")]
+    positions = unit * _numbers(section, "position", table, section.take("position", list, list(POSITION)), 3)
+    turns = _numbers(section, "orientation", table, section.take("orientation", list, list(ORIENTATION)), 4)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(turns, axis=1)
+    if (wrong := np.flatnonzero(~(np.abs(lengths - 1.0) <= _NORM_TOLERANCE))).size:
+        raise SequenceError(
+            f"{table.path}, line {table.lines[wrong[0]]}: the quaternion has the length {lengths[wrong[0]]:.4g}, it "
+            "must be 1. Name its columns as `orientation`, in the order x, y, z, w."
+        )
+    if (far := np.flatnonzero(~(np.abs(positions).max(1) <= _FARTHEST))).size:
+        raise SequenceError(
+            f"{table.path}, line {table.lines[far[0]]}: the camera is {np.abs(positions[far[0]]).max():.4g} m away, "
+            f'{_FARTHEST:g} m is allowed. If the columns are in mm, say so: length_unit = "mm".'
+        )
+    Ts = np.tile(np.eye(4), (len(table), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(turns).as_matrix(), positions
+    return Ts if kind == POSES[0] else np.linalg.inv(Ts)
+
+
+def _numbers(section: TomlTable, key: str, table: Table, columns: list, count: int) -> Float[np.ndarray, "rows n"]:
+    if len(columns) != count or not all(isinstance(column, str) for column in columns):
+        raise section.error(key, f"is {columns!r}. Give the names of {count} columns.")
+    return np.column_stack([table.numbers(column, section.name(key)) for column in columns])
+
+
+def _check_joints(section: TomlTable, table: Table, columns: list[str]) -> None:
+    """Joints of the ECM are in rad and m; other units give impossible values."""
+    for column, joint in zip(columns, JOINT_NAMES, strict=True):
+        kind = "prismatic" if joint == "insertion" else "revolute"
+        largest = np.abs(table.numbers(column, section.name("ecm_joints"))).max()
+        if largest > PLAUSIBLE[kind]:
+            raise section.error(
+                "ecm_joints", f"has {joint} at {largest:.4g}; {PLAUSIBLE[kind]:.3g} is allowed. Give [rad] and [m]."
+            )

@@ -1,7 +1,8 @@
-"""A recording: frames with images, measured joint positions, and where known masks and truth."""
+"""Recordings: frames with images, measured joint positions and, where known, masks and true joint positions."""
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,11 +15,63 @@ from ..model.camera import Camera
 from ..model.scene import Scene
 from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, spread
-from .cache import ByteCache
-from .camera_input import CameraInput
-from .description import Description, read_description
 from .images import ImageFiles, ImageSource, read_image, read_mask
 from .matching import TimeMatching
+from .sequence_file import CameraInput, Description, read_description
+
+
+class ByteCache:
+    """Least recently used arrays go first. Safe to use from several threads; what one makes, others wait for.
+
+    Args:
+        limit: memory [bytes]; a single array may be larger.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._used = 0
+        self._arrays: OrderedDict[Hashable, np.ndarray] = OrderedDict()
+        self._making: set[Hashable] = set()
+        self._changed = threading.Condition()
+
+    def get(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array under `key`, made when it is not there.
+
+        Raises:
+            Exception: what `make` raises. Nothing is kept then, and whoever waited for it calls their own `make`.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: key not in self._making)
+            if key in self._arrays:
+                self._arrays.move_to_end(key)
+                return self._arrays[key]
+            self._making.add(key)
+        try:
+            array = make()
+            with self._changed:
+                self._keep(key, array)
+        finally:
+            with self._changed:
+                self._making.discard(key)
+                self._changed.notify_all()
+        return array
+
+    def clear(self) -> None:
+        """Keep none of them any longer."""
+        with self._changed:
+            self._arrays.clear()
+            self._used = 0
+
+    def __contains__(self, key: Hashable) -> bool:
+        with self._changed:
+            return key in self._arrays
+
+    def _keep(self, key: Hashable, array: np.ndarray) -> None:
+        self._arrays[key] = array
+        self._used += array.nbytes
+        while self._used > self._limit and len(self._arrays) > 1:
+            self._used -= self._arrays.popitem(last=False)[1].nbytes
+
 
 CACHE_BYTES = 192 * 2**20
 """Memory for decoded images and masks of one sequence."""
@@ -327,3 +380,77 @@ class Sequence:
                 f"Its cameras are: {', '.join(self._cameras)}."
             )
         return self._cameras[camera]
+
+
+AHEAD = 8
+"""At most this many frames are read in advance."""
+LONGEST_STRIDE = 10
+"""Going further than this many frames at once is a jump, which says nothing about the next one."""
+
+
+class FrameReader:
+    """Reads frames, and on a thread of its own the neighbours in the direction of travel into the sequence's cache.
+
+    Asking for another frame makes what was planned void. An error in a frame that nobody has asked for yet is dropped;
+    who asks for it reads it again and gets the error. The thread lives while there is something to read.
+    """
+
+    def __init__(self, sequence: Sequence) -> None:
+        self._sequence = sequence
+        self._lock = threading.Lock()
+        self._plan: deque[tuple[int, str, tuple[str, ...]]] = deque()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self._last: int | None = None
+        self._stride = 1
+
+    def frame(self, index: int, domain: str, *cameras: str) -> Frame:
+        """One frame with the images of some cameras.
+
+        Raises:
+            SequenceError: there is no such frame, domain or camera, or the image is not usable.
+        """
+        self._replace_plan(())
+        frame = self._sequence.frame(index, domain, list(cameras))
+        moved = 0 if self._last is None else index - self._last
+        self._last = index
+        if moved:
+            self._stride = moved if abs(moved) <= LONGEST_STRIDE else 1
+        self._replace_plan((row, domain, cameras) for row in self._neighbours(index, cameras))
+        return frame
+
+    def close(self) -> None:
+        """Stop reading in advance and wait for the thread; `frame` still works."""
+        with self._lock:
+            self._closed = True
+            self._plan.clear()
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _neighbours(self, index: int, cameras: Collection[str]) -> list[int]:
+        """Numbers of the frames that will probably be asked for next, the likeliest first."""
+        sizes = [own.width * own.height for own in self._sequence.scene.cameras if own.name in cameras]
+        # An image, a mask; and no more than half of the cache, or they would push out what was seen last.
+        ahead = min(AHEAD, CACHE_BYTES // 2 // max(4 * sum(sizes), 1))
+        rows = [index + self._stride * count for count in range(1, ahead + 1)] + [index - self._stride]
+        return [row for row in rows if 0 <= row < len(self._sequence)]
+
+    def _replace_plan(self, plan: Iterable[tuple[int, str, tuple[str, ...]]]) -> None:
+        with self._lock:
+            self._plan = deque(() if self._closed else plan)
+            if self._plan and self._thread is None:
+                self._thread = threading.Thread(target=self._read, name="carts-frames", daemon=True)
+                self._thread.start()
+
+    def _read(self) -> None:
+        while True:
+            with self._lock:
+                if not self._plan:
+                    self._thread = None
+                    return
+                index, domain, cameras = self._plan.popleft()
+            try:
+                self._sequence.frame(index, domain, list(cameras))
+            except Exception:  # Whoever asks for this frame meets the same.
+                continue

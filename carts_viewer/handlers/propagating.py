@@ -10,7 +10,7 @@ import numpy as np
 from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
 from carts_core.project import Figures, Key, ProjectState, between_kept
-from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.checks import unknown
 from carts_viewer.context import Context, OpenRun

@@ -5,7 +5,7 @@ from collections import Counter
 import viser
 
 from carts_core.project import ProjectState, ReviewState
-from carts_core.project.keys import WHOLE_PROJECT
+from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer import intents
 from carts_viewer.finding import BY_HAND, SOLVED, review_name
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write

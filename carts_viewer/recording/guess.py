@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from carts_core.errors import CartsError
+from carts_core.recording.importing.cameras import find_images
 from carts_core.recording.importing.columns import ColumnMeanings, guess_columns
 from carts_core.recording.importing.foreign_tables import ForeignTable
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.recording.importing.importer import detect, find
-from carts_core.recording.importing.media import find_images
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
 from carts_core.recording.sources.folder import kinematics_table
 from carts_core.settings.importing import NO_TABLE, ImportOptions

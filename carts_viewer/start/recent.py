@@ -18,7 +18,7 @@ from carts_core.files import write_bytes, write_text
 from carts_core.files.reading import TABLE, is_regular, parse_json, read_bytes, read_text, typed
 from carts_core.project import ProjectState, ReviewState, read_state
 from carts_core.project.file import LOG, beside
-from carts_core.project.place import data_dir
+from carts_core.project.identity import data_dir
 from carts_viewer.app import ViewerApp
 from carts_viewer.companions import damage
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from carts_core.export.polygons import MIN_POINTS, polygons
-from carts_core.export.rle import row_runs
+from carts_core.export.encodings import MIN_POINTS, polygons, row_runs
 
 
 def _filled(mask: np.ndarray) -> np.ndarray:

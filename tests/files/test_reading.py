@@ -19,12 +19,12 @@ from carts_core.files.reading import Kind, RefusedFileError, parse_json, parse_t
 from carts_core.model.meshes import mesh_path, read_mesh
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
-from carts_core.recording.annotations.coco import read_coco
+from carts_core.recording.annotations.formats import read_coco
 from carts_core.recording.images import read_image
 from carts_core.recording.importing.foreign_tables import read_foreign_table
 from carts_core.recording.importing.importer import find
 from carts_core.recording.toml_table import read_toml
-from carts_core.recording.video_index import index_video
+from carts_core.recording.video import index_video
 
 SMALL = Kind("note", 10)
 READERS: dict[str, Callable[[Path], object]] = {

@@ -42,8 +42,7 @@ from carts_core.recording.images import read_image
 from carts_core.recording.importing.calibrations import read_calibration
 from carts_core.recording.importing.foreign_tables import read_foreign_table
 from carts_core.recording.importing.importer import find
-from carts_core.recording.video import Video
-from carts_core.recording.video_index import index_video
+from carts_core.recording.video import Video, index_video
 from fuzz.kinds import make_folder
 
 Maker = Callable[[Path], Path]

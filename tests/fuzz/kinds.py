@@ -26,8 +26,7 @@ from carts_core.networks.weights import read_weights, save_weights
 from carts_core.optimization.hand_eye.files import read_points
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image, read_mask
-from carts_core.recording.video import Video
-from carts_core.recording.video_index import index_video
+from carts_core.recording.video import Video, index_video
 from carts_core.settings import Architecture
 from fuzz.mutations import mutated_bytes, mutated_png, mutated_safetensors, mutated_text
 

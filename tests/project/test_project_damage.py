@@ -15,7 +15,8 @@ from project_model import FRAMES, IDENTITY, act, visible
 from sql_file import edit_file, rows
 
 from carts_core.errors import ProjectError
-from carts_core.project import Key, Project, Review, database, digests
+from carts_core.project import Key, Project, Review, database
+from carts_core.project.database import seal
 
 NOTE = {Key.review(0): Review(note="a")}
 
@@ -148,7 +149,7 @@ def _seal_again(path: Path) -> None:
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         try:
             connection.execute("BEGIN")
-            digests.seal(connection, bytes(16))
+            seal(connection, bytes(16))
             connection.execute("COMMIT")
         except (sqlite3.Error, TypeError, AttributeError, OverflowError, ValueError):
             pytest.skip("it has no place for digests")

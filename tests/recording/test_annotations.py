@@ -14,7 +14,7 @@ from carts_core.export import Dataset, FormatName, export, measured_frames
 from carts_core.model.camera import Camera
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import FrameAnnotation, read_annotations
-from carts_core.recording.annotations.rasters import mask_of_polygon, mask_of_runs, runs_of_text
+from carts_core.recording.annotations.formats import mask_of_polygon, mask_of_runs, runs_of_text
 
 HEIGHT, WIDTH = 72, 96
 

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from carts_core.recording.cache import ByteCache
+from carts_core.recording.sequence import ByteCache
 
 
 def make(size: int):

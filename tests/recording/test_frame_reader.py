@@ -9,7 +9,7 @@ import pytest
 
 from carts_core.errors import SequenceError
 from carts_core.recording import FrameReader, Sequence
-from carts_core.recording import frame_reader as module
+from carts_core.recording import sequence as module
 
 FRAMES = 60
 MAIN = threading.current_thread()

@@ -16,7 +16,7 @@ from carts_core.errors import SequenceError
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
 from carts_core.recording.images import read_image, read_mask
-from carts_core.recording.importing.media import find_images
+from carts_core.recording.importing.cameras import find_images
 from carts_core.recording.video import Video
 
 HEIGHT, WIDTH = 72, 96

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from carts_core.recording import Sequence
-from carts_core.recording.video_index import decoded_frames
+from carts_core.recording.video import decoded_frames
 from tools.bench_recordings import browse, make_recording, open_seconds
 
 FRAMES = 60
@@ -53,7 +53,7 @@ def test_opening_decodes_no_image_file_and_one_frame_of_a_video(recording, monke
 
 def test_browsing_keeps_no_more_than_the_cache_may_hold(recording, monkeypatch):
     monkeypatch.setattr("carts_core.recording.sequence.CACHE_BYTES", 10 * IMAGE_BYTES)
-    monkeypatch.setattr("carts_core.recording.frame_reader.CACHE_BYTES", 10 * IMAGE_BYTES)
+    monkeypatch.setattr("carts_core.recording.sequence.CACHE_BYTES", 10 * IMAGE_BYTES)
     for path in recording.values():
         sequence = Sequence.open(path)
         times, memory = browse(sequence, range(FRAMES))

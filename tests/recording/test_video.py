@@ -10,10 +10,9 @@ from av.video.frame import PictureType
 from videos import write_timed_video
 
 from carts_core.errors import SequenceError
-from carts_core.recording import Sequence, video_index
+from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
-from carts_core.recording.video import Video
-from carts_core.recording.video_index import index_video, open_video
+from carts_core.recording.video import Video, _by_packets, _by_table, index_video, open_video
 
 FRAMES = 150
 SIZE = (96, 72)
@@ -137,7 +136,7 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
 )
 def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(codec, options, tmp_path):
     path = write_numbered(tmp_path / "left.mp4", codec, options)
-    unparsed, parsed = video_index._by_packets(path, parsed=False), video_index._by_packets(path, parsed=True)
+    unparsed, parsed = _by_packets(path, parsed=False), _by_packets(path, parsed=True)
     assert unparsed is not None and unparsed == parsed and unparsed.count == FRAMES
 
 
@@ -152,19 +151,19 @@ def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(co
 )
 def test_an_mp4_without_reordered_frames_has_the_index_of_its_table(codec, options, times, tmp_path):
     path = write_numbered(tmp_path / "left.mp4", codec, options, times)
-    by_table = video_index._by_table(path)
-    assert by_table is not None and by_table == video_index._by_packets(path, parsed=True)
+    by_table = _by_table(path)
+    assert by_table is not None and by_table == _by_packets(path, parsed=True)
     assert by_table == index_video(path) and by_table.count == FRAMES
 
 
 def test_a_table_that_does_not_say_all_is_not_relied_on(timed_video):
-    assert video_index._by_table(timed_video) is None
+    assert _by_table(timed_video) is None
 
 
 @pytest.mark.parametrize("flags", ["frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+empty_moov+dash"])
 def test_frames_of_all_fragments_are_counted(flags, tmp_path):
     path = remuxed(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "0", "g": "12"}), {"movflags": flags})
-    assert index_video(path) == video_index._by_packets(path, parsed=True) and index_video(path).count == FRAMES
+    assert index_video(path) == _by_packets(path, parsed=True) and index_video(path).count == FRAMES
 
 
 def test_frames_whose_pictures_were_cut_off_are_not_counted(tmp_path):
@@ -173,7 +172,7 @@ def test_frames_whose_pictures_were_cut_off_are_not_counted(tmp_path):
     with path.open("r+b") as file:
         file.truncate(path.stat().st_size * 2 // 3)
     index = index_video(path)
-    assert FRAMES // 3 < index.count < FRAMES and index == video_index._by_packets(path, parsed=True)
+    assert FRAMES // 3 < index.count < FRAMES and index == _by_packets(path, parsed=True)
 
 
 def remuxed(path: Path, options: dict[str, str]) -> Path:
@@ -237,8 +236,8 @@ def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_pat
         container, stream = open_video(path)
         return Inexact(container), stream
 
-    monkeypatch.setattr("carts_core.recording.video.open_video", inexact)
     video = Video(path, tuple(range(FRAMES)))
+    monkeypatch.setattr("carts_core.recording.video.open_video", inexact)
     order = [100, 3, 77, 76, 0, 149]
     assert [number_of(video.read(index)) for index in order] == order
 

@@ -27,7 +27,7 @@ from carts_core.errors import ProjectError, SequenceError, SettingsError
 from carts_core.optimization import Backgrounds
 from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
-from carts_core.recording.cache import ByteCache
+from carts_core.recording.sequence import ByteCache
 from carts_core.resources import sample_sequence
 from carts_viewer import editing, intents, worker
 from carts_viewer import tab as tabs

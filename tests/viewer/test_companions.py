@@ -21,7 +21,7 @@ from carts_core.batch.manifest import read_manifest
 from carts_core.cli.batch_job import BatchWork
 from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
-from carts_core.project.place import data_dir
+from carts_core.project.identity import data_dir
 from carts_core.settings.importing import ImportOptions
 from carts_viewer.jobs import JobState
 from carts_viewer.networks import STARTED

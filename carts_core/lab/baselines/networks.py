@@ -17,9 +17,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from ...errors import SettingsError, WeightsError
-from ...extras import needs_extra
 from ...files import OutputPath, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json, read_bytes
+from ...imports import needs_extra
 from ...model.parts import SURFACE_CHANNELS
 from ...networks.network import FeatureNetwork
 from ...networks.weights import read_weights, tensor_bytes

@@ -14,11 +14,20 @@ from ...errors import SequenceError
 from ...model.camera import HALF_PIXEL, Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
-from .coco import is_coco, read_coco
-from .cvat import is_cvat, read_cvat
-from .folders import is_mask_folder, read_mask_folder
-from .found import Annotations, ForeignImage, FrameAnnotation, Labels
-from .surgpose import is_surgpose, read_surgpose
+from .formats import (
+    Annotations,
+    ForeignImage,
+    FrameAnnotation,
+    Labels,
+    is_coco,
+    is_cvat,
+    is_mask_folder,
+    is_surgpose,
+    read_coco,
+    read_cvat,
+    read_mask_folder,
+    read_surgpose,
+)
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
 """Of a folder that is an export: the file that matters."""

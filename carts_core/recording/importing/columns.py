@@ -12,12 +12,12 @@ from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
-from ..joint_limits import LENGTH_UNITS, Joint, joints_of
+from ..kinematics_table import LENGTH_UNITS, Joint, joints_of
+from .cameras import IMAGE_SUFFIXES
 from .foreign_tables import ForeignTable
 from .found import Note
 from .joint_units import in_si, joints_of_arm, length_unit
 from .logs import ArmLog, track
-from .media import IMAGE_SUFFIXES
 from .row_matching import LogRows
 
 _ARM = re.compile(r"(?i)(?:^|[^a-z])(psm\d?)(?![a-z])")

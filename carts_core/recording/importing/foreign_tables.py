@@ -11,9 +11,9 @@ import numpy as np
 
 from ...decoders import tables
 from ...errors import SequenceError
-from ...extras import needs_extra
 from ...files.decoding import decoded
 from ...files.reading import TABLE, read_text
+from ...imports import needs_extra
 from ...wording import shown
 
 _LONGEST_UNIT = 12

@@ -1,12 +1,14 @@
-"""What an importer finds in a foreign recording, before a sequence file is written."""
+"""Contents of a foreign recording before a sequence file is written, and the interface of their readers."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from ...settings.importing import ImportOptions
 
 NoteKind = Literal["found", "guessed", "missing", "warning"]
 
@@ -113,3 +115,21 @@ class FoundRecording:
     """Of all cameras; None for cameras that stay."""
     domains: Mapping[str, str] = field(default_factory=dict)
     """Domain -> what stands for {domain} in patterns; empty for one domain."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A kind of recording that can be imported."""
+
+    name: str
+    """As `--source` calls it."""
+    label: str
+    """For people."""
+    looked_for: str
+    """What shows that a folder or file is of this kind, for people."""
+    detect: Callable[[Path], bool]
+    """Whether a path is of this kind; quick, and without an error whatever the path is."""
+    uses: tuple[str, ...]
+    """Names of the `ImportOptions` that it uses beside those of arms, robots and calibrations, which all do."""
+    read: Callable[[Path, ImportOptions], FoundRecording]
+    """Everything that is found; raises a `CartsError` for what is damaged or contradicts itself."""

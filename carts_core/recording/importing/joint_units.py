@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ...settings.importing import ImportOptions
-from ..joint_limits import ANGLE_UNITS, LENGTH_UNITS, Joint, fits_roughly, joints_of, misfits
+from ..kinematics_table import ANGLE_UNITS, LENGTH_UNITS, Joint, fits_roughly, joints_of, misfits
 from .found import FoundArm, Note
 
 _INSERTED = 0.03

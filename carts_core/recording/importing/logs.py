@@ -1,30 +1,199 @@
-"""What was logged of one arm becomes joint positions with times, and a base frame where the log knows it."""
+"""Logs of arms and of the endoscope: joint positions with times, instrument and base frame."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ...errors import SequenceError
+from ...errors import CartsError, SequenceError
+from ...model import ecm_kinematics
 from ...model.camera import T_DVRK_OPENCV
-from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, inverse
+from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
 from ...settings.importing import ImportOptions
 from ...wording import counted
-from ..joint_limits import Joint
-from .alignment import at_times, clock_offset, nearest
-from .dvrk_files import read_base_frames
-from .found import FoundArm, Note
-from .instrument import ACCEPTED, CANDIDATES, check_instrument, fit_base_frame, fit_tool_point
+from ..kinematics_table import Joint
+from .calibrations import read_base_frames
+from .found import FoundArm, FoundMotion, Note
 from .joint_units import in_si, joints_of_arm
+
+SAME_CYCLE = 2e-3
+"""[s] Rows of two topics this near to each other were written in the same cycle of a controller."""
+
+
+def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> float:
+    """By how much rows of `times` are stamped later than the rows of `other` of the same cycle [s].
+
+    Topics of one cycle are stamped one after the other, so their stamps differ by a constant, which is not motion. It
+    is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between topics
+    of different rates.
+    """
+    difference = times - other[nearest(times, other)]
+    same = np.abs(difference) <= SAME_CYCLE
+    return float(np.median(difference[same])) if 2 * same.sum() >= len(times) else 0.0
+
+
+def at_times(
+    wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "wanted columns"]:
+    """Values at other times, linear between the rows before and after; NaN before the first and after the last row."""
+    columns = [np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T]
+    return np.stack(columns, axis=1)
+
+
+def nearest(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> Int[np.ndarray, " rows"]:
+    """For each of `times`, the row of `other` (increasing) that is nearest to it."""
+    after = np.searchsorted(other, times).clip(1, max(len(other) - 1, 1))
+    before = after - 1
+    after = after.clip(0, len(other) - 1)
+    return np.where(np.abs(times - other[before]) <= np.abs(times - other[after]), before, after)
+
+
+ACCEPTED = 2e-5
+"""[m] The base of the right instrument moves by no more than this, in the median row."""
+_AMBIGUOUS = 2.0
+"""The best lengths must be this many times as good as the next ones."""
+_FEWEST_ROWS = 20
+
+WRIST_LENGTHS = (0.0091, 0.0093, 0.0100, 0.0107, 0.0112)
+"""[m] From wrist pitch to wrist yaw, of all wristed 8 mm instruments."""
+
+CANDIDATES: Mapping[str, PsmGeometry] = {
+    f"{1e3 * length:.1f} mm wrist": replace(CLASSIC, wrist_length=length) for length in WRIST_LENGTHS
+}
+"""Lengths of the known instruments on their own arm; classic and Si come out the same, since only shaft length minus
+distance to the remote centre counts (-15.6 mm for both)."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseFrame:
+    """The arm's base as a recording with joints and poses gives it."""
+
+    T_reference_base: Float[np.ndarray, "4 4"]
+    """[m] The reference is the frame that the poses are given in."""
+    deviation: float
+    """How far the base is from there in the median row [m]."""
+    largest_deviation: float
+    """In the worst row [m]."""
+    rotation_deviation: float
+    """How far it is turned in the median row [rad]."""
+
+
+def fit_base_frame(
+    Ts_reference_tip: Float[np.ndarray, "rows 4 4"],
+    joints: Float[np.ndarray, "rows 6"],
+    geometry: PsmGeometry = CLASSIC,
+) -> BaseFrame:
+    """The base frame that joint positions [rad, m] and the tip's poses [m] at the same times agree on.
+
+    Raises:
+        CartsError: there are no rows with both.
+    """
+    known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
+    if not known.any():
+        raise CartsError(
+            "no row has both joint positions and a tip pose, so the base frame is not known from them. "
+            "Check that both topics were recorded at the same time."
+        )
+    Ts = Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry))
+    rotations = Rotation.from_matrix(Ts[:, :3, :3])
+    mean = rotations.mean()
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = mean.as_matrix(), np.median(Ts[:, :3, 3], axis=0)
+    distances = np.linalg.norm(Ts[:, :3, 3] - T[:3, 3], axis=1)
+    turned = np.median((mean.inv() * rotations).magnitude())
+    return BaseFrame(T, float(np.median(distances)), float(distances.max()), float(turned))
+
+
+def fit_tool_point(
+    Ts_reference_point: Float[np.ndarray, "rows 4 4"],
+    joints: Float[np.ndarray, "rows 6"],
+    geometry: PsmGeometry = CLASSIC,
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Where the point of poses is, seen from the tip, and how far the base moves with it in the median row [m].
+
+    With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the places of the point at d from the tip are
+    p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
+
+    Raises:
+        CartsError: there are no rows with both.
+    """
+    known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_point).all((1, 2))
+    R = fit_base_frame(Ts_reference_point, joints, geometry).T_reference_base[:3, :3]
+    Ts = forward(joints[known], geometry)
+    A = np.concatenate([R @ Ts[:, :3, :3], np.broadcast_to(np.eye(3), (len(Ts), 3, 3))], axis=2).reshape(-1, 6)
+    b = (Ts_reference_point[known, :3, 3] - Ts[:, :3, 3] @ R.T).reshape(-1)
+    solved = np.linalg.lstsq(A, b, rcond=None)[0]
+    residuals = np.linalg.norm((b - A @ solved).reshape(-1, 3), axis=1)
+    return solved[:3], float(np.median(residuals))
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentCheck:
+    """How well instruments explain a recording."""
+
+    fits: Mapping[str, BaseFrame]
+    """Name -> fit, the best first."""
+
+    @property
+    def best(self) -> str:
+        """Name of the instrument that explains the recording best."""
+        return next(iter(self.fits))
+
+    def accepts(self, name: str) -> bool:
+        """Whether a recording can be of this instrument."""
+        return self.fits[name].deviation <= ACCEPTED
+
+    @property
+    def decides(self) -> bool:
+        """Whether the best instrument is accepted and clearly better than every other one."""
+        deviations = [fit.deviation for fit in self.fits.values()]
+        return self.accepts(self.best) and all(_AMBIGUOUS * deviations[0] < other for other in deviations[1:])
+
+    def warning(self, name: str) -> str | None:
+        """What to tell whoever chose an instrument; None when it fits."""
+        fit = self.fits[name]
+        if self.accepts(name):
+            return None
+        text = (
+            f"the recording does not fit {name}: measured_cp and measured_js place the arm's base "
+            f"{1e3 * fit.deviation:.3f} mm apart from row to row (allowed is {1e3 * ACCEPTED:g} mm)."
+        )
+        if self.accepts(self.best):
+            return f"{text} It fits {self.best} ({1e3 * self.fits[self.best].deviation:.4f} mm): choose that one."
+        return (
+            f"{text} No known instrument does: check that joints and poses are of the same arm, in metres and radians."
+        )
+
+
+def check_instrument(
+    Ts_reference_tip: Float[np.ndarray, "rows 4 4"],
+    joints: Float[np.ndarray, "rows 6"],
+    candidates: Mapping[str, PsmGeometry] = CANDIDATES,
+) -> InstrumentCheck:
+    """Compare instruments by how still the arm's base stands with each.
+
+    Args:
+        Ts_reference_tip: poses of the tip in any frame that does not move against the base [m].
+        joints: joint positions at the same times [rad, m].
+        candidates: name -> lengths.
+
+    Raises:
+        CartsError: fewer than 20 rows have both.
+    """
+    rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
+    if rows < _FEWEST_ROWS:
+        raise CartsError(f"{rows} rows have both joints and a pose, at least {_FEWEST_ROWS} are needed. Record longer.")
+    fits = {name: fit_base_frame(Ts_reference_tip, joints, geometry) for name, geometry in candidates.items()}
+    return InstrumentCheck(dict(sorted(fits.items(), key=lambda item: item[1].deviation)))
+
 
 _SAME_BASE = 1e-3
 """[m], [rad] A base frame nearer to the identity than this was not set in the dVRK."""
 _CHECKED_ROWS = 5000
 _FEWEST_REACHABLE = 0.5
-_FEWEST_ROWS = 20
 _SAME_POINT = 1e-4
 """[m] A point nearer to the tip than this is the tip."""
 
@@ -308,3 +477,57 @@ def _solved(
         )
     note(Note("found", f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses."))
     return Track(source.times[reached], found.joints[reached])
+
+
+_MOVES = 5e-4, 0.1
+"""[m], [deg] An endoscope that moves by less stands still."""
+
+
+def endoscope_motion(
+    poses: Track | None, joints: Track | None, start: float, note: Callable[[Note], None]
+) -> FoundMotion | None:
+    """The pose of the camera over time, in the world whose origin it is at the first image; None if it stands still.
+
+    The tip of the ECM counts as the camera, with the dVRK's axes; what the camera's place on the tip differs from that,
+    `carts calibrate` finds.
+
+    Args:
+        poses: of the ECM's tip in some fixed frame.
+        joints: of the ECM, in place of poses.
+        start: time of the first image [s].
+        note: called with what was found.
+    """
+    chosen = poses if poses is not None else joints
+    if chosen is None or len(chosen.times) < 2:
+        return None
+    Ts = transforms(chosen.values) if poses is not None else ecm_kinematics.forward(chosen.values)
+    there = np.asarray(np.isfinite(Ts).all((1, 2)))
+    if there.sum() < 2:
+        return None
+    times, Ts = chosen.times[there], Ts[there]
+    first = int(np.abs(times - start).argmin())
+    relative = T_DVRK_OPENCV @ np.linalg.inv(Ts[first]) @ Ts @ T_DVRK_OPENCV
+    way, turn = _extent(relative)
+    if way <= _MOVES[0] and turn <= _MOVES[1]:
+        note(Note("found", "the endoscope (ECM) stands still."))
+        return None
+    note(
+        Note(
+            "found",
+            f"the endoscope (ECM) moves by up to {1e3 * way:.1f} mm and {turn:.1f} deg; a table has where the cameras "
+            "are. Base frames hold for where it is at the first image.",
+        )
+    )
+    note(
+        Note(
+            "guessed",
+            "the camera is taken for the ECM's tip; let carts calibrate find its place there and the base frames.",
+        )
+    )
+    return FoundMotion(times, relative)
+
+
+def _extent(Ts: Float[np.ndarray, "rows 4 4"]) -> tuple[float, float]:
+    """How far poses are at most from the first image's [m], [deg]."""
+    turns = Rotation.from_matrix(Ts[:, :3, :3]).magnitude()
+    return float(np.linalg.norm(Ts[:, :3, 3], axis=1).max()), float(np.degrees(turns.max()))

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 from ...errors import SequenceError
 from ...settings.importing import SECONDS, Clock, ImportOptions
 from ...wording import counted
+from .cameras import Images
 from .found import FoundArm, Note
-from .media import Images
 
 _STAMPED_DIGITS = 13
 """Names of images with numbers this long are times."""

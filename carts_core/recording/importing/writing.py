@@ -14,8 +14,8 @@ from ...errors import CartsError, SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
 from ...model.instruments import SCHEME, robot_file
 from .. import Sequence
-from ..camera_motion import ORIENTATION, POSITION
-from ..joint_limits import joints_of
+from ..kinematics_table import joints_of
+from ..matching import ORIENTATION, POSITION
 from .found import FoundArm, FoundCamera, FoundRecording
 from .placing import MAX_GAP
 

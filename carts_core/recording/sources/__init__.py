@@ -1,5 +1,6 @@
 """One module per foreign format; the first one that detects a path reads it."""
 
+from ..importing.found import Source as Source
 from .bag import SOURCE as _BAG
 from .carts_layouts import AMBF as _AMBF
 from .carts_layouts import CTS as _CTS
@@ -10,7 +11,6 @@ from .datasets import SURGPOSE as _SURGPOSE
 from .dvrk_recorder import SOURCE as _DVRK
 from .folder import SOURCE as _FOLDER
 from .lerobot import SOURCE as _LEROBOT
-from .protocol import Source as Source
 from .surgsync import SOURCE as _SURGSYNC
 
 SOURCES: tuple[Source, ...] = (

@@ -15,13 +15,12 @@ from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
 from ..images import mask_remarks, read_mask, spread_files
+from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.foreign_tables import read_array, read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
 from ..importing.joint_units import in_si, joints_of_arm
-from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.row_matching import by_rows, frame_times
-from ..joint_limits import Joint
-from .protocol import Source
+from ..kinematics_table import Joint
 
 _TRUTH = "green_screen"
 _FIRST = ("regular",)

@@ -17,11 +17,10 @@ from ...errors import SequenceError
 from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...settings.importing import ImportOptions
 from ...wording import listed
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.cameras import cameras_of, common_ids, find_images, image_files
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
 from ..importing.logs import ArmLog, arm_from_log, track
-from ..importing.media import cameras_of, common_ids, find_images, image_files
 from ..importing.row_matching import by_rows, frame_times
-from .protocol import Source
 
 _JIGSAWS_COLUMNS = 76
 _JIGSAWS_ARMS = {"PSM_left": 38, "PSM_right": 57}

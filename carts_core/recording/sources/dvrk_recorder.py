@@ -15,17 +15,13 @@ from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...settings.importing import ImportOptions
 from ..image_sources import Bag
-from ..importing.alignment import nearest
-from ..importing.cameras import calibration_of, side_of
+from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import ForeignTable, read_foreign_table
-from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Note
-from ..importing.logs import ArmLog, Track, arm_from_log, track
-from ..importing.media import find_images
+from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Note, Source
+from ..importing.logs import ArmLog, Track, arm_from_log, nearest, track
 from ..video import SUFFIXES
-from .bag import read_arm_logs
-from .ecm import read_endoscope
-from .protocol import Source
+from .bag import read_arm_logs, read_endoscope
 
 _SIDES = {"LR": ("left", "right"), "RL": ("right", "left")}
 _OLD_UNITS = {"timestamps_ns": 1e-9, "timestamps_ms": 1e-3, "timestamps": 1.0}

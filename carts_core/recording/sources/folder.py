@@ -9,15 +9,13 @@ import numpy as np
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import NO_TABLE, ImportOptions
-from ..importing.cameras import side_of
+from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..importing.found import FoundArm, FoundRecording, Note
+from ..importing.found import FoundArm, FoundRecording, Note, Source
 from ..importing.logs import arm_from_log
-from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
 from ..video import SUFFIXES
-from .protocol import Source
 
 _DEPTH = 2
 _NOT_IMAGES = ("mask", "label", "segment", "ground_truth", "annot", "depth")

@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 
 from ...errors import SequenceError
-from ...extras import needs_extra
 from ...files.reading import VALUES, parse_json, read_text
+from ...imports import needs_extra
 from ...settings.importing import ImportOptions
-from ..importing.alignment import nearest
-from ..importing.cameras import calibration_of, side_of
+from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
-from ..importing.logs import arm_from_log
-from ..importing.media import find_images
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
+from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
-from .protocol import Source
 
 _STATE = "observation.state"
 _EPISODE = re.compile(r"episode_(\d+)\.parquet$")

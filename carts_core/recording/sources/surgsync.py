@@ -16,13 +16,12 @@ from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.importing import ImportOptions
+from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
 from ..importing.logs import ArmLog, Track, arm_from_log, track
-from ..importing.media import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.row_matching import by_rows, frame_times
-from .protocol import Source
 
 _ARMS = ("PSM1", "PSM2", "PSM3")
 _TRACKS = ("joints", "poses", "local_poses", "jaw")

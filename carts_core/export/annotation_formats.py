@@ -1,0 +1,347 @@
+"""Annotation formats: PNG masks, COCO instances and keypoints, CVAT, Datumaro, Pascal VOC and YOLO."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from itertools import pairwise
+from pathlib import PurePosixPath
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from ..errors import CartsError
+from ..files import OutputPath, output_stream, write_bytes, write_text
+from ..model.keypoints import Keypoint, keypoints, project_keypoints
+from ..settings import Parts
+from .dataset import Category, Dataset, Monitor, View
+from .encodings import bounding_box, coco_rle, label_png, mask_png, polygons, row_runs
+
+_KINDS: tuple[Parts, ...] = ("arms", "parts", "links")
+
+
+def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Folders `binary`, `arms`, `parts` and `links` with a PNG per view; `labels.json` says what the values mean."""
+    for view in dataset.views(monitor):
+        if dataset.images == "copied":
+            dataset.write_image_as(view, folder / "images", view.name)
+        write_bytes(folder / "binary" / f"{view.name}.png", mask_png(view.link_ids >= 0))
+        for kind in _KINDS:
+            write_bytes(folder / kind / f"{view.name}.png", label_png(dataset.label_image(view, kind)))
+    meaning = {"binary": {0: "background", 255: "arm"}}
+    for kind in _KINDS:
+        meaning[kind] = {0: "background"} | {category.id: category.name for category in dataset.categories_of(kind)}
+    write_text(folder / "labels.json", json.dumps(meaning, indent=1, ensure_ascii=False))
+
+
+Annotation = dict[str, Any]
+
+
+def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the dataset in COCO's format; masks lose nothing."""
+
+    def annotations(view: View) -> Iterable[Annotation]:
+        for category, mask in dataset.instances(view):
+            yield mask_annotation(view, category.id, mask)
+
+    categories = [{"id": c.id, "name": c.name, "supercategory": c.arm} for c in dataset.categories]
+    write_annotations(dataset, folder, monitor, "instances", categories, annotations)
+
+
+def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
+    """An object of a view, without its number; the box of one that is not in the image is empty."""
+    return {
+        "image_id": view.id,
+        "category_id": category_id,
+        "segmentation": coco_rle(mask),
+        "area": int(mask.sum()),
+        "bbox": list(bounding_box(mask)) if mask.any() else [0, 0, 0, 0],
+        "iscrowd": 0,
+    }
+
+
+def write_annotations(
+    dataset: Dataset,
+    folder: OutputPath,
+    monitor: Monitor,
+    kind: str,
+    categories: list[dict[str, Any]],
+    annotate: Callable[[View], Iterable[Annotation]],
+) -> None:
+    """Write images, and the file of annotations that CVAT and Datumaro look for under this name.
+
+    Args:
+        dataset, folder, monitor: what is written where, and who hears of progress.
+        kind: `instances` or `person_keypoints`, as COCO names its files.
+        categories: as COCO has them.
+        annotate: the objects of a view, without their numbers.
+    """
+    images, annotations = [], []
+    for view in dataset.views(monitor):
+        images.append(
+            {
+                "id": view.id,
+                "file_name": dataset.write_image(view, folder / "images"),
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "frame": view.frame.frame_id,
+                "camera": view.camera.name,
+                "source": view.frame.source,
+                **({"painted": True} if view.painted else {}),
+            }
+        )
+        for annotation in annotate(view):
+            annotations.append({"id": len(annotations) + 1, **annotation})
+    content = {
+        "info": {"description": dataset.sequence.name, "image_folder": str(dataset.image_folder)},
+        "licenses": [],
+        "images": images,
+        "annotations": annotations,
+        "categories": categories,
+    }
+    write_text(folder / "annotations" / f"{kind}_default.json", json.dumps(content, ensure_ascii=False))
+
+
+_OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
+"""COCO's words for a keypoint: not labelled, labelled but not visible, labelled and visible."""
+
+
+def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the keypoints of every arm in COCO's format, with the arm's mask and box; always a category per arm."""
+    points = {arm.name: keypoints(arm) for arm in dataset.scene.arms}
+
+    def annotations(view: View) -> Iterable[Annotation]:
+        for category in dataset.arms:
+            yield from _annotations(dataset, view, category, points[category.arm])
+
+    categories = [_category(category, points[category.arm]) for category in dataset.arms]
+    # "person" whoever has the keypoints: CVAT and Datumaro look for no other name.
+    write_annotations(dataset, folder, monitor, "person_keypoints", categories, annotations)
+
+
+def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any]:
+    names = [point.name for point in points]
+    tips = [number for number, name in enumerate(names, start=1) if name.endswith(" tip")]
+    joints = [number for number in range(1, len(names) + 1) if number not in tips]
+    # The joints lie along the instrument, and every tip hangs on the joint that is nearest to it.
+    skeleton = [*pairwise(joints), *((tip, joints[0]) for tip in tips if joints)]
+    return {
+        "id": category.id,
+        "name": category.name,
+        "supercategory": category.arm,
+        "keypoints": names,
+        "skeleton": [list(edge) for edge in skeleton],
+    }
+
+
+def _annotations(
+    dataset: Dataset, view: View, category: Category, points: tuple[Keypoint, ...]
+) -> Iterable[Annotation]:
+    """An arm in a view; none where neither a pixel nor a keypoint of it is in the image."""
+    mask = dataset.label_image(view, "arms") == category.id
+    pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
+    values: list[float] = []
+    for u, v in pixels:
+        inside = bool(np.isfinite([u, v]).all()) and 0 <= u < view.camera.width and 0 <= v < view.camera.height
+        if not inside:
+            values += [0.0, 0.0, _OUTSIDE]
+            continue
+        values += [round(float(u), 3), round(float(v), 3), _VISIBLE if mask[int(v), int(u)] else _HIDDEN]
+    labelled = sum(flag > 0 for flag in values[2::3])
+    if labelled or mask.any():
+        yield {**mask_annotation(view, category.id, mask), "keypoints": values, "num_keypoints": labelled}
+
+
+def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the dataset in CVAT's format; masks lose nothing."""
+    root = ElementTree.Element("annotations")
+    _text(root, "version", "1.1")
+    _add_meta(root, dataset)
+    for view in dataset.views(monitor):
+        size = {"width": str(view.camera.width), "height": str(view.camera.height)}
+        name = dataset.write_image(view, folder / "images")
+        image = ElementTree.SubElement(root, "image", {"id": str(view.id - 1), "name": name, **size})
+        for category, mask in dataset.instances(view):
+            left, top, width, height = bounding_box(mask)
+            runs = row_runs(mask[top : top + height, left : left + width])
+            attributes = {
+                "label": category.name,
+                "source": "auto",
+                "occluded": "0",
+                "rle": ", ".join(map(str, runs)),
+                "left": str(left),
+                "top": str(top),
+                "width": str(width),
+                "height": str(height),
+                "z_order": "0",
+            }
+            ElementTree.SubElement(image, "mask", attributes)
+    ElementTree.indent(root, " ")
+    content = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    write_bytes(folder / "annotations.xml", content)
+
+
+def _add_meta(root: ElementTree.Element, dataset: Dataset) -> None:
+    task = ElementTree.SubElement(ElementTree.SubElement(root, "meta"), "task")
+    _text(task, "name", dataset.sequence.name)
+    _text(task, "size", str(len(dataset.steps)))
+    _text(task, "mode", "annotation")
+    labels = ElementTree.SubElement(task, "labels")
+    for category in dataset.categories:
+        label = ElementTree.SubElement(labels, "label")
+        _text(label, "name", category.name)
+        _text(label, "type", "mask")
+        ElementTree.SubElement(label, "attributes")
+
+
+def _text(parent: ElementTree.Element, tag: str, text: str) -> None:
+    ElementTree.SubElement(parent, tag).text = text
+
+
+_IMAGE = 2
+"""Datumaro's media type of still images."""
+
+
+def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the dataset in Datumaro's format; masks lose nothing."""
+    items = []
+    for view in dataset.views(monitor):
+        file = dataset.write_image(view, folder / "images" / "default")
+        annotations = [
+            {
+                "id": number,
+                "type": "mask",
+                "attributes": {},
+                "group": 0,
+                "label_id": category.id - 1,
+                "rle": coco_rle(mask),
+                "z_order": 0,
+            }
+            for number, (category, mask) in enumerate(dataset.instances(view))
+        ]
+        items.append(
+            {
+                "id": str(PurePosixPath(file).with_suffix("")),
+                "annotations": annotations,
+                "attr": {"frame": view.frame.frame_id, "camera": view.camera.name, "source": view.frame.source},
+                "image": {"path": file, "size": [view.camera.height, view.camera.width]},
+            }
+        )
+    labels = [{"name": category.name, "parent": "", "attributes": []} for category in dataset.categories]
+    content = {
+        "dm_format_version": "1.0",
+        "media_type": _IMAGE,
+        "infos": {},
+        "categories": {"label": {"labels": labels, "label_groups": [], "attributes": []}},
+        "items": items,
+    }
+    write_text(folder / "annotations" / "default.json", json.dumps(content, ensure_ascii=False))
+
+
+_LISTS = ("Main", "Segmentation")
+"""Folders in `ImageSets` where lists of the images stand; there is no split, so each is one list of all."""
+_MOST_CATEGORIES = 254
+"""0 is the background and 255 is VOC's void."""
+
+
+def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the dataset in Pascal VOC's format; label images lose nothing, and images are copies of any kind.
+
+    Raises:
+        CartsError: there are more categories than VOC's label images can tell apart.
+    """
+    if len(dataset.categories) > _MOST_CATEGORIES:
+        raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
+    for view in dataset.views(monitor):
+        stem = dataset.stems[view.id - 1]
+        file = dataset.write_image_as(view, folder / "JPEGImages", stem)
+        labels, objects = dataset.label_image(view), np.zeros(view.link_ids.shape, np.uint8)
+        root = _annotation(view, file)
+        for number, (category, mask) in enumerate(dataset.instances(view), start=1):
+            objects[mask] = number
+            _add_object(root, category, mask)
+        _write_palette(folder / "SegmentationClass" / f"{stem}.png", labels)
+        _write_palette(folder / "SegmentationObject" / f"{stem}.png", objects)
+        ElementTree.indent(root, " ")
+        write_bytes(folder / "Annotations" / f"{stem}.xml", ElementTree.tostring(root, encoding="utf-8"))
+    names = "".join(f"{stem}\n" for stem in dataset.stems)
+    for name in _LISTS:
+        write_text(folder / "ImageSets" / name / "trainval.txt", names)
+    _write_label_map(folder / "labelmap.txt", dataset)
+
+
+def _annotation(view: View, file: str) -> ElementTree.Element:
+    root = ElementTree.Element("annotation")
+    _texts(root, {"folder": "JPEGImages", "filename": file})
+    size = {"width": view.camera.width, "height": view.camera.height, "depth": 3}
+    _texts(ElementTree.SubElement(root, "size"), size)
+    _texts(root, {"segmented": 1})
+    return root
+
+
+def _add_object(root: ElementTree.Element, category: Category, mask: np.ndarray) -> None:
+    """An object; VOC counts pixels from 1."""
+    left, top, width, height = bounding_box(mask)
+    object_ = ElementTree.SubElement(root, "object")
+    _texts(object_, {"name": _name(category), "pose": "Unspecified", "truncated": 0, "difficult": 0, "occluded": 0})
+    box = {"xmin": left + 1, "ymin": top + 1, "xmax": left + width, "ymax": top + height}
+    _texts(ElementTree.SubElement(object_, "bndbox"), box)
+    for polygon in polygons(mask):
+        points = {f"{'xy'[axis]}{number + 1}": value + 1 for (number, axis), value in np.ndenumerate(polygon)}
+        _texts(ElementTree.SubElement(object_, "polygon"), points)
+
+
+def _texts(parent: ElementTree.Element, values: Mapping[str, object]) -> None:
+    for tag, value in values.items():
+        ElementTree.SubElement(parent, tag).text = str(value)
+
+
+def _name(category: Category) -> str:
+    return category.name.replace(":", "_")  # separates the columns of labelmap.txt
+
+
+def _palette() -> UInt8[np.ndarray, "256 3"]:
+    """VOC's colours: the bits of a label, from the lowest, fill red, green and blue in turn from their highest bit."""
+    labels = np.arange(256)[:, None]
+    bits = (labels >> np.arange(8)) & 1
+    return np.stack(
+        [sum(bits[:, 3 * n + c] << (7 - n) for n in range(3) if 3 * n + c < 8) for c in range(3)], 1
+    ).astype(np.uint8)
+
+
+def _write_palette(path: OutputPath, labels: UInt8[np.ndarray, "height width"]) -> None:
+    image = Image.fromarray(labels, mode="L")
+    image.putpalette(_palette().tobytes())  # turns grey values into numbers of colours
+    with output_stream(path) as stream:
+        image.save(stream, format="PNG")
+
+
+def _write_label_map(path: OutputPath, dataset: Dataset) -> None:
+    colors = [",".join(map(str, color)) for color in _palette().tolist()]
+    names = ["background", *(_name(category) for category in dataset.categories)]
+    lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:{colors[n]}::\n" for n, name in enumerate(names))]
+    write_text(path, "".join(lines))
+
+
+_INTO_PIXEL = 0.25
+"""Added to a pixel's number [px], so that a reader finds that pixel whether it rounds (supervision) or cuts off the
+fraction (Ultralytics)."""
+
+
+def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+    """Write the dataset in YOLO's format: a visible part of an arm that stands alone is an object of its own."""
+    for view in dataset.views(monitor):
+        stem = dataset.stems[view.id - 1]
+        dataset.write_image_as(view, folder / "images", stem)
+        size = (view.camera.width, view.camera.height)
+        lines = []
+        for category, mask in dataset.instances(view):
+            for polygon in polygons(mask):
+                numbers = " ".join(f"{value:.6f}" for value in ((polygon + _INTO_PIXEL) / size).ravel())
+                lines.append(f"{category.id - 1} {numbers}\n")
+        write_text(folder / "labels" / f"{stem}.txt", "".join(lines))
+    names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is YAML
+    text = f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n"
+    write_text(folder / "data.yaml", text)

@@ -1,0 +1,96 @@
+"""Encodings of masks and images: PNG, run lengths and polygons."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Int, UInt, UInt8
+from pycocotools import mask as coco_mask
+from scipy.spatial.distance import cdist
+
+from ..errors import CartsError
+
+
+def mask_png(mask: Bool[np.ndarray, "height width"]) -> bytes:
+    """A mask as a PNG file: 255 where an arm is, 0 elsewhere."""
+    return _png(mask.astype(np.uint8) * 255)
+
+
+def label_png(labels: UInt[np.ndarray, "height width"]) -> bytes:
+    """Labels of 8 or 16 bits as a PNG file whose grey values they are."""
+    return _png(labels)
+
+
+def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
+    """An RGB or RGBA picture as a PNG file."""
+    code = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
+    return _png(cv2.cvtColor(image, code))
+
+
+def _png(image: np.ndarray) -> bytes:
+    ok, data = cv2.imencode(".png", image)
+    if not ok:
+        raise CartsError(f"an image of shape {image.shape} could not be written as PNG: OpenCV's encoder failed.")
+    return data.tobytes()
+
+
+def coco_rle(mask: Bool[np.ndarray, "height width"]) -> dict[str, object]:
+    """COCO's compressed run lengths (column by column): `size` as [height, width], and `counts` as text."""
+    counts = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"]
+    assert isinstance(counts, bytes)
+    return {"size": list(mask.shape), "counts": counts.decode("ascii")}
+
+
+def row_runs(mask: Bool[np.ndarray, "height width"]) -> list[int]:
+    """Lengths of runs row by row, in turn outside and inside the mask; the first is outside and may be 0."""
+    flat = mask.ravel()
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    lengths = np.diff(changes, prepend=0, append=flat.size).tolist()
+    return [0, *lengths] if flat[0] else lengths
+
+
+def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
+    """Left, top, width and height [px] of a mask that is not empty."""
+    columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
+    return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
+
+
+MIN_POINTS = 3
+"""Readers take fewer points for something else than a polygon."""
+
+
+def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "points 2"]]:
+    """One closed polygon per connected part of a mask, through the centres of the pixels on its rim.
+
+    Filled with its edges, as OpenCV does, each gives back the very pixels. A hole is reached through a slit of no
+    width, since a polygon has one rim only.
+
+    Returns:
+        Points (column, row) [px], whole numbers; pixel (0, 0) is at (0, 0).
+    """
+    contours, hierarchy = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return []
+    rims = [contour[:, 0] for contour in contours]
+    parents = hierarchy[0, :, 3]
+    parts = []
+    for index in np.flatnonzero(parents < 0):
+        part = _corners(_with_holes(rims[index], [rims[hole] for hole in np.flatnonzero(parents == index)]))
+        parts.append(np.concatenate([part, part[-1:].repeat(max(MIN_POINTS - len(part), 0), axis=0)]))
+    return parts
+
+
+def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
+    """One closed line along the rim and all holes. The shortest link first: no other hole can lie across it."""
+    while holes:
+        distances = [cdist(rim, hole, "sqeuclidean") for hole in holes]
+        nearest = min(range(len(holes)), key=lambda index: distances[index].min())
+        at, start = np.unravel_index(distances[nearest].argmin(), distances[nearest].shape)
+        hole = np.roll(holes.pop(nearest), -start, axis=0)
+        rim = np.concatenate([rim[: at + 1], hole, hole[:1], rim[at:]])
+    return rim
+
+
+def _corners(line: np.ndarray) -> np.ndarray:
+    """The closed line without the points in the middle of straight runs."""
+    before, after = line - np.roll(line, 1, axis=0), np.roll(line, -1, axis=0) - line
+    corners = line[(before != after).any(1)]
+    return corners if len(corners) else line[:1]

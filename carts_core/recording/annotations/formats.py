@@ -1,0 +1,561 @@
+"""Readers of annotation formats: COCO, CVAT for images 1.1, SurgPose and folders of mask images."""
+
+import math
+import os
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from ...errors import SequenceError
+from ...files.reading import VALUES, is_regular, parse_json, parse_yaml, read_text
+from ...model.camera import HALF_PIXEL
+from ...wording import shown
+from ..images import read_labels
+
+MOST_LABELS = 255
+"""Of a layer, whose pixels have 8 bits."""
+MOST_IMAGES = 100_000
+"""In one source."""
+MOST_KEYPOINTS = 200
+"""In one image."""
+
+
+@dataclass(frozen=True)
+class ForeignImage:
+    """One image of a source, with what is marked in it."""
+
+    name: str
+    """Its file, as the source calls it."""
+    parts: Callable[[], Iterable[tuple[str, Bool[np.ndarray, "height width"]]]] = tuple
+    """Labels and their pixels, decoded when asked for; later ones lie above earlier ones. One without a name says that
+    nothing else is marked; an image without any has no mask."""
+    keypoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Name -> column and row [px], from the upper left corner."""
+    frame: str = ""
+    """Id of the frame, where the source says it."""
+    camera: str = ""
+    """The same of the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnnotation:
+    """What is marked in one frame through one camera."""
+
+    frame: int
+    """Position in the sequence."""
+    camera: str
+    labels: UInt8[np.ndarray, "height width"] | None
+    """Of each pixel of the undistorted image the label, counted from 1; 0 elsewhere. None without masks."""
+    keypoints: Mapping[str, tuple[float, float]]
+    """Name -> column and row in the undistorted image [px]."""
+
+
+class Labels:
+    """Names of labels, numbered as they come."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def number(self, name: str) -> int:
+        """Of a label, from 1.
+
+        Raises:
+            SequenceError: there are too many.
+        """
+        if name not in self.names:
+            if len(self.names) == MOST_LABELS:
+                raise SequenceError(f"there are more than {MOST_LABELS} labels, say {name!r}. Join some of them.")
+            self.names.append(name)
+        return self.names.index(name) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Annotations:
+    """All that a source marks in a sequence. The frames are decoded while they are gone through, which is done once."""
+
+    kind: str
+    """The source's format, for people."""
+    frames: Iterator[FrameAnnotation]
+    label_names: list[str]
+    """Of label 1 and so on; complete once all frames were gone through."""
+    unknown: list[str]
+    """Names of images that belong to no frame; complete likewise."""
+    remarks: Counter[str] = field(default_factory=Counter)
+    """What was decided about masks, and annotations that were left out with the reason, and how often; complete
+    likewise."""
+
+
+_BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
+"""Of COCO's text: five bits a character, from "0" on."""
+
+
+def runs_of_text(text: str) -> list[int]:
+    """COCO's compressed run lengths as numbers.
+
+    Raises:
+        ValueError: the text is none.
+    """
+    runs: list[int] = []
+    value = place = 0
+    for character in text:
+        code = ord(character) - _FIRST
+        if not 0 <= code < 2 * _MORE or place > 40:
+            raise ValueError(f"the character {character!r} is no part of run lengths")
+        value |= (code & (_MORE - 1)) << place
+        place += _BITS
+        if not code & _MORE:
+            if code & _SIGN:
+                value -= 1 << place
+            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+            value = place = 0
+    if place:
+        raise ValueError("the run lengths end within a number")
+    return runs
+
+
+def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bool) -> Bool[np.ndarray, "height width"]:
+    """A mask of run lengths, in turn outside and inside; the first is outside.
+
+    Raises:
+        ValueError: they are not as many pixels as the mask has.
+    """
+    lengths = np.asarray(runs, np.int64)
+    if lengths.ndim != 1 or (lengths < 0).any() or (lengths > height * width).any() or lengths.sum() != height * width:
+        raise ValueError(f"the run lengths do not make {width} x {height} pixels")
+    flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+    return flat.reshape(width, height).T if by_columns else flat.reshape(height, width)
+
+
+def mask_of_polygon(
+    points: Float[np.ndarray, "corners 2"], height: int, width: int
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels whose centres are inside a polygon, by the even-odd rule; corners from the upper left corner [px]."""
+    flips = np.zeros((height, width + 1), np.int32)
+    ends = np.roll(points, -1, axis=0)
+    for (x0, y0), (x1, y1) in zip(points, ends, strict=True):
+        low, high = min(y0, y1), max(y0, y1)
+        rows = np.arange(max(0, int(np.ceil(low - 0.5))), min(height, int(np.ceil(high - 0.5))))
+        if len(rows):
+            # Where the edge crosses the middle of the row; from the next centre on one is on its other side.
+            crossing = x0 + (rows + 0.5 - y0) * (x1 - x0) / (y1 - y0)
+            np.add.at(flips, (rows, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
+    return np.cumsum(flips, axis=1)[:, :width] % 2 == 1
+
+
+_LARGEST_SIDE = 16384
+"""[px]"""
+_FEWEST_CORNERS = 3
+
+
+def is_coco(path: Path) -> bool:
+    """Whether a file can be one: it ends with .json."""
+    return path.suffix.lower() == ".json"
+
+
+def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+    """The images of a COCO file.
+
+    Args:
+        path: of the file.
+        remarks: annotations that are not usable are added, with the reason, and left out.
+
+    Raises:
+        SequenceError: it is not COCO.
+    """
+    try:
+        content = parse_json(read_text(path, VALUES))
+        names = {int(entry["id"]): entry for entry in content["categories"]}
+        marked: dict[int, list[dict[str, Any]]] = defaultdict(list)
+        for annotation in content["annotations"]:
+            marked[int(annotation["image_id"])].append(annotation)
+        images = list(content["images"])
+        if len(images) > MOST_IMAGES:
+            raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+        for absent in sorted(marked.keys() - {int(image["id"]) for image in images}):
+            why = f"image {absent} is not in the file"
+            remarks.update(_left_out(annotation, why) for annotation in marked[absent])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise SequenceError(f"{path} is not a COCO file ({_why(error)}). Export it again.") from error
+    for image in images:
+        yield _coco_image(path, image, marked[int(image["id"])], names, remarks)
+
+
+def _left_out(annotation: dict[str, Any], why: str) -> str:
+    return f"annotation {annotation.get('id', '(without id)')} left out: {why}"
+
+
+def _coco_image(
+    path: Path, image: Any, marked: list[dict[str, Any]], names: dict[int, Any], remarks: Counter[str]
+) -> ForeignImage:
+    where = f"{path}: image {image.get('file_name')!r}"
+    try:
+        size = int(image["height"]), int(image["width"])
+        if not all(0 < side <= _LARGEST_SIDE for side in size):
+            raise ValueError(f"its size is {size[1]} x {size[0]}")
+        name = str(image["file_name"])
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise SequenceError(f"{where} cannot be read ({_why(error)}). Export it again.") from error
+    points: dict[str, tuple[float, float]] = {}
+    usable = []
+    for annotation in marked:
+        try:
+            points |= _coco_keypoints(annotation, _category(annotation, names))
+            usable.append(annotation)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            remarks[_left_out(annotation, f"{name}: {_why(error)}")] += 1
+    if len(points) > MOST_KEYPOINTS:
+        raise SequenceError(f"{where} has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed. Export fewer.")
+
+    def parts() -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+        for annotation in usable:
+            try:
+                mask = _coco_mask(annotation.get("segmentation"), *size)
+                label = str(_category(annotation, names)["name"])
+            except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+                remarks[_left_out(annotation, f"{name}: {_why(error)}")] += 1
+                continue
+            if mask is not None:
+                yield label, mask
+
+    return ForeignImage(name, parts, points, str(image.get("frame", "")), str(image.get("camera", "")))
+
+
+def _category(annotation: dict[str, Any], names: dict[int, Any]) -> Any:
+    if (number := int(annotation["category_id"])) not in names:
+        raise ValueError(f"category {number} is not in the file")
+    return names[number]
+
+
+def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "height width"] | None:
+    if not segmentation:
+        return None
+    if isinstance(segmentation, dict):
+        counts, size = segmentation["counts"], [int(side) for side in segmentation["size"]]
+        if size != [height, width]:
+            raise ValueError(f"a mask is {size[1]} x {size[0]} in an image of {width} x {height} pixels")
+        runs = runs_of_text(counts) if isinstance(counts, str) else [int(run) for run in counts]
+        return mask_of_runs(runs, height, width, by_columns=True)
+    # Some tools write the only polygon without a list around it.
+    polygons = [segmentation] if all(isinstance(value, int | float) for value in segmentation) else segmentation
+    mask = np.zeros((height, width), bool)
+    for polygon in polygons:
+        if len(polygon) % 2 or len(polygon) < 2 * _FEWEST_CORNERS:
+            raise ValueError(f"a polygon has {len(polygon)} numbers, which are not x and y of three or more corners")
+        points = np.asarray(polygon, np.float64).reshape(-1, 2)
+        if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
+            raise ValueError("a corner of a polygon lies nowhere")
+        mask |= mask_of_polygon(points, height, width)
+    return mask
+
+
+def _coco_keypoints(annotation: dict[str, Any], category: Any) -> dict[str, tuple[float, float]]:
+    values = np.asarray(annotation.get("keypoints") or [], np.float64)
+    if values.size % 3:
+        raise ValueError(f"its keypoints have {values.size} numbers, which are not x, y and visibility of each")
+    values = values.reshape(-1, 3)
+    names = [str(name) for name in category.get("keypoints") or range(1, len(values) + 1)]
+    if len(names) < len(values):
+        raise ValueError(f"{len(values)} keypoints have {len(names)} names")
+    return {
+        f"{category['name']}.{name}": (float(u), float(v))
+        for name, (u, v, seen) in zip(names, values, strict=False)
+        if seen > 0 and np.isfinite([u, v]).all()
+    }
+
+
+def _why(error: Exception) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def is_cvat(path: Path) -> bool:
+    """Whether a file can be one: it ends with .xml."""
+    return path.suffix.lower() == ".xml"
+
+
+def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+    """The images of a CVAT file.
+
+    Args:
+        path: of the file.
+        remarks: shapes that are not usable are added, with the reason, and left out.
+
+    Raises:
+        SequenceError: it is not CVAT's.
+    """
+    try:
+        text = read_text(path, VALUES)
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ValueError("it declares a document type or entities")
+        root = ElementTree.fromstring(text)
+        if root.tag != "annotations" or root.find("image") is None:
+            raise ValueError("there is no <image> in <annotations>; export as 'CVAT for images 1.1'")
+        images = root.findall("image")
+        if len(images) > MOST_IMAGES:
+            raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+        name, times = Counter(image.get("name") for image in images).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"it has image {shown(str(name))} {times} times")
+    except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
+        raise SequenceError(f"{path} is not a CVAT file ({error}). Export it again.") from error
+    for image in images:
+        yield _cvat_image(path, image, remarks)
+
+
+def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignImage:
+    name = image.get("name", "")
+    where = f"{path}: image {name!r}"
+    try:
+        height, width = int(image.get("height", "")), int(image.get("width", ""))
+        if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
+            raise ValueError(f"its size is {width} x {height}")
+        points = dict(_cvat_keypoints(image))
+        if len(points) > MOST_KEYPOINTS:
+            raise ValueError(f"it has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
+    except (ValueError, TypeError) as error:
+        raise SequenceError(f"{where} cannot be read ({error}). Export it again.") from error
+
+    def parts() -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+        shapes = [shape for shape in image if shape.tag in ("mask", "polygon")]
+        for shape in sorted(shapes, key=lambda shape: int(shape.get("z_order", "0"))):
+            try:
+                mask = _cvat_mask(shape, height, width)
+            except (ValueError, TypeError) as error:
+                remarks[f"a {shape.tag} ({shape.get('label', 'no label')}) of {name} left out: {error}"] += 1
+                continue
+            yield shape.get("label", "instrument"), mask
+
+    return ForeignImage(name, parts, points)
+
+
+def _cvat_mask(shape: Element, height: int, width: int) -> Bool[np.ndarray, "height width"]:
+    if shape.tag == "polygon":
+        return mask_of_polygon(_cvat_points(shape), height, width)
+    left, top, wide, high = (int(shape.get(key, "")) for key in ("left", "top", "width", "height"))
+    if left < 0 or top < 0 or wide < 1 or high < 1 or left + wide > width or top + high > height:
+        raise ValueError(f"a mask of {wide} x {high} at {left}, {top} is not inside {width} x {height} pixels")
+    runs = [int(run) for run in shape.get("rle", "").split(",")]
+    mask = np.zeros((height, width), bool)
+    mask[top : top + high, left : left + wide] = mask_of_runs(runs, high, wide, by_columns=False)
+    return mask
+
+
+def _cvat_points(shape: Element) -> np.ndarray:
+    rows = [corner.split(",") for corner in shape.get("points", "").split(";")]
+    points = np.array([[float(x), float(y)] for x, y in rows])
+    if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
+        raise ValueError("a point lies nowhere")
+    return points
+
+
+def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Points with their labels; several of one shape are numbered."""
+    for shape in image.iter("points"):
+        if shape.get("outside") == "1":
+            continue
+        points, label = _cvat_points(shape), shape.get("label", "point")
+        for number, (u, v) in enumerate(points, start=1):
+            yield (label if len(points) == 1 else f"{label}.{number}"), (float(u), float(v))
+
+
+def is_surgpose(path: Path) -> bool:
+    """Whether a file can be one: it ends with .yaml."""
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+    """The frames of a file of keypoints; nothing is remarked about them.
+
+    Raises:
+        SequenceError: it is none.
+    """
+    del remarks
+    try:
+        content = parse_yaml(read_text(path, VALUES))
+        if not isinstance(content, dict) or len(content) > MOST_IMAGES:
+            raise ValueError("it is no table of frames")
+        frames = {int(frame): dict(points or {}) for frame, points in content.items()}
+        found = [(frame, _surgpose_points(points)) for frame, points in sorted(frames.items())]
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise SequenceError(
+            f"{path} has no keypoints as SurgPose writes them ({error}): {{frame: {{1: [x, y], ...}}}}."
+        ) from error
+    for frame, points in found:
+        yield ForeignImage(f"{path.name} {frame}", keypoints=points, frame=str(frame), camera="")
+
+
+def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
+    if len(points) > MOST_KEYPOINTS:
+        raise ValueError(f"a frame has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
+    found = {}
+    for name, place in points.items():
+        if place is not None:
+            u, v = (float(value) + HALF_PIXEL for value in place)
+            if not (math.isfinite(u) and math.isfinite(v)):
+                raise ValueError(f"keypoint {name} is at {place}")
+            found[str(name)] = (u, v)
+    return found
+
+
+_SUFFIXES = (".png", ".bmp")
+_OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
+"""Looked for where there are none of these, since masks lie beside images."""
+_DEEPEST = 4
+_MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
+_TOOL = "_labels"
+_INSTRUMENT = "instrument"
+_MOST_UNNAMED = 32
+"""Values of one image; more come from interpolation."""
+_BACKGROUND = ("background", "background-tissue")
+_SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
+"""How EndoVis 2018 begins the names of what belongs to an instrument; everything else is anatomy or thread."""
+
+_Colours = Mapping[tuple[int, int, int], str]
+
+
+def is_mask_folder(path: Path) -> bool:
+    """Whether it is a folder."""
+    return path.is_dir()
+
+
+def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:
+    """The images below a folder; files of one name in folders beside one another belong to one frame.
+
+    Args:
+        path: of the folder.
+        remarks: what was changed or decided about how many files is added while they are decoded.
+        confined: whether links are left out, and what values mean is not looked for above the folder.
+
+    Raises:
+        SequenceError: there are none, or it is not known what their values mean.
+    """
+    there = [file for file in _files(_finest(path)) if not (confined and file.is_symlink())]
+    files = [file for file in there if file.suffix.lower() in _SUFFIXES] or there
+    if not files:
+        known = ", ".join((*_SUFFIXES, *_OTHER_SUFFIXES))
+        raise SequenceError(f"{path} has no masks ({known}). Name the folder that holds them.")
+    meanings: dict[Path, Any] = {}
+    for file in files:
+        above = _meaning_file(file, path if confined else path.parent, confined)
+        if above is not None and above not in meanings:
+            meanings[above] = _meaning(above)
+        meaning = None if above is None else meanings[above]
+        yield ForeignImage(
+            file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning, remarks)
+        )
+
+
+def _finest(path: Path) -> Path:
+    """Of an export of carts, the folder with links."""
+    return path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
+
+
+def _files(folder: Path) -> list[Path]:
+    found: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        if len(Path(place).relative_to(folder).parts) >= _DEEPEST:
+            folders.clear()
+        chosen = [name for name in names if name.lower().endswith((*_SUFFIXES, *_OTHER_SUFFIXES))]
+        found += [Path(place) / name for name in chosen if not name.startswith(".")]
+        if len(found) > MOST_IMAGES:
+            raise SequenceError(f"{folder} has more than {MOST_IMAGES} masks. Name a folder with fewer.")
+    # Files of one frame follow each other: tools have folders of their own beside one another.
+    files = [file for file in found if is_regular(file)]
+    return sorted(files, key=lambda file: (file.stem, file.parent.parent.as_posix(), file.as_posix()))
+
+
+def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
+    """What says what the values mean: in the mask's folder or one above, up to the top."""
+    for folder in file.parents:
+        for name in _MEANINGS:
+            if is_regular(folder / name) and not (confined and (folder / name).is_symlink()):
+                return folder / name
+        if folder == top:
+            break
+    return None
+
+
+def _meaning(path: Path) -> Any:
+    try:
+        return parse_json(read_text(path, VALUES))
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path} cannot be read ({error}). Correct it or remove it.") from error
+
+
+def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    image = read_labels(file)
+    tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
+    yield "", np.zeros(image.colours.shape[:2], bool)
+    try:
+        if isinstance(meaning, list):
+            yield from _by_colour(image.colours, _colours(meaning), file)
+            return
+        names = _names(meaning, file.parent.name)
+        remarks.update(image.remarks)
+        if image.mask is not None and not names:
+            if image.mask.any():
+                yield tool or _INSTRUMENT, image.mask
+        elif image.values is None:
+            raise SequenceError(
+                f"{file} has colours, and no labels.json in its folder or above says what they mean. Add one as "
+                'EndoVis 2018 has it: [{"name": ..., "color": [r, g, b]}, ...].'
+            )
+        else:
+            yield from _by_value(image.values, names, tool, file)
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        raise SequenceError(f"what the values of {file} mean cannot be read ({error}).") from error
+
+
+def _colours(meaning: list[Any]) -> _Colours:
+    rows = [(tuple(int(value) for value in entry["color"]), str(entry["name"])) for entry in meaning]
+    return {colour: name for colour, name in rows if len(colour) == 3}  # type: ignore[misc]
+
+
+def _by_colour(
+    image: np.ndarray, colours: _Colours, file: Path
+) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    code = image.astype(np.int64) @ (65536, 256, 1)
+    there = {int(value) for value in np.unique(code)}
+    known = {colour[0] * 65536 + colour[1] * 256 + colour[2]: name for colour, name in colours.items()}
+    if unknown := there - known.keys():
+        raise SequenceError(f"{file} has the colour #{min(unknown):06x}, which labels.json does not know. Add it.")
+    for value in sorted(there):
+        if known[value].lower().startswith(_SCENE_PARTS):
+            yield known[value], code == value
+
+
+def _by_value(
+    image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
+) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    values = [int(value) for value in np.unique(image) if value]
+    unknown = [value for value in values if value not in names]
+    if len(unknown) > _MOST_UNNAMED:
+        raise SequenceError(
+            f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}. Labels that were resized "
+            "with interpolation have such: resize them by the nearest neighbour, or name each value in labels.json."
+        )
+    for value in values:
+        name = names.get(value, f"label {value}")
+        if name.lower() not in _BACKGROUND:
+            yield f"{tool}.{name}" if tool else name, image == value
+
+
+def _names(meaning: Any, folder: str) -> dict[int, str]:
+    """Grey value -> name, of a file that says either of both first."""
+    if not isinstance(meaning, dict):
+        return {}
+    if isinstance(inner := meaning.get(folder), dict):
+        meaning = inner
+    names: dict[int, str] = {}
+    for key, value in meaning.items():
+        if str(key).isdecimal() and isinstance(value, str):
+            names[int(key)] = value
+        elif isinstance(value, int):
+            names[value] = str(key)
+    return {value: name for value, name in names.items() if value}

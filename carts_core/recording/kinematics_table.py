@@ -1,0 +1,441 @@
+"""Kinematics tables: CSV files with a row per frame, whose columns are joint positions in a given unit."""
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import combinations
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import SequenceError
+from ..files.reading import ROBOT, TABLE, open_regular, read_text
+from ..model.instruments import robot_file
+from ..model.robot import Robot, parsed_urdf
+from ..wording import closest, listed, shown
+from .toml_table import TomlTable
+
+MOST_CELLS = 10_000_000
+"""Largest table; an hour at 100 rows per second has room for 27 columns."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A CSV file as text; only cells of a column that is asked for are looked at."""
+
+    path: Path
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]
+    """Line of the file in which each row ends, counted from 1."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def text(self, column: str, asked_by: str) -> list[str]:
+        """The cells of a column.
+
+        Args:
+            column: its name in the header.
+            asked_by: the key that names the column, for errors.
+
+        Raises:
+            SequenceError: there is no such column.
+        """
+        return [cell.strip() for cell in self._cells(column, asked_by)]
+
+    def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
+        """The values of a column.
+
+        Raises:
+            SequenceError: there is no such column, or a cell is not a finite number.
+        """
+        try:
+            values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
+        except ValueError:
+            # Some cell is no number; this way, which is slower, says which.
+            values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
+        if (wrong := np.flatnonzero(~np.isfinite(values))).size:
+            row, cells = wrong[0], self.text(column, asked_by)
+            raise SequenceError(
+                f"{self.path}, line {self.lines[row]}, column {column!r}: {shown(cells[row])} is not a finite number. "
+                "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
+            )
+        return values
+
+    def _cells(self, column: str, asked_by: str) -> Iterator[str]:
+        """The cells of a column as they stand in the file."""
+        if column not in self.header:
+            raise SequenceError(
+                f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
+                f"Its columns are: {listed(self.header)}."
+            )
+        return map(itemgetter(self.header.index(column)), self.rows)
+
+
+def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
+    """Read a CSV file, which errors call `what`; blank lines are skipped.
+
+    Raises:
+        SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
+    """
+    try:
+        with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8-sig", newline="") as handle:
+            reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
+            rows, lines = _filled_rows(reader, path, what)
+    except (FileNotFoundError, IsADirectoryError) as error:
+        raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
+    except (OSError, ValueError, csv.Error) as error:
+        raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
+    if len(rows) < 2:
+        raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
+    header = tuple(name.strip() for name in rows[0])
+    if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
+        raise SequenceError(
+            f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
+            f"Set `delimiter = {found!r}` in [kinematics] (decimal points are points)."
+        )
+    repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
+    if repeated:
+        raise SequenceError(f"{path} has several columns called {listed(map(repr, repeated))}. Rename all but one.")
+    if set(map(len, rows)) != {len(header)}:
+        line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != len(header))
+        raise SequenceError(
+            f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
+        )
+    return Table(path, header, tuple(rows[1:]), tuple(lines[1:]))
+
+
+def _filled_rows(reader: Any, path: Path, what: str) -> tuple[list[tuple[str, ...]], list[int]]:
+    """Cells, and number of the last line, of every row that is not empty."""
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    cells = 0
+    for row in reader:
+        if any(row):
+            rows.append(tuple(row))  # Which Python's collector looks at once, and at a list again and again.
+            lines.append(reader.line_num)
+            cells += len(row)
+            if cells > MOST_CELLS:
+                raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
+    return rows, lines
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+ANGLE_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
+"""[rad] of one unit; "percent" is not among them, since it counts from the middle of the limits."""
+LENGTH_UNITS: Mapping[str, float] = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3}
+"""[m] of one unit."""
+PERCENT = "percent"
+"""Unit of -100 to 100 of the range of a joint."""
+_BEYOND = 0.15
+"""Share of the range of a joint by which positions may exceed its limits."""
+FAR = 0.5
+"""The same, beyond which a unit is wrong."""
+_FEW = 0.02
+"""Share of rows that may be beyond, as spikes of an encoder."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """An independent joint of a robot."""
+
+    name: str
+    revolute: bool
+    lower: float
+    """[rad], [m]; infinite where not given."""
+    upper: float
+
+    @property
+    def unit(self) -> str:
+        """Its SI unit."""
+        return "rad" if self.revolute else "m"
+
+    def beyond(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> np.ndarray:
+        """Which positions [rad], [m] exceed the limits by more than a share of their range."""
+        if not np.isfinite([self.lower, self.upper]).all():
+            return np.zeros(len(values), bool)
+        margin = share * (self.upper - self.lower)
+        return (values < self.lower - margin) | (values > self.upper + margin)
+
+    def fits(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> bool:
+        """Whether all positions but a few are within the limits."""
+        return bool(self.beyond(values, share).mean() <= _FEW)
+
+    def from_percent(self, values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Positions of -100 to 100 between the limits [rad], [m]."""
+        return self.lower + (values + 100) / 200 * (self.upper - self.lower)
+
+
+def joints_of(robot: str | Path) -> tuple[Joint, ...]:
+    """The independent joints of a robot, in the order of its URDF.
+
+    Raises:
+        RobotError: it is missing or no URDF.
+    """
+    return _joints_of(robot_file(robot).absolute())
+
+
+@lru_cache(maxsize=16)
+def _joints_of(urdf: Path) -> tuple[Joint, ...]:
+    found = []
+    for joint in parsed_urdf(read_text(urdf, ROBOT), urdf).iter("joint"):
+        kind = joint.get("type")
+        if kind not in ("revolute", "continuous", "prismatic") or joint.find("mimic") is not None:
+            continue
+        limit = joint.find("limit")
+        lower, upper = -np.inf, np.inf
+        if limit is not None and kind != "continuous":
+            lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+        if lower >= upper:
+            lower, upper = -np.inf, np.inf
+        found.append(Joint(joint.get("name", ""), kind != "prismatic", lower, upper))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """A joint whose positions are beyond its limits, and what would bring them within."""
+
+    joint: Joint
+    lowest: float
+    """[rad], [m]"""
+    highest: float
+    remedies: tuple[str, ...] = field(default=())
+    """Each "the other sign", a unit, or another joint's column, for people."""
+
+    def sentence(self) -> str:
+        """For people."""
+        text = (
+            f"{self.joint.name} is from {self.lowest:.4g} to {self.highest:.4g} {self.joint.unit}, and the robot's "
+            f"limits are {self.joint.lower:.4g} to {self.joint.upper:.4g} {self.joint.unit}"
+        )
+        return f"{text}; {' or '.join(self.remedies)} would fit" if self.remedies else text
+
+
+def misfits(
+    joints: Sequence[Joint], values: Float[np.ndarray, "rows joints"], share: float = _BEYOND
+) -> tuple[Misfit, ...]:
+    """The joints whose positions [rad], [m] are beyond their limits."""
+    wrong = [index for index, joint in enumerate(joints) if len(values) and not joint.fits(values[:, index], share)]
+    order = _other_order(joints, values, wrong)
+    return tuple(
+        Misfit(
+            joints[index],
+            float(values[:, index].min()),
+            float(values[:, index].max()),
+            (*_remedies(joints[index], values[:, index]), *order),
+        )
+        for index in wrong
+    )
+
+
+def _remedies(joint: Joint, values: np.ndarray) -> tuple[str, ...]:
+    """Units and signs with which positions that were read as SI units fit the limits, so that they still move there."""
+    found = []
+    if joint.fits(-values):
+        found.append("the other sign")
+    for unit, factor in (ANGLE_UNITS if joint.revolute else LENGTH_UNITS).items():
+        if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
+            found.append(f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})")
+    return tuple(found)
+
+
+def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> tuple[str, ...]:
+    """Orders of the columns in which all positions fit, where a sign alone does not mend each joint."""
+    if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
+        return ()
+    names = [joint.name for joint in joints]
+
+    def fit(order: Sequence[int]) -> bool:
+        return all(joint.fits(values[:, place]) for joint, place in zip(joints, order, strict=True))
+
+    alphabetical = [sorted(names).index(name) for name in names]
+    if alphabetical != list(range(len(names))) and fit(alphabetical):
+        return ("the alphabetical order of the joints' names",)
+    found = []
+    for a, b in combinations(range(len(joints)), 2):
+        order = list(range(len(joints)))
+        order[a], order[b] = b, a
+        if (a in wrong or b in wrong) and fit(order):
+            found.append(f"the columns of {names[a]} and {names[b]} the other way round")
+    return tuple(found)
+
+
+def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert: Callable[..., np.ndarray]) -> bool:
+    """Whether converted columns are nowhere far beyond the limits; the sign does not count."""
+    for joint, values in zip(joints, columns, strict=True):
+        converted = convert(joint, values)
+        if not (joint.fits(converted, FAR) or joint.fits(-converted, FAR)):
+            return False
+    return True
+
+
+_UNITS = {"revolute": (*ANGLE_UNITS, PERCENT), "prismatic": (*LENGTH_UNITS, PERCENT)}
+
+PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
+"""Largest magnitude [rad], [m] of a joint position; more means that the unit was not given."""
+
+
+@dataclass(frozen=True)
+class JointColumn:
+    """joint position = column * scale + offset."""
+
+    joint: str
+    column: str
+    scale: float
+    """[rad or m per unit of the column]"""
+    offset: float
+    """[rad] or [m]"""
+    unit: str
+    given: bool = False
+    """Whether the file says the unit, so that positions beyond the limits are meant."""
+
+
+@dataclass(frozen=True)
+class JointColumns:
+    """How the joint positions of one robot are read from a table."""
+
+    robot: Robot
+    columns: tuple[JointColumn, ...]
+    defaults: Mapping[str, float]
+    """Position [rad], [m] of every joint that the table does not measure."""
+    key: str
+    """How errors call the mapping."""
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The joints that have a column, in the robot's order."""
+        mapped = {column.joint for column in self.columns}
+        return tuple(name for name in self.robot.joint_names if name in mapped)
+
+    def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
+        """Joint positions of every row [rad], [m], in the order of `Robot.joint_names`.
+
+        Raises:
+            SequenceError: a column is missing, a cell is not a finite number, or values cannot be in the given unit.
+        """
+        names = self.robot.joint_names
+        positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
+        for column in self.columns:
+            index = names.index(column.joint)
+            with np.errstate(over="ignore", invalid="ignore"):
+                values = table.numbers(column.column, f"{self.key} {column.joint}") * column.scale + column.offset
+            kind = self.robot.joint_types[index]
+            if not (worst := np.abs(values).max()) <= PLAUSIBLE[kind]:
+                symbol, other = ("rad", "deg") if kind == "revolute" else ("m", "mm")
+                raise SequenceError(
+                    f"{table.path}, line {table.lines[int(np.abs(values).argmax())]}, column {column.column!r}: read "
+                    f"as {column.unit}, joint {column.joint!r} is at {worst:.4g} {symbol}, which no instrument reaches "
+                    f"({PLAUSIBLE[kind]:.3g} {symbol} is allowed). If the column is in {other}, say so: "
+                    f'{column.joint} = {{ column = "{column.column}", unit = "{other}" }}.'
+                )
+            self._check_limits(table, column, index, values)
+            positions[:, index] = values
+        return positions
+
+    def _check_limits(self, table: Table, column: JointColumn, index: int, values: np.ndarray) -> None:
+        """See that positions whose unit is not given are not far beyond the limits of the robot.
+
+        Raises:
+            SequenceError: they are, and another unit would fit.
+        """
+        low, high = self.robot.joint_limits[index].tolist()
+        joint = Joint(column.joint, self.robot.joint_types[index] == "revolute", low, high)
+        if column.given or joint.fits(values, FAR):
+            return
+        units = ANGLE_UNITS if joint.revolute else LENGTH_UNITS
+        fitting = [unit for unit, factor in units.items() if factor != 1.0 and joint.fits(values * factor)]
+        if fitting:
+            key, name = ("angle_unit", "rad") if joint.revolute else ("length_unit", "m")
+            raise SequenceError(
+                f"{table.path}, column {column.column!r}: read as {joint.unit}, joint {joint.name!r} is from "
+                f"{values.min():.4g} to {values.max():.4g} {joint.unit}, and its limits are {low:.4g} to {high:.4g}. "
+                f'Say the unit in [[arms]]: {key} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
+                f'"{name}" if it is that.'
+            )
+
+
+def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
+    """The keys `joints`, `defaults`, `angle_unit` and `length_unit` of an `[[arms]]` table.
+
+    Raises:
+        SequenceError: a joint is not in the robot, has no value, or a unit does not fit it.
+    """
+    given = {"revolute": "angle_unit" in table, "prismatic": "length_unit" in table}
+    units = {
+        "revolute": table.take_choice("angle_unit", _UNITS["revolute"], "rad"),
+        "prismatic": table.take_choice("length_unit", _UNITS["prismatic"], "m"),
+    }
+    mapping, defaults = table.take_table("joints"), table.take_table("defaults")
+    columns = tuple(_take_column(mapping, joint, robot, units, given) for joint in mapping.items())
+    values: dict[str, float] = {}
+    for joint in defaults.items():
+        _joint_type(defaults, joint, robot)
+        values[joint] = float(defaults.take(joint, float))
+        if abs(values[joint]) > (largest := PLAUSIBLE[_joint_type(defaults, joint, robot)]):
+            raise defaults.error(joint, f"is {values[joint]:g}; allowed is up to {largest:.3g} [rad or m].")
+        if joint in mapping:
+            raise defaults.error(
+                joint, "is given, but the joint has a column in [arms.joints] too. Remove one of them."
+            )
+    for joint in robot.joint_names:
+        if joint not in mapping and joint not in values:
+            unit = "[rad]" if _joint_type(mapping, joint, robot) == "revolute" else "[m]"
+            raise mapping.error(
+                joint,
+                f"is missing: robot {robot.name!r} has this joint. Name its column here, "
+                f"or give the position {unit} that it keeps under [arms.defaults], say {joint} = 0.0.",
+            )
+    return JointColumns(robot, columns, values, mapping.where)
+
+
+def _joint_type(table: TomlTable, joint: str, robot: Robot) -> str:
+    if joint not in robot.joint_names:
+        raise table.error(
+            joint,
+            f"is not a joint of robot {robot.name!r} ({robot.urdf}).{closest(joint, robot.joint_names)} "
+            f"Its joints are: {', '.join(robot.joint_names)}.",
+        )
+    return robot.joint_types[robot.joint_names.index(joint)]
+
+
+def _take_column(
+    mapping: TomlTable, joint: str, robot: Robot, units: Mapping[str, str], given: Mapping[str, bool]
+) -> JointColumn:
+    kind = _joint_type(mapping, joint, robot)
+    if isinstance(mapping.take(joint, (str, dict)), str):
+        scale, offset = _conversion(joint, units[kind], robot)
+        return JointColumn(joint, mapping.take(joint, str), scale, offset, units[kind], given[kind])
+    entry = TomlTable(mapping.take(joint, dict), mapping.file, f"{mapping.where}: {joint}")
+    said = given[kind] or any(key in entry for key in ("unit", "scale"))
+    unit = entry.take_choice("unit", _UNITS[kind], units[kind])
+    scale, offset = _conversion(joint, unit, robot)
+    scale, offset = scale * float(entry.take("scale", float, 1.0)), offset + float(entry.take("offset", float, 0.0))
+    result = JointColumn(joint, entry.take("column", str), scale, offset, unit, said)
+    entry.finish()
+    return result
+
+
+def _conversion(joint: str, unit: str, robot: Robot) -> tuple[float, float]:
+    """Scale and offset to [rad] or [m]; those of percent are between the limits of the joint."""
+    index = robot.joint_names.index(joint)
+    if unit != PERCENT:
+        return {**ANGLE_UNITS, **LENGTH_UNITS}[unit], 0.0
+    low, high = robot.joint_limits[index].tolist()
+    if not np.isfinite([low, high]).all():
+        raise SequenceError(f"joint {joint!r} of {robot.urdf} has no limits, so {PERCENT} of its range is not known.")
+    return (high - low) / 200, (high + low) / 2

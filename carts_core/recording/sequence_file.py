@@ -1,0 +1,504 @@
+"""Sequence files: reading and checking of their tables, and writing of a copy with another calibration."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from jaxtyping import Float
+
+from ..errors import RobotError, SequenceError, SettingsError
+from ..files.reading import SEQUENCE, VALUES, is_regular, parse_json, read_text
+from ..model.camera import FARTHEST, HALF_PIXEL, Camera, implausible_intrinsics, rigid_transform
+from ..model.instruments import SCHEME, robot_file
+from ..model.robot import Robot
+from ..model.scene import Arm, Light, Scene
+from ..wording import closest, listed, shown
+from .frame_list import FrameList, check_present, expand, frame_files, is_glob, is_per_frame, numbers_of_frames
+from .image_sources import BagImages, Cropped
+from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
+from .kinematics_table import take_joints
+from .matching import JointSamples, PoseSamples, Rows, TimeMatching, take_camera_motion, take_rows
+from .toml_table import TomlTable, check_file_name, read_toml
+from .video import SUFFIXES, Video
+
+
+def take_value(table: TomlTable, key: str, default: Any) -> Any:
+    """The value of `key`; text `file.json#a/b` stands for the value under `a`, `b` in that JSON file.
+
+    Raises:
+        SequenceError: the JSON file or the name in it does not exist.
+    """
+    value = table.take(key, object, default)
+    if not isinstance(value, str):
+        return value
+    file_name, mark, pointer = value.partition("#")
+    if not mark or not pointer:
+        raise table.error(
+            key, f'is {shown(value)}. Write the numbers here, or "file.json#name" to take them from a file.'
+        )
+    path = table.path(file_name)
+    try:
+        found = parse_json(read_text(path, VALUES))
+    except FileNotFoundError as error:
+        raise table.error(key, f"points at {path}, which is missing. Correct the path.") from error
+    except (OSError, ValueError) as error:
+        raise table.error(key, f"points at {path}, which is not a readable JSON file: {error}.") from error
+    for name in pointer.strip("/").split("/"):
+        if isinstance(found, list) and name.isdigit() and int(name) < len(found):
+            found = found[int(name)]
+        elif isinstance(found, dict) and name in found:
+            found = found[name]
+        else:
+            names = list(found) if isinstance(found, dict) else []
+            raise table.error(
+                key,
+                f"points at {name!r}, which {path} does not have.{closest(name, names)} "
+                f"It has: {listed(names) or 'no names at this place'}.",
+            )
+    return found
+
+
+def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
+    """A rigid transform [4, 4], translation in [m].
+
+    Raises:
+        SequenceError: it is not rigid.
+    """
+    value = take_value(table, key, default)
+    try:
+        return rigid_transform(value, table.name(key))
+    except SettingsError as error:
+        raise SequenceError(str(error)) from error
+
+
+def take_camera(table: TomlTable) -> Camera:
+    """The camera that one `[[cameras]]` table describes.
+
+    Raises:
+        SequenceError: a value is missing or impossible.
+    """
+    name = table.take("name", str)
+    width, height = _take_size(table)
+    intrinsics = _take_intrinsics(table)
+    distortion = take_value(table, "distortion", [])
+    if not isinstance(distortion, list) or not all(_is_number(value) for value in distortion):
+        raise table.error(
+            "distortion", f"is {shown(distortion)}. Give a list of 0, 4, 5, 8, 12 or 14 numbers: k1 k2 p1 p2 k3 ..."
+        )
+    T_camera_world = take_transform(table, "T_camera_world", np.eye(4).tolist())
+    try:
+        return Camera(name, width, height, intrinsics, T_camera_world, tuple(float(value) for value in distortion))
+    except SettingsError as error:
+        raise SequenceError(f"{table.file}: {table.where}: {error}") from error
+
+
+def _take_size(table: TomlTable) -> tuple[int, int]:
+    size = take_value(table, "size", [])
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
+        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, say size = [640, 480].")
+    return size[0], size[1]
+
+
+def _take_intrinsics(table: TomlTable) -> tuple[float, float, float, float]:
+    K = take_value(table, "K", None)
+    if isinstance(K, dict) and sorted(K) == ["cx", "cy", "fx", "fy"] and all(_is_number(value) for value in K.values()):
+        fx, fy, cx, cy = (float(K[key]) for key in ("fx", "fy", "cx", "cy"))
+    else:
+        try:
+            matrix = np.array(K, dtype=np.float64)
+        except (TypeError, ValueError):
+            matrix = np.empty(0)
+        if matrix.shape != (3, 3):
+            raise table.error(
+                "K", f"is {shown(K)}. Give 3 rows of 3 numbers, or {{ fx = ..., fy = ..., cx = ..., cy = ... }}."
+            )
+        fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+        if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * abs(fx)):
+            raise table.error(
+                "K",
+                f"is {shown(K)}. It must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported, "
+                "and rows must not be swapped with columns.",
+            )
+    center = table.take("pixel_center", float, HALF_PIXEL)
+    if center not in (0.0, HALF_PIXEL):
+        raise table.error(
+            "pixel_center", f"is {center!r}, but must be 0.5 (ours) or 0.0 (OpenCV, ROS, MATLAB minus 1)."
+        )
+    return float(fx), float(fy), float(cx) + HALF_PIXEL - center, float(cy) + HALF_PIXEL - center
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def resolve_robot(table: TomlTable) -> Path:
+    """The URDF that the key `robot` names: a path, or `builtin:NAME`.
+
+    Raises:
+        SequenceError: no robot of that name is built in.
+    """
+    value = table.take("robot", str)
+    if value.startswith(SCHEME):
+        try:
+            return robot_file(value)
+        except RobotError as error:
+            raise table.error("robot", f"is not known: {error}") from error
+    return table.path(value)
+
+
+@dataclass(frozen=True)
+class CameraInput:
+    """A camera and the files that belong to it, by domain."""
+
+    camera: Camera
+    images: Mapping[str, ImageSource]
+    masks: Mapping[str, tuple[Path | None, ...]]
+    """Mask file of every frame, None for a frame that has none; empty when the sequence has no masks."""
+    background: Mapping[str, Path]
+    motion: PoseSamples | None
+    """Of what carries it; None for a camera that stays."""
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is changed about images and masks before they are used, and what is unusual about the calibration."""
+        camera = self.camera
+        files = {file: None for domain in self.masks.values() for file in domain if file is not None}
+        found = [text for source in self.images.values() for text in _remarks_of(source)]
+        found += mask_remarks(list(files))
+        unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
+        found += [f"its calibration has {unusual}. Check `size`, `K` and `distortion`."] if unusual else []
+        return tuple(dict.fromkeys(f"{camera.name}: {text}" for text in found))
+
+
+def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
+    """The camera that one `[[cameras]]` table describes, every file of it present.
+
+    Raises:
+        SequenceError: a value is missing or wrong, or a file is missing.
+    """
+    camera, frames = take_camera(table), rows.frames
+    motion = take_camera_motion(table, rows)
+    images = {
+        domain: _images(table, pattern, frames, domain, camera.name)
+        for domain, pattern in _by_domain(table, "images", domains, required=True).items()
+    }
+    sparse = table.take("sparse_masks", bool, False)
+    masks = {
+        domain: _masks(table, pattern, frames, domain=domain, camera=camera.name, sparse=sparse)
+        for domain, pattern in _by_domain(table, "masks", domains).items()
+    }
+    background: dict[str, Path] = {}
+    for domain, pattern in _by_domain(table, "background", domains).items():
+        path = table.path(expand(pattern, table.name("background"), domain=domain, camera=camera.name))
+        if not is_regular(path):
+            raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
+        background[domain] = path
+    if background and motion is not None:
+        raise table.error("background", "does not go with `motion`: it would be another one in every frame. Remove it.")
+    table.finish()
+    return CameraInput(camera, images, masks, background, motion)
+
+
+def _remarks_of(source: ImageSource) -> tuple[str, ...]:
+    try:
+        return source.remarks()
+    except SequenceError:  # It is an error where the image is used.
+        return ()
+
+
+def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
+    """Pattern of every domain: text is for all domains, a table names them one by one."""
+    value = table.take(key, (str, dict)) if required else table.take(key, (str, dict), {})
+    if isinstance(value, str):
+        if required and len(domains) > 1 and "{domain" not in value:
+            raise table.error(
+                key,
+                f"is {value!r} for all {len(domains)} domains. Put {{domain}} into it, "
+                "or give a table with one pattern per domain.",
+            )
+        return dict.fromkeys(domains, value)
+    for domain, pattern in value.items():
+        if domain not in domains:
+            raise table.error(
+                f"{key}.{domain}",
+                f"is for an unknown domain.{closest(domain, domains)} "
+                f"`domains` at the top of the file lists: {', '.join(domains)}.",
+            )
+        if not isinstance(pattern, str):
+            raise table.error(f"{key}.{domain}", f"is {pattern!r}, but must be text.")
+    if required and (missing := [domain for domain in domains if domain not in value]):
+        raise table.error(key, f"is missing for: {', '.join(missing)}. Give every domain a pattern.")
+    return dict(value)
+
+
+def _images(table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str) -> ImageSource:
+    source = _whole_images(table, pattern, frames, domain, camera)
+    crop = table.take("crop", list, [])
+    if not crop:
+        return source
+    if len(crop) != 4 or not all(isinstance(value, int) and value >= 0 for value in crop) or min(crop[2:]) < 1:
+        raise table.error("crop", f"is {crop!r}. Give [left, top, width, height] in whole pixels.")
+    return Cropped(source, (crop[0], crop[1], crop[2], crop[3]))
+
+
+def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str) -> ImageSource:
+    key = table.name("images")
+    topic, numbers = table.take("topic", str, ""), frames.video_frames
+    message_time, video_frame = table.take("message_time", str, ""), table.take("video_frame", str, "")
+    bits = table.take("bits", int, None)
+    if bits is not None and bits not in DEPTHS:
+        raise table.error("bits", f"is {bits}. Give the bits of the images' values: {', '.join(map(str, DEPTHS))}.")
+    deinterlace = table.take("deinterlace", bool, True)
+    if topic:
+        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        return BagImages(path, topic, _message_times(table, message_time, frames))
+    if video_frame:
+        if frames.table is None:
+            raise table.error("video_frame", "names a column, but [frames] has no table. Name the frames in a table.")
+        numbers = numbers_of_frames(frames.table, video_frame, table.name("video_frame"))
+    if not is_per_frame(pattern) and not is_glob(pattern):
+        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        if path.suffix.lower() not in SUFFIXES:
+            raise table.error(
+                "images",
+                f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
+                f"or name a video ({', '.join(SUFFIXES)}).",
+            )
+        return Video(path, numbers, deinterlace=deinterlace)
+    files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
+    check_present(key, files, frames)
+    return ImageFiles(files, bits)
+
+
+def _message_times(table: TomlTable, column: str, frames: FrameList) -> tuple[int, ...]:
+    if frames.table is None or not column:
+        raise table.error("message_time", "is missing: with `topic`, name the column of the table with times [ns].")
+    cells = frames.table.text(column, table.name("message_time"))
+    for cell, line in zip(cells, frames.table.lines, strict=True):
+        if not cell.isdecimal():
+            raise SequenceError(f"{frames.table.path}, line {line}, column {column!r}: {cell!r} is no time [ns].")
+    return tuple(map(int, cells))
+
+
+def _masks(
+    table: TomlTable, pattern: str, frames: FrameList, *, domain: str, camera: str, sparse: bool
+) -> tuple[Path | None, ...]:
+    key = table.name("masks")
+    if not is_per_frame(pattern) and not is_glob(pattern):
+        raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it.")
+    files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
+    if sparse and any(is_regular(file) for file in files):
+        return tuple(file if is_regular(file) else None for file in files)
+    check_present(key, files, frames, " If only some frames have masks, set sparse_masks = true.")
+    return files
+
+
+FORMAT = "carts-sequence/1"
+"""Value of the key `format`."""
+
+_BRIGHTEST = 1e3
+"""Largest value of the keys of `[light]` that are numbers."""
+
+
+@dataclass(frozen=True)
+class ArmInput:
+    """An arm and its joint positions."""
+
+    arm: Arm
+    measured_joints: tuple[str, ...]
+    measured: JointSamples
+    truth: JointSamples | None
+
+
+@dataclass(frozen=True)
+class Description:
+    """A sequence file, read and checked."""
+
+    path: Path
+    name: str
+    scene: Scene
+    domains: tuple[str, ...]
+    frames: FrameList
+    matching: TimeMatching | None
+    """How joint positions are matched with frames by time; None where every row of the tables is a frame."""
+    cameras: Mapping[str, CameraInput]
+    arms: Mapping[str, ArmInput]
+    remarks: tuple[str, ...] = ()
+    """What is changed about images and masks before they are used, and what is unusual about calibrations."""
+
+    def at_frames(self, samples: JointSamples) -> Float[np.ndarray, "frames dofs"]:
+        """The joint positions of every frame [rad, m].
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        return samples.positions if self.matching is None else samples.at_times(self.frames, self.matching)
+
+    def mounts(self) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
+        """Camera -> T_mount_world of every frame [m], of the cameras that move.
+
+        Raises:
+            SequenceError: a frame has no row near enough in time.
+        """
+        moving = {name: camera.motion for name, camera in self.cameras.items() if camera.motion is not None}
+        poses = {
+            name: motion.Ts_world_mount if self.matching is None else motion.at_times(self.frames, self.matching)
+            for name, motion in moving.items()
+        }
+        return {name: np.linalg.inv(Ts) for name, Ts in poses.items()}
+
+
+def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
+    """Read a sequence file and everything that it points at, images excepted.
+
+    Args:
+        path: the TOML file.
+        progress: called with a line for people while robots are loaded.
+
+    Raises:
+        SequenceError: the file or something it points at is missing or wrong.
+        RobotError: a robot or one of its meshes is missing or wrong.
+    """
+    root = read_toml(path)
+    root.take_choice("format", (FORMAT,), "(none)")
+    name = root.take("name", str, path.stem)
+    check_file_name(root, "name", "is", name)
+    root.take("description", str, "")
+    domains = _take_domains(root)
+    frames_section = root.take_table("frames") if "frames" in root else None
+    rows = take_rows(root.take_table("kinematics"), frames_section)
+    light = _take_light(root.take_table("light"))
+    robots: dict[tuple[Path, str | None], Robot] = {}
+    arms = [_take_arm(table, rows, robots, progress) for table in root.take_tables("arms")]
+    cameras = [take_camera_input(table, rows, domains) for table in root.take_tables("cameras")]
+    root.finish()
+    scene = Scene(tuple(entry.arm for entry in arms), tuple(entry.camera for entry in cameras), light)
+    remarks = tuple(remark for camera in cameras for remark in camera.remarks())
+    remarks += tuple(dict.fromkeys(f"{robot.name}: {text}" for robot in robots.values() for text in robot.remarks))
+    if progress is not None:
+        for remark in remarks:
+            progress(f"note: {remark}")
+    return Description(
+        path=path,
+        name=name,
+        scene=scene,
+        domains=domains,
+        frames=rows.frames,
+        matching=rows.matching,
+        cameras={entry.camera.name: entry for entry in cameras},
+        arms={entry.arm.name: entry for entry in arms},
+        remarks=remarks,
+    )
+
+
+def _take_domains(root: TomlTable) -> tuple[str, ...]:
+    domains = root.take("domains", list, ["regular"])
+    if not domains or not all(isinstance(domain, str) and domain for domain in domains):
+        raise root.error("domains", f'is {shown(domains)}. Give names, say domains = ["regular", "smoke"].')
+    if len(set(domains)) < len(domains):
+        raise root.error("domains", f"names one twice: {', '.join(domains)}.")
+    for domain in domains:
+        check_file_name(root, "domains", "has", domain)
+    return tuple(domains)
+
+
+def _take_light(table: TomlTable) -> Light:
+    values: dict[str, Any] = {}
+    for setting in fields(Light):
+        if setting.name in table:
+            value = table.take(setting.name, list if setting.name == "position" else float)
+            values[setting.name] = tuple(value) if isinstance(value, list) else float(value)
+        else:
+            table.take(setting.name, object, None)
+    table.finish()
+    position = values.get("position", (0.0, 0.0, 0.0))
+    if len(position) != 3 or not all(isinstance(value, int | float) and abs(value) <= FARTHEST for value in position):
+        raise table.error("position", f"must be three numbers [m] within {FARTHEST:g}, in the camera's frame.")
+    for key, value in values.items():
+        if key != "position" and not 0.0 <= value <= _BRIGHTEST:
+            raise table.error(key, f"is {value:g}, but must be 0 to {_BRIGHTEST:g}.")
+    return Light(**values)
+
+
+def _take_arm(
+    table: TomlTable,
+    rows: Rows,
+    robots: dict[tuple[Path, str | None], Robot],
+    progress: Callable[[str], None] | None,
+) -> ArmInput:
+    name = table.take("name", str)
+    urdf = resolve_robot(table)
+    base_link = table.take("base_link", str, None)
+    if (key := (urdf.resolve(), base_link)) not in robots:
+        robots[key] = Robot.load(urdf, base_link=base_link, progress=progress)
+    robot = robots[key]
+    T_world_base = take_transform(table, "T_world_base", np.eye(4).tolist())
+    columns = take_joints(table, robot)
+    measured, truth = rows.measured_of(table, columns), rows.truth_of(table, columns)
+    table.finish()
+    return ArmInput(Arm(name, robot, T_world_base), columns.measured, measured, truth)
+
+
+def calibrated_sequence_file(
+    path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate", time_offset: float | None = None
+) -> str:
+    """The text of a sequence file like the one at `path`, for another folder and with another calibration.
+
+    What differs between the scenes is written as numbers; everything else, comments included, stays. Paths, which are
+    relative to the file's folder, are changed for the new one; absolute paths stay.
+
+    Args:
+        path: a sequence file that was read without an error.
+        folder: where the new one will lie.
+        before: the scene that `path` describes.
+        after: the same with other base frames, extrinsics or intrinsics.
+        command: the `carts` command that found them, for the heading.
+        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is.
+    """
+    document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
+    source, target = path.parent.resolve(), folder.resolve()
+
+    def moved(value: str) -> str:
+        return value if os.path.isabs(value) else Path(os.path.relpath(source / value, target)).as_posix()
+
+    def move(table: dict[str, Any], *keys: str) -> None:
+        for key in keys:
+            value = table.get(key)
+            if isinstance(value, str):
+                table[key] = moved(value)
+            elif isinstance(value, dict):
+                # Patterns by domain; K as a table of numbers has no text in it.
+                for name, entry in value.items():
+                    value[name] = moved(entry) if isinstance(entry, str) else entry
+
+    move(document["kinematics"], "table", "truth")
+    move(document.get("frames", {}), "table", "video")
+    if time_offset is not None:
+        document["frames"]["time_offset"] = time_offset
+    for table, old, new in zip(document["arms"], before.arms, after.arms, strict=True):
+        move(table, "table", "truth", "T_world_base")
+        if not table["robot"].startswith(SCHEME):
+            move(table, "robot")
+        if not np.array_equal(old.T_world_base, new.T_world_base):
+            table["T_world_base"] = _matrix(new.T_world_base)
+    for table, old, new in zip(document["cameras"], before.cameras, after.cameras, strict=True):
+        move(table, "images", "masks", "background", "size", "K", "distortion", "T_camera_world")
+        if isinstance(table.get("motion"), dict):
+            move(table["motion"], "table")
+        else:
+            move(table, "motion")
+        if not np.array_equal(old.T_camera_world, new.T_camera_world):
+            table["T_camera_world"] = _matrix(new.T_camera_world)
+        if old.intrinsics != new.intrinsics:
+            table["K"] = dict(zip(("fx", "fy", "cx", "cy"), new.intrinsics, strict=True))
+            table["pixel_center"] = HALF_PIXEL
+    heading = f"# What carts {command} found is filled in. Other comments are those of the original file."
+    return f"{heading}\n{tomlkit.dumps(document)}"
+
+
+def _matrix(values: np.ndarray) -> Any:
+    # Adding 0 makes -0.0 a plain zero.
+    return tomlkit.item((np.round(values, 12) + 0.0).tolist()).multiline(True)  # pyright: ignore
