@@ -8,7 +8,7 @@ from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.networks.network import SurfaceNetwork
 from carts_core.networks.weights import read_weights
-from carts_core.optimization import Backgrounds, familiarity
+from carts_core.optimization import Backgrounds, check_domain
 from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import NetworkSegmenter, Segmenter
 from carts_core.settings.optimization import Inference
@@ -105,7 +105,7 @@ class NetworkLoader:
         known = extractor.sha256, domain, *cameras
         if known not in self._unfamiliar:
             scene = scene.with_cameras(cameras)
-            found = familiarity(scene, sequence.frame(index, domain, list(cameras)), extractor)
+            found = check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
             background = Backgrounds.of(sequence, cameras, domain).covers(scene)
             self._unfamiliar[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
         return self._unfamiliar[known]

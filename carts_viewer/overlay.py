@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int
 
-from carts_core.evaluation.metrics import dice, joint_mae_deg
+from carts_core.evaluation.evaluate import dice, joint_mae_deg
 from carts_core.export.dataset import labelled
 from carts_core.model.keypoints import Keypoint
 from carts_core.model.parts import link_classes

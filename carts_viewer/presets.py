@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from carts_core.settings import SurfaceSolver
-from carts_core.settings.presets import reduced
+from carts_core.settings.stages import reduced
 
 
 @dataclass(frozen=True)

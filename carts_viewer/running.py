@@ -25,8 +25,9 @@ from carts_core.optimization import (
 from carts_core.optimization.measurement import Ignore
 from carts_core.project import Provenance, Source
 from carts_core.recording import Sequence as Recording
-from carts_core.settings import Direction, presets
+from carts_core.settings import Direction
 from carts_core.settings.serialization import to_plain
+from carts_core.settings.stages import NONE
 from carts_viewer.active_run import Optimizer
 from carts_viewer.loading import NetworkLoader
 from carts_viewer.observing import NETWORK, Target
@@ -114,7 +115,7 @@ class OptimizerFactory(NetworkLoader):
             domain,
             cameras,
             pose,
-            replace(surface, stages=presets.NONE),
+            replace(surface, stages=NONE),
             FreeParameters(),
             ignore,
             self.predictor(target),

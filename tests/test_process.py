@@ -92,7 +92,7 @@ def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
 UNWRITABLE = """
 import numba.core.caching as caching
 caching.CacheImpl._locator_classes = []  # As where neither the installation nor the home folder can be written to.
-import carts_core.rendering, carts_core.imaging.edges_numba
+import carts_core.rendering, carts_core.optimization.factors.edges
 from carts_core.compiled import compiled
 
 @compiled

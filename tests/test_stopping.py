@@ -169,7 +169,7 @@ time.sleep(600)
 import time
 from collections.abc import Callable
 from pathlib import Path
-from carts_core.batch.pool import Pool
+from carts_core.batch.engines import Pool
 def work(job):
     time.sleep(600)
 if __name__ == "__main__":
@@ -178,7 +178,7 @@ if __name__ == "__main__":
     "cluster": """
 import time
 from pathlib import Path
-from carts_core.batch.cluster import LOCAL, Cluster
+from carts_core.batch.engines import LOCAL, Cluster
 def work(job):
     time.sleep(600)
 if __name__ == "__main__":

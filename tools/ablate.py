@@ -26,8 +26,8 @@ from ablation_variants import AS_IS, VARIANTS, Variant
 from carts_core.evaluation.evaluate import frame_score, start_positions
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer
-from carts_core.optimization.evaluation import Evaluation
 from carts_core.optimization.frame_problem import FrameProblem
+from carts_core.optimization.observability import Evaluation
 from carts_core.optimization.observation import observe
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer

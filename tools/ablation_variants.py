@@ -22,9 +22,9 @@ AS_IS = SurfaceSolver()
 """What variants are compared with."""
 
 _PARTS = {
-    "images": ("imaging.haze.", "optimization.frame_images.", "optimization.counterfactual."),
+    "images": ("imaging.haze.", "optimization.observation.", "optimization.counterfactual."),
     "surface": ("optimization.factors.surface.",),
-    "edges": ("imaging.haze.", "optimization.factors.edges.", "optimization.edge_alignment."),
+    "edges": ("imaging.haze.", "optimization.factors.edges."),
 }
 """Which modules' constants what is shared depends on."""
 
@@ -104,8 +104,8 @@ VARIANTS = (
     Variant("RandomRestart.deviation 1", _at(_RESTART, deviation=1.0)),
     Variant("RandomRestart.if_loss 0.03", _at(_RESTART, if_loss=0.03)),
     Variant("arms are never lost", constants={"optimization.stages.arm_is_lost": lambda *_: False}),
-    Variant("_SUPPORT 0", constants={"optimization.search._SUPPORT": 0.0}),
-    Variant("_LEFT 0", constants={"optimization.search._LEFT": 0.0}),
+    Variant("_SUPPORT 0", constants={"optimization.stages._SUPPORT": 0.0}),
+    Variant("_LEFT 0", constants={"optimization.observation.HAS_LEFT": 0.0}),
     Variant("no AlignEdges between", _without(_EDGES[0])),
     Variant("no AlignEdges at the end", _without(_EDGES[1])),
     Variant("no AlignEdges", _without(*_EDGES)),
@@ -116,7 +116,7 @@ VARIANTS = (
     Variant("no weight for haze", _every(Observe, haze=False)),
     Variant("no weight for haze but at the end", _at(_OBSERVE[2], haze=False)),
     Variant("weight for haze at first, too", _every(Observe, haze=True)),
-    Variant("transmission squared", constants={"optimization.frame_images.certainty": lambda through: through}),
+    Variant("transmission squared", constants={"optimization.observation.certainty": lambda through: through}),
     Variant("no weight for haze at edges", constants={"optimization.factors.edges.certainty": _clear}),
     Variant("dehaze 0", _settings(dehaze=0.0)),
     Variant("dehaze 1", _settings(dehaze=1.0)),
@@ -132,11 +132,9 @@ VARIANTS = (
     Variant("_BLUR 0", constants={"optimization.factors.edges._BLUR": 0.0}),
     Variant("_RENDERED_ANEW off", constants={"optimization.factors.edges._RENDERED_ANEW": math.inf}),
     Variant("_ROBUST of edges off", constants={"optimization.factors.edges._ROBUST": math.inf}),
-    Variant("_STILL 0", constants={"optimization.edge_alignment._STILL": 0.0}),
-    Variant(
-        "longest step of descents off", constants={"optimization.solvers.levenberg_marquardt._LONGEST_STEP": math.inf}
-    ),
-    Variant("damping off", constants={"optimization.solvers.levenberg_marquardt._FIRST_DAMPING": 1e-4}),
+    Variant("_STILL 0", constants={"optimization.factors.edges._STILL": 0.0}),
+    Variant("longest step of descents off", constants={"optimization.solvers._LONGEST_STEP": math.inf}),
+    Variant("damping off", constants={"optimization.solvers._FIRST_DAMPING": 1e-4}),
     Variant("_LEAST transmission 0.1", constants={"imaging.haze._LEAST": 0.1}),
     Variant("haze at full size", constants={"imaging.haze._COARSER": 1}),
     Variant("coarsest comparison 4", constants={"optimization.factors.surface._REDUCTIONS": (1, 2, 4)}),

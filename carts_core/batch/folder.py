@@ -1,20 +1,297 @@
-"""A batch on disk: which jobs it has, and what is known of each."""
+"""The folder of a batch: states of its jobs, their results, and the summary of both."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Rows
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
-from typing import Literal
+from typing import Annotated, Any, Literal
+
+import cv2
+import msgspec
+import numpy as np
 
 from ..errors import SettingsError
-from ..files import OutputPath, check_name, write_text
-from ..files.reading import VALUES, parse_json, read_bytes, typed
-from .findings import FILE as FINDINGS
-from .findings import Findings, read_findings
+from ..export import KinematicsRow, outlined, read_kinematics_csv
+from ..export.kinematics import joint_columns, joint_units, position_values, std_values
+from ..files import BusyError, OutputPath, check_name, holds_file, locked_folder, set_aside, write_bytes, write_text
+from ..files.reading import IMAGE, VALUES, parse_json, read_bytes, typed
+from ..recording import Sequence
 from .manifest import STEPS, Job, Step
-from .state import JobState, present_status
 
-FILE = "batch.json"
+JOB_FILE = "job.json"
+_JOB_FORMAT: Literal["carts-job/1"] = "carts-job/1"
+HEARTBEAT_SECONDS = 10.0
+"""A running job says so this often."""
+
+Status = Literal["waiting", "running", "done", "failed", "stopped"]
+
+
+@dataclass(frozen=True)
+class StepState:
+    """What is known of a step."""
+
+    key: str
+    """Of what it is made from; a step of another key is taken again."""
+    seconds: float
+    """It took so long [s]."""
+
+
+@dataclass(frozen=True)
+class JobState:
+    """What is known of a job."""
+
+    status: Status = "waiting"
+    steps: Mapping[str, StepState] = field(default_factory=dict)
+    """Those that are done."""
+    attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """How often it was begun since it was last done or failed; more than once where a worker was lost."""
+    error: str = ""
+    """Why it failed."""
+    worker: str = ""
+    """Machine and process that ran it last."""
+    heartbeat: float = 0.0
+    """When it was last known to run [s since 1970]."""
+
+
+@dataclass(frozen=True)
+class _WrittenState(JobState):
+    """Content of the file."""
+
+    format: Literal["carts-job/1"] = _JOB_FORMAT
+
+
+def read_state(folder: OutputPath) -> JobState:
+    """What is known of the job of a folder; where its file is damaged, that it has failed by that."""
+    try:
+        return _read(folder)
+    except (OSError, ValueError) as error:
+        remedy = "Run the batch again: the job begins anew, and the damaged file is kept."
+        return JobState("failed", error=f"{JOB_FILE} cannot be read: {error}. {remedy}")
+
+
+def _read(folder: OutputPath) -> JobState:
+    """What is known of a job.
+
+    Raises:
+        OSError, ValueError: the file is damaged.
+    """
+    path = folder / JOB_FILE
+    if not holds_file(path):
+        return JobState()
+    values = vars(typed(parse_json(read_bytes(path.path, VALUES)), _WrittenState))
+    return JobState(**{name: value for name, value in values.items() if name != "format"})
+
+
+def write_state(folder: OutputPath, state: JobState) -> None:
+    """Replace what is known of a job."""
+    write_text(folder / JOB_FILE, json.dumps({"format": _JOB_FORMAT, **asdict(state)}, indent=1))
+
+
+def present_status(folder: OutputPath) -> tuple[str, JobState]:
+    """The status of a job, `lost` where it should be running and nobody holds it, and all that is known of it."""
+    state = read_state(folder)
+    if state.status == "running":
+        with suppress(BusyError), locked_folder(folder):
+            return "lost", state
+    return state.status, state
+
+
+class RunningJob:
+    """A job that this process runs; its state on disk, with a heartbeat.
+
+    Attributes:
+        state: what is known of it.
+    """
+
+    def __init__(self, folder: OutputPath) -> None:
+        self._folder, self._changing = folder, threading.Lock()
+        try:
+            self.state = _read(folder)
+        except (OSError, ValueError):
+            set_aside(folder / JOB_FILE)
+            self.state = JobState()
+
+    def change(self, **values: object) -> None:
+        """Change what is known."""
+        with self._changing:
+            self.state = replace(self.state, heartbeat=time.time(), **values)  # pyright: ignore[reportArgumentType]
+            write_state(self._folder, self.state)
+
+    def step_done(self, name: str, step: StepState) -> None:
+        """A step was taken."""
+        self.change(steps={**self.state.steps, name: step})
+
+
+@contextmanager
+def running(folder: OutputPath) -> Iterator[RunningJob | None]:
+    """Hold a job and keep its heartbeat while the block runs; None where another process runs it."""
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked_folder(folder))
+        except BusyError:
+            yield None
+            return
+        job, ended = RunningJob(folder), threading.Event()
+        job.change(status="running", error="", attempts=job.state.attempts + 1, worker=this_worker())
+
+        def beat() -> None:
+            while not ended.wait(HEARTBEAT_SECONDS):
+                job.change()
+
+        thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield job
+        finally:
+            ended.set()
+            thread.join()
+
+
+def this_worker() -> str:
+    """Machine and process, for people."""
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+FINDINGS_FILE = "findings.json"
+_FINDINGS_FORMAT: Literal["carts-findings/1"] = "carts-findings/1"
+_WORST = 3
+"""Frames of a job that are shown."""
+_WIDTH = 480
+"""Of their pictures, at most [px]."""
+
+
+@dataclass(frozen=True)
+class FrameFinding:
+    """The verdict on a frame."""
+
+    camera: str
+    frame: str
+    verdict: str
+    """`good`, `doubtful` or `failed`."""
+    reason: str
+    probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
+    """That its mask is wrong [1]."""
+    picture: str = ""
+    """File in the job's folder; empty for frames that are not among the worst."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a job found."""
+
+    recording: str
+    frames: list[FrameFinding] = field(default_factory=list)
+    corrections: dict[str, list[float]] = field(default_factory=dict)
+    """`ARM.JOINT` -> corrected minus measured, of each frame [deg, mm]."""
+    deviations: dict[str, list[float]] = field(default_factory=dict)
+    """`ARM.JOINT` -> reported standard deviation, of each frame that has one [deg, mm]."""
+    base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
+    """`ARM in CAMERA` -> T_camera_base, calibrated where that was asked for [4 x 4, m]."""
+
+
+@dataclass(frozen=True)
+class _WrittenFindings(Findings):
+    """Content of the file."""
+
+    format: Literal["carts-findings/1"] = _FINDINGS_FORMAT
+
+
+def read_findings(folder: OutputPath) -> Findings | None:
+    """What the job of a folder found; None before it has ended.
+
+    Raises:
+        OSError, ValueError: the file is damaged.
+    """
+    path = folder / FINDINGS_FILE
+    if not holds_file(path):
+        return None
+    found = typed(parse_json(read_bytes(path.path, VALUES)), _WrittenFindings)
+    if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
+        raise ValueError("a base frame is no 4 x 4 matrix")
+    return found
+
+
+def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
+    """Write `findings.json`, and pictures of the worst frames.
+
+    Args:
+        job: that is done.
+        folder: of the job.
+        sequence_file: with the calibration that its last steps used.
+    """
+    sequence = Sequence.open(sequence_file)
+    scene, found = sequence.scene, Findings(str(job.recording))
+    for arm in scene.arms:
+        for camera in scene.cameras:
+            T_mount_world = sequence.mounts(0).get(camera.name)
+            moved = np.eye(4) if T_mount_world is None else T_mount_world
+            seen_in = camera.name if T_mount_world is None else f"the first frame of {camera.name}"
+            found.base_frames[f"{arm.name} in {seen_in}"] = (camera.T_camera_world @ moved @ arm.T_world_base).tolist()
+    steps = [step for step in ("sequence", "optimize") if step in job.steps]
+    parts = sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
+    for table in parts:
+        rows = read_kinematics_csv(table, scene)
+        _add_corrections(found, sequence, rows)
+        cameras = table.parent.name
+        records = _records(table.parent / "results.json")
+        frames = [
+            FrameFinding(cameras, row.frame_id, record["verdict"], record["reason"], record["probability"])
+            for row in rows
+            if (record := records.get(row.frame_id)) and record.get("verdict")
+        ]
+        found.frames.extend(_pictured(folder, sequence, table.parent, frames))
+    write_text(folder / FINDINGS_FILE, json.dumps({"format": _FINDINGS_FORMAT, **asdict(found)}))
+
+
+def _add_corrections(found: Findings, sequence: Sequence, rows: list[KinematicsRow]) -> None:
+    scene = sequence.scene
+    order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+    units = [np.rad2deg(1.0) if unit == "rad" else 1000.0 for unit in joint_units(scene)]
+    for row in rows:
+        index = order[row.frame_id]
+        measured = np.concatenate([sequence.measured[arm.name][index] for arm in scene.arms])
+        change, deviation = position_values(scene, row) - measured, std_values(scene, row)
+        for name, unit, moved, std in zip(joint_columns(scene), units, change, deviation, strict=True):
+            found.corrections.setdefault(name, []).append(round(float(moved * unit), 6))
+            if np.isfinite(std):
+                found.deviations.setdefault(name, []).append(round(float(std * unit), 6))
+
+
+def _records(path: Path) -> Mapping[str, Mapping[str, Any]]:
+    try:
+        return parse_json(read_bytes(path, VALUES))["frames"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:
+    """The frames, the worst with pictures: the image with the mask's outline."""
+    worst = sorted(frames, key=lambda frame: -frame.probability)[:_WORST]
+    domain, first = part.parent.name, part.name.split("+")[0]
+    masks = part / "masks" / first if "+" in part.name else part / "masks"
+    for frame in frames:
+        if frame not in worst:
+            yield frame
+            continue
+        index = list(sequence.frame_ids).index(frame.frame)
+        image = sequence.frame(index, domain, [first]).images[first]
+        mask = cv2.imdecode(np.frombuffer(read_bytes(masks / f"{frame.frame}.png", IMAGE), np.uint8), 0)
+        assert mask is not None
+        shown = outlined(image, mask > 0)
+        scale = min(1.0, _WIDTH / shown.shape[1])
+        small = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        name = f"worst-{part.name}-{frame.frame}.jpg"
+        write_bytes(folder / name, cv2.imencode(".jpg", small[..., ::-1])[1].tobytes())
+        yield FrameFinding(**{**asdict(frame), "picture": name})
+
+
+BATCH_FILE = "batch.json"
 _LONGEST_ERROR = 1000
 """Characters."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
@@ -40,7 +317,7 @@ class KnownJob:
         return lines[-1][:_LONGEST_ERROR] if lines else self.damage
 
 
-def known_jobs(batch: OutputPath, jobs: Sequence[Job]) -> list[KnownJob]:
+def known_jobs(batch: OutputPath, jobs: Rows[Job]) -> list[KnownJob]:
     """What is known of jobs, in their order."""
     return [_known(batch / "jobs" / job.name, job) for job in jobs]
 
@@ -52,11 +329,11 @@ def _known(folder: OutputPath, job: Job) -> KnownJob:
     try:
         return KnownJob(job, status, state, read_findings(folder))
     except (OSError, ValueError) as error:
-        damage = f"{FINDINGS} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to make it anew."
+        damage = f"{FINDINGS_FILE} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to make it anew."
         return KnownJob(job, status, state, None, damage)
 
 
-def most_urgent_first(known: Sequence[KnownJob]) -> list[KnownJob]:
+def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
     """Failures first, what is done last."""
     return sorted(known, key=lambda entry: ORDER.index(entry.status))
 
@@ -80,15 +357,15 @@ class _Batch:
     jobs: list[_Row]
 
 
-def write_jobs(batch: OutputPath, jobs: Sequence[Job]) -> None:
+def write_jobs(batch: OutputPath, jobs: Rows[Job]) -> None:
     """Write which jobs a batch has, so that it can be looked at without its manifest."""
     rows = [_Row(job.name, str(job.recording.resolve()), job.camera, job.domain, job.steps) for job in jobs]
-    write_text(batch / FILE, json.dumps(asdict(_Batch("carts-batch-jobs/1", rows)), indent=1))
+    write_text(batch / BATCH_FILE, json.dumps(asdict(_Batch("carts-batch-jobs/1", rows)), indent=1))
 
 
 def is_batch(folder: Path) -> bool:
     """Whether a folder is that of a batch."""
-    return (folder / FILE).is_file()
+    return (folder / BATCH_FILE).is_file()
 
 
 def read_jobs(folder: Path) -> list[Job]:
@@ -98,7 +375,7 @@ def read_jobs(folder: Path) -> list[Job]:
         SettingsError: it is no batch, or its list of jobs is damaged.
     """
     try:
-        content = typed(parse_json(read_bytes(folder / FILE, VALUES)), _Batch)
+        content = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch)
         jobs = [_job(row) for row in content.jobs]
         for job in jobs:
             check_name(job.name, f"a job of {folder}")

@@ -16,8 +16,7 @@ from ..evaluation.calibration import pose_distance
 from ..files import OutputPath, output_stream, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
 from ..html import STYLE, Cell, Table, anchor, figure_html, section_html, table_html
-from .findings import FrameFinding
-from .folder import ORDER, KnownJob, known_jobs, most_urgent_first
+from .folder import ORDER, FrameFinding, KnownJob, known_jobs, most_urgent_first
 from .manifest import Job
 
 matplotlib.use("Agg")

@@ -88,7 +88,7 @@ class Batch:
         """Do jobs; name and error of each that failed."""
         import os
 
-        from ..batch.pool import Pool
+        from ..batch.engines import Pool
         from ..imports import needs_extra
         from .batch_job import BatchWork, with_project
 
@@ -100,7 +100,7 @@ class Batch:
             engine = Pool(work, min(workers, len(jobs)), self.threads)
         else:
             needs_extra("distributed", "cluster")
-            from ..batch.cluster import Cluster
+            from ..batch.engines import Cluster
 
             engine = Cluster(work, self.scheduler, min(workers, len(jobs)), self.threads)
         if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):

@@ -11,11 +11,9 @@ from typing import Any, Literal
 
 import tyro
 
-from ..batch.engine import Outcome
-from ..batch.findings import FILE as FINDINGS
-from ..batch.findings import read_findings, write_findings
+from ..batch.engines import Outcome
+from ..batch.folder import FINDINGS_FILE, RunningJob, StepState, read_findings, running, write_findings
 from ..batch.manifest import Job, Step
-from ..batch.state import RunningJob, StepState, running
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, remove_file, set_aside, write_text
@@ -141,7 +139,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
             # They are of what was there before; whoever is killed from here on makes them when the job goes on.
-            remove_file(folder / FINDINGS)
+            remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
             state.step_done(step, StepState(key, round(time.perf_counter() - began, 3)))
@@ -158,7 +156,7 @@ def _has_findings(folder: OutputPath) -> bool:
     try:
         return read_findings(folder) is not None
     except (OSError, ValueError):
-        set_aside(folder / FINDINGS)
+        set_aside(folder / FINDINGS_FILE)
         return False
 
 

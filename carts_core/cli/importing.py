@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from ..console import Terminal
-from ..settings.importing import ImportOptions
+from ..settings.interchange import ImportOptions
 from .options import SequencePath
 
 if TYPE_CHECKING:

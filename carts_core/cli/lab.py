@@ -11,7 +11,7 @@ from ..console import Bar, Terminal
 from ..errors import CartsError, SettingsError
 from ..files import output_path
 from ..settings import SynthesisConfig, TrainingConfig
-from ..settings.baseline import BaselineNetwork, BaselineTraining
+from ..settings.training import BaselineNetwork, BaselineTraining
 from ..stopping import when_stopped
 from ..wording import counted
 from .options import Network, check_device, output_folder

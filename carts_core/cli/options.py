@@ -534,10 +534,10 @@ class Observer:
                 f"cameras that look together ({', '.join(cameras)}) are left to the network there, masks or not. "
                 "Leave that camera out with --camera, or give it masks."
             ]
-        from ..optimization import familiarity
+        from ..optimization import check_domain
 
         frame = sequence.frame(index, domain, cameras)
-        found = familiarity(sequence.scene.with_cameras(cameras), frame, self.predictor)
+        found = check_domain(sequence.scene.with_cameras(cameras), frame, self.predictor)
         return found.warnings(", ".join(cameras), background=background)
 
 

@@ -48,7 +48,6 @@ _CODE = (
     "model/**/*.py",
     "recording/*.py",
     "evaluation/evaluate.py",
-    "evaluation/sequence.py",
     "export/kinematics.py",
     "export/encodings.py",
     "networks/**/*.py",

@@ -1,15 +1,17 @@
-"""Optimize frames whose masks or true kinematics are known, and say how well it went."""
+"""Metrics of masks and joint positions, and evaluations of frames and sequences against the truth."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Names
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ..model.perturbation import perturb
-from ..model.scene import SceneState
+from ..model.scene import Arm, Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..optimization import (
     Assessment,
@@ -17,13 +19,87 @@ from ..optimization import (
     FrameOptimizer,
     FreeParameters,
     GivenMasks,
+    SequenceOptimizer,
+    SequenceSettings,
     SolverSettings,
     SurfacePredictor,
     undetermined_joints,
 )
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
-from .metrics import dice, joint_mae_deg, joint_std_deg
+
+
+def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Dice score of two masks, 0 to 1; two empty masks agree."""
+    total = int(a.sum()) + int(b.sum())
+    return 1.0 if total == 0 else 2.0 * int((a & b).sum()) / total
+
+
+def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"], tolerance: float) -> float:
+    """Share of both masks' outlines that lies within `tolerance` [px] of the other's outline, 0 to 1 (NSD).
+
+    An outline is the mask's pixels that have a neighbour (left, right, above, below) outside the mask. The image's
+    border is no outline: there the mask is cut off, not ended. Two masks without outline agree if they are equal.
+    """
+    outlines = [_outline(mask) for mask in (a, b)]
+    total = sum(int(outline.sum()) for outline in outlines)
+    if total == 0:
+        return float(np.array_equal(a, b))
+    if not all(outline.any() for outline in outlines):
+        return 0.0
+    near = 0
+    for outline, other in (outlines, reversed(outlines)):
+        distance = cv2.distanceTransform((~other).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        near += int((distance[outline] <= tolerance + 1e-4).sum())
+    return near / total
+
+
+def _outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    # OpenCV erodes as if the mask went on beyond the image.
+    return mask & (cv2.erode(mask.astype(np.uint8), cross) == 0)
+
+
+def joint_mae_deg(
+    scene: Scene,
+    estimate: Mapping[str, Float[np.ndarray, " dofs"]],
+    truth: Mapping[str, Float[np.ndarray, " dofs"]],
+    joints: Mapping[str, tuple[str, ...]],
+) -> float | None:
+    """Mean absolute error [deg] of the named revolute joints over all arms; None where nothing can be compared.
+
+    Args:
+        scene: whose arms these are.
+        estimate, truth: arm name -> joint positions [rad, m].
+        joints: arm name -> joints that count.
+    """
+    errors = []
+    for arm in scene.arms:
+        if arm.name in truth:
+            difference = np.abs(np.asarray(estimate[arm.name]) - np.asarray(truth[arm.name]))
+            errors += _revolute(arm, difference, joints)
+    return float(np.rad2deg(np.mean(errors))) if errors else None
+
+
+def joint_std_deg(
+    scene: Scene, joint_std: Mapping[str, Float[np.ndarray, " dofs"]], joints: Mapping[str, tuple[str, ...]]
+) -> float | None:
+    """Mean standard deviation [deg] of the named revolute joints over all arms; None where none is known.
+
+    Args:
+        scene: whose arms these are.
+        joint_std: arm name -> standard deviations [rad, m]; NaN ones do not count.
+        joints: arm name -> joints that count.
+    """
+    values = [
+        value for arm in scene.arms for value in _revolute(arm, joint_std[arm.name], joints) if np.isfinite(value)
+    ]
+    return float(np.rad2deg(np.mean(values))) if values else None
+
+
+def _revolute(arm: Arm, values: Float[np.ndarray, " dofs"], joints: Mapping[str, tuple[str, ...]]) -> list[float]:
+    named = zip(arm.robot.joint_names, arm.robot.joint_types, values, strict=True)
+    return [float(v) for name, kind, v in named if kind == "revolute" and name in joints.get(arm.name, ())]
 
 
 @dataclass(frozen=True)
@@ -221,3 +297,83 @@ def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
 def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
     """What `carts evaluate --json` writes."""
     return {"frames": [asdict(score) for score in scores], "mean": mean_score(scores)}
+
+
+def evaluate_sequence(
+    sequence: Sequence,
+    networks: FeatureExtractor | SurfacePredictor,
+    *,
+    frames: Names[int],
+    cameras: Names[str],
+    domains: Names[str],
+    settings: SolverSettings,
+    model: SequenceSettings,
+    free: FreeParameters,
+    perturb_deg: float = 0.0,
+    seed: int = 0,
+    together: bool = False,
+    given: GivenMasks | None = None,
+) -> Iterator[FrameScore]:
+    """As `evaluate`, but the frames of a camera (or all) and domain inform each other; see `SequenceOptimizer`.
+
+    A perturbation is the same in all frames, as an error of calibration is.
+    """
+    groups = camera_groups(cameras, together)
+    for domain in domains:
+        for group in groups:
+            scene = sequence.scene.with_cameras(group)
+            renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
+            starts = Starts(sequence, domain, group, perturb_deg, seed)
+            optimizer = SequenceOptimizer(
+                scene,
+                starts.frame,
+                starts.times(frames),
+                networks,
+                settings=settings,
+                model=model,
+                free=free,
+                ignore=None if given is None else given.ignored,
+                backgrounds=Backgrounds.of(sequence, group, domain),
+            )
+            for _ in optimizer:
+                pass
+            for index, estimate in sorted(optimizer.estimates.items()):
+                frame = starts.frame(index)
+                frame = frame if given is None else given.filled(frame)
+                for camera, renderer in renderers.items():
+                    yield frame_score(
+                        sequence,
+                        frame,
+                        camera,
+                        renderer,
+                        frame.measured,
+                        estimate.state,
+                        estimate.joint_positions,
+                        estimate.joint_std,
+                        estimate.iterations,
+                        estimate.seconds / len(group),
+                        estimate.start,
+                        assessment=estimate.assessment,
+                    )
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Frames of cameras in a domain as sequence mode takes them: what is called measured is where it starts."""
+
+    sequence: Sequence
+    domain: str
+    cameras: tuple[str, ...]
+    perturb_deg: float
+    seed: int
+    """Of the perturbation, which is the same in all frames."""
+
+    def frame(self, index: int) -> Frame:
+        """The frame at a position of the sequence."""
+        frame = self.sequence.frame(index, self.domain, self.cameras)
+        return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, (self.seed,)))
+
+    def times(self, frames: Names[int]) -> dict[int, float | None]:
+        """Position -> time of chosen frames [s]."""
+        stamps = self.sequence.timestamps
+        return {index: None if stamps is None else float(stamps[index]) for index in frames}

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from ..optimization.inputs import smoothed
-from ..optimization.losses import attention
+from .working_image import attention, smoothed
 
 _REACH = 1 / 32
 """How far away the darkest pixel may be, and deviation by which the haze is smoothed [image widths]."""

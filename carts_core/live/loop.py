@@ -9,10 +9,8 @@ import numpy as np
 
 from ..model.scene import Scene
 from ..rendering import Renderer
-from .estimate import LiveEstimate, LiveVerdict
-from .messages import ResultMessage, encoded_masks
-from .moments import Moment, Newest, Source
-from .tracker import LiveTracker
+from .messages import Moment, Newest, ResultMessage, Source, encoded_masks
+from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
 _RECENT = 20
 """Frames that tell how long the next one will take."""

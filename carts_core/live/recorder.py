@@ -19,9 +19,9 @@ from ..model.scene import Scene
 from ..project import Edits, FitVerdict, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
 from ..recording.matching import ORIENTATION, POSITION
-from .estimate import LiveVerdict
 from .loop import Tracked
-from .moments import mounts_of
+from .messages import mounts_of
+from .tracker import LiveVerdict
 
 _WAITING = 32
 """Frames that wait for the disk; further ones are not recorded."""

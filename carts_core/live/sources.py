@@ -1,10 +1,13 @@
-"""Replays, cameras, and folders that fill, as sources of a live stream."""
+"""Sources of live streams: cameras, recordings, and a network server."""
 
 import logging
+import queue
+import socket
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,8 +18,161 @@ from ..errors import SequenceError, SettingsError
 from ..files.reading import VALUES, read_bytes
 from ..recording import Sequence
 from ..recording.images import read_image
-from .messages import FrameMessage, ImageMessage, StreamError
-from .moments import Assembler, Moment
+from ..settings.live import StreamAddress, StreamKind
+from .messages import (
+    Assembler,
+    ErrorMessage,
+    FrameMessage,
+    ImageMessage,
+    Moment,
+    ResultMessage,
+    Source,
+    StreamError,
+    packed,
+    receive,
+)
+
+HOST = "127.0.0.1"
+_WAITING = 8
+"""Results that wait for a slow client; older ones are dropped."""
+_CLIENTS = 16
+_SILENCE = 10.0
+"""Since a client's last message, after which it makes room for another client where all places are taken [s]."""
+_LINGER = 1.0
+"""For which a sender still gets results when it has ended its side [s]."""
+
+
+class _Client:
+    """One connection: what it is to be sent, and when it last sent a message [s]."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.Queue[bytes | None] = queue.Queue(_WAITING)
+        self.heard = time.monotonic()
+        self.sends = False
+
+
+class StreamServer:
+    """Listens on 127.0.0.1; a source of frames, and where results go.
+
+    Args:
+        assembler: makes frames of messages.
+        port: 0 takes a free one.
+
+    Attributes:
+        port: where it listens.
+
+    Raises:
+        SettingsError: the port is taken.
+    """
+
+    def __init__(self, assembler: Assembler, port: int) -> None:
+        self._assembler = assembler
+        self._moments: queue.Queue[Moment | None] = queue.Queue(2)
+        self._clients: dict[socket.socket, _Client] = {}
+        self._changing, self._closed = threading.Lock(), threading.Event()
+        try:
+            self._listener = socket.create_server((HOST, port))
+        except OSError as error:
+            raise SettingsError(f"port {port} of {HOST} cannot be used: {error}. Give another, or 0.") from error
+        self.port: int = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, name="carts-live-accept", daemon=True).start()
+
+    def __iter__(self) -> Iterator[Moment]:
+        """See `Source`; the stream ends with `close` only."""
+        while (moment := self._moments.get()) is not None:
+            yield moment
+
+    def send(self, result: ResultMessage) -> None:
+        """Hand a result to every client; who reads too slowly misses some."""
+        content = packed(result)
+        with self._changing:
+            for client in self._clients.values():
+                _put_newest(client.waiting, content)
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._closed.set()
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        with self._changing:
+            for client in self._clients.values():
+                _put_newest(client.waiting, None)
+        _put_newest(self._moments, None)
+
+    def _accept(self) -> None:
+        while not self._closed.is_set():
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            client = _Client()
+            with self._changing:
+                full = not self._has_room()
+                if not full:
+                    self._clients[connection] = client
+            if full:
+                _refuse(connection)
+                continue
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            threading.Thread(target=self._read, args=(connection, client), daemon=True).start()
+            threading.Thread(target=self._write, args=(connection, client), daemon=True).start()
+
+    def _has_room(self) -> bool:
+        """Whether one more client can be taken, if need be in place of the one that has been silent for longest."""
+        if len(self._clients) < _CLIENTS:
+            return True
+        connection, longest = min(self._clients.items(), key=lambda each: each[1].heard)
+        if time.monotonic() - longest.heard < _SILENCE:
+            return False
+        self._clients.pop(connection)
+        with suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        _put_newest(longest.waiting, None)
+        return True
+
+    def _read(self, connection: socket.socket, client: _Client) -> None:
+        try:
+            while (message := receive(connection)) is not None and not self._closed.is_set():
+                client.heard, client.sends = time.monotonic(), True
+                moment = self._assembler.moment(message)
+                if moment is not None:
+                    _put_newest(self._moments, moment)
+            if client.sends:
+                self._closed.wait(_LINGER)
+        except StreamError as error:
+            _put_newest(client.waiting, packed(ErrorMessage(str(error))))
+        except OSError:
+            pass
+        _put_newest(client.waiting, None)
+
+    def _write(self, connection: socket.socket, client: _Client) -> None:
+        with suppress(OSError):
+            while (content := client.waiting.get()) is not None:
+                connection.sendall(content)
+        with self._changing:
+            self._clients.pop(connection, None)
+        with suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        connection.close()
+
+
+def _refuse(connection: socket.socket) -> None:
+    """Close a connection for which there is no place."""
+    with connection, suppress(OSError):
+        connection.sendall(packed(ErrorMessage(f"{_CLIENTS} clients are connected. Close one, or try again.")))
+
+
+def _put_newest(waiting: queue.Queue, item: object) -> None:
+    """Put something in, in place of the oldest where there is no room."""
+    while True:
+        try:
+            waiting.put_nowait(item)
+            return
+        except queue.Full:
+            with suppress(queue.Empty):
+                waiting.get_nowait()
+
 
 _log = logging.getLogger(__name__)
 
@@ -189,3 +345,66 @@ class Folder:
         except SequenceError as error:
             raise StreamError(str(error)) from error
         return ImageMessage(image.tobytes(), "rgb8", image.shape[1], image.shape[0])
+
+
+@dataclass(frozen=True)
+class OpenStream:
+    """A source, and a server where there is one, which is closed with it."""
+
+    source: Source
+    server: StreamServer | None = None
+
+    @property
+    def clients(self) -> list[Callable[[ResultMessage], None]]:
+        """Where results go besides."""
+        return [] if self.server is None else [self.server.send]
+
+    def close(self) -> None:
+        """End it; more than once does no harm."""
+        self.source.close()
+        if self.server is not None:
+            self.server.close()
+
+
+def open_stream(
+    address: StreamAddress,
+    sequence: Sequence,
+    cameras: tuple[str, ...],
+    domain: str,
+    *,
+    rate: float | None = None,
+    loops: int = 1,
+) -> OpenStream:
+    """Open a stream of a sequence's arms and cameras.
+
+    Args:
+        address: where frames come from.
+        sequence: whose arms and cameras these are.
+        cameras: that every frame needs an image of; a device gives the first one's.
+        domain: of a replay.
+        rate: of a replay [1/s]; None: as recorded.
+        loops: how often a replay is shown.
+
+    Raises:
+        SettingsError: a device, a folder or a port cannot be used, or a replay has no times.
+    """
+    if address.kind is StreamKind.REPLAY:
+        return OpenStream(Replay(sequence, cameras, domain, rate=rate, loops=loops))
+    assembler = Assembler(sequence, cameras)
+    port = int(address.place) if address.kind is StreamKind.SOCKET else address.joints_port
+    with ExitStack() as held:
+        server = None if port is None else StreamServer(assembler, port)
+        if server is not None:
+            held.callback(server.close)
+        match address.kind:
+            case StreamKind.SOCKET:
+                assert server is not None
+                source: Source = server
+            case StreamKind.FOLDER:
+                source = Folder(assembler, cameras, Path(address.place))
+            case StreamKind.CAMERA:
+                source = Camera(assembler, cameras[0], int(address.place))
+            case _:
+                source = Camera(assembler, cameras[0], address.place)
+        held.pop_all()
+    return OpenStream(source, server)

@@ -1,4 +1,4 @@
-"""Follows arms through a stream, forwards only: the filter of sequence mode, with as little work a frame as will do."""
+"""Tracker of arms in a stream, and its estimates."""
 
 import math
 import statistics
@@ -8,11 +8,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
-from ..model.scene import Scene
+from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..optimization.counterfactual import Backgrounds
 from ..optimization.error_model import ErrorModel, Gaussian, combined
@@ -25,9 +27,67 @@ from ..recording import Frame
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.live import LiveSettings
 from ..settings.stages import Stage
-from .estimate import Effort, LiveEstimate, LiveVerdict
-from .moments import mounts_of
-from .resemblance import CHANGED, Picture, change, small_picture
+from .messages import mounts_of
+
+
+class LiveVerdict(StrEnum):
+    """How far an estimate can be relied on."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    """The image does not fit for the moment: what is shown is what the frames before let expect."""
+    LOST = "lost"
+    """Nothing is known but the measured values and what they were off by when the arms were last seen."""
+
+
+class Effort(StrEnum):
+    """What was done with a frame."""
+
+    SMALL = "small"
+    FULL = "full"
+    SEARCH = "search"
+
+
+@dataclass(frozen=True)
+class LiveEstimate:
+    """One frame, in the light of those before it."""
+
+    frame_id: str
+    time: float
+    """When it was taken [s]."""
+    verdict: LiveVerdict
+    effort: Effort
+    loss: float
+    """Of the surface factor [1]."""
+    state: SceneState
+    joint_positions: Mapping[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> [rad, m]."""
+    joint_std: Mapping[str, Float[np.ndarray, " dofs"]]
+    """Arm name -> standard deviation [rad, m]; NaN where a joint is not free."""
+    seconds: float
+    """Spent on it [s]."""
+
+
+CHANGED = 0.5
+"""Change of small pictures from which they show something else: they correlate by less than a half [1]."""
+_SIZE = (32, 24)
+"""Width and height of small pictures [px]."""
+
+Picture = Float[np.ndarray, "cameras pixels"]
+
+
+def small_picture(frame: Frame) -> Picture:
+    """The images, small and gray, each without its mean."""
+    small = [cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA) for image in frame.images.values()]
+    pixels = np.stack([image.reshape(_SIZE[0] * _SIZE[1], -1).mean(axis=1) for image in small]).astype(float)
+    return pixels - pixels.mean(axis=1, keepdims=True)
+
+
+def change(before: Picture, now: Picture) -> float:
+    """How much pictures have changed, in the camera where they did most [1]: 0.7 where they have nothing in common."""
+    sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
+    return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
+
 
 _REMEMBERED = 60
 """Good fits whose losses tell what is usual."""

@@ -7,7 +7,6 @@ from ..settings import FreeParameters as FreeParameters
 from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
-from .base_frame_gain import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
@@ -16,28 +15,29 @@ from .counterfactual import Backgrounds as Backgrounds
 from .evidence import Evidence as Evidence
 from .factors import Factor as Factor
 from .factors import Linearization as Linearization
-from .familiarity import Familiarity as Familiarity
-from .familiarity import familiarity as familiarity
-from .fit import StopReason as StopReason
+from .frame import BASE_FRAME_GAIN as BASE_FRAME_GAIN
 from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
-from .ignore import propose_ignore as propose_ignore
-from .masks import GivenMasks as GivenMasks
-from .masks import MaskPredictor as MaskPredictor
+from .frame_problem import propose_ignore as propose_ignore
+from .measurement import sequence_checkpoint as sequence_checkpoint
 from .observability import fit_words as fit_words
 from .observability import undetermined_joints as undetermined_joints
 from .predictor import FramePredictor as FramePredictor
+from .predictor import GivenMasks as GivenMasks
 from .predictor import ImagePredictor as ImagePredictor
+from .predictor import MaskPredictor as MaskPredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
-from .resumable import sequence_checkpoint as sequence_checkpoint
 from .sequence import SequenceOptimizer as SequenceOptimizer
 from .sequence_estimate import FrameEstimate as FrameEstimate
 from .sequence_estimate import Origin as Origin
+from .stages import StopReason as StopReason
 from .verdict import Assessment as Assessment
+from .verdict import DomainCheck as DomainCheck
+from .verdict import SequenceAssessment as SequenceAssessment
 from .verdict import Verdict as Verdict
-from .verdict_of_many import SequenceAssessment as SequenceAssessment
+from .verdict import check_domain as check_domain
 
 __all__ = [
     "BASE_FRAME_GAIN",
@@ -49,9 +49,9 @@ __all__ = [
     "CalibrationOptimizer",
     "CalibrationResult",
     "DescentSolver",
+    "DomainCheck",
     "Evidence",
     "Factor",
-    "Familiarity",
     "FrameEstimate",
     "FrameOptimizer",
     "FramePredictor",
@@ -73,7 +73,7 @@ __all__ = [
     "SurfaceSolver",
     "UnknownChange",
     "Verdict",
-    "familiarity",
+    "check_domain",
     "fit_words",
     "propose_ignore",
     "undetermined_joints",

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: base frames and cameras that many frames share, one iterate at a time."""
+"""Calibration: base frames and cameras from many frames at once."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ from scipy.special import ndtr, stdtrit
 
 from ..errors import SettingsError
 from ..model.keypoints import link_transforms
-from ..model.scene import Scene
+from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..recording.background import spread
@@ -26,18 +26,53 @@ from ..settings import (
     surface_solver,
 )
 from ..settings.stages import Descend
-from .calibrated_scene import calibrated_scene
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .counterfactual import Backgrounds
-from .familiarity import familiarity
-from .fit import Fit, Point, StopReason
 from .frame import Progress
 from .hand_eye.result import PoseDeviation
 from .predictor import SurfacePredictor, predictor_of
-from .stages import run_stages
-from .variables import APART
-from .verdict import Assessment, Verdict
-from .verdict_of_many import assess_calibration, without_knowledge, worse_in
+from .stages import Fit, Point, StopReason, run_stages
+from .variables import APART, Variables
+from .verdict import Assessment, Verdict, assess_calibration, check_domain, without_knowledge, worse_in
+
+
+def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: torch.Tensor) -> Scene:
+    """A scene with the calibration of its calibrated part; what did not move keeps its exact value.
+
+    Args:
+        whole: the scene.
+        part: the same arms with the cameras that take part.
+        variables: the unknowns of `part`.
+        offsets: where they are now, from their start.
+    """
+    start, state = variables.start, variables.state(offsets)
+    arms = tuple(
+        replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
+        for index, arm in enumerate(whole.arms)
+    )
+    indices = {camera.name: index for index, camera in enumerate(part.cameras)}
+    cameras = []
+    for camera in whole.cameras:
+        if (index := indices.get(camera.name)) is not None:
+            T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
+            before, after = start.intrinsics[index], state.intrinsics[index]
+            fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
+            cameras.append(replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy)))
+        else:
+            cameras.append(camera)
+    return replace(whole, arms=arms, cameras=tuple(cameras))
+
+
+def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
+    before, after = getattr(start, name)[index], getattr(state, name)[index]
+    if torch.equal(before, after):
+        return given
+    import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second
+
+    result = after.cpu().double()
+    result[:3, :3] = roma.special_procrustes(result[:3, :3])
+    return result.numpy()
+
 
 _TRIED = 4
 """Most frames in which the network is tried on a rendering of the arms."""
@@ -246,7 +281,7 @@ class CalibrationOptimizer:
         if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
             return found
         tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
-        known = [familiarity(self._scene, frame, self._predictor, self.settings) for frame in tried]
+        known = [check_domain(self._scene, frame, self._predictor, self.settings) for frame in tried]
         return without_knowledge(found, known)
 
     def __iter__(self) -> Iterator[CalibrationIterate]:

@@ -1,9 +1,4 @@
-"""Many frames that share one calibration: the same factors, with shared variables.
-
-Every frame contributes its own residuals. The prior on the calibration counts once. Joint offsets, where they are free,
-belong to one frame each, have a tight prior, and are eliminated by the Schur complement, so that a solver sees the
-calibration alone.
-"""
+"""Many frames as one optimization problem in the calibration that they share."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,15 +15,45 @@ from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
 from .counterfactual import Backgrounds
-from .elimination import Eliminated, eliminate
-from .evaluation import Evaluation
 from .evidence import Evidence
 from .factors import Prior
 from .factors.surface import SurfaceFactor
-from .frame_problem import FrameProblem
+from .frame_problem import FrameProblem, search_silhouettes
+from .observability import Evaluation
 from .predictor import SurfacePredictor
-from .silhouettes import search_silhouettes
 from .variables import Variables
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """A quadratic model of the shared unknowns, with a frame's own ones at their best (Schur complement). On the CPU,
+    in double precision."""
+
+    gradient: Float[Tensor, " shared"]
+    curvature: Float[Tensor, "shared shared"]
+    """The Schur complement of the own unknowns' block."""
+    _step: Float[Tensor, " own"]
+    _gain: Float[Tensor, "own shared"]
+
+    def own_step(self, shared_step: Float[Tensor, " shared"]) -> Float[Tensor, " own"]:
+        """How the own unknowns move, when the shared ones move by that much."""
+        return -(self._step + self._gain @ shared_step.double().cpu())
+
+
+def eliminate(gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"], own: int) -> Eliminated:
+    """Eliminate the first `own` unknowns of a model; 0 leaves it as it is.
+
+    Args:
+        gradient, curvature: of the model; the block of the own unknowns is positive definite.
+        own: how many unknowns belong to the frame alone.
+    """
+    gradient, curvature = gradient.double().cpu(), curvature.double().cpu()
+    across = curvature[:own, own:]
+    right = torch.cat([gradient[:own, None], across], 1)
+    solved = torch.linalg.solve(curvature[:own, :own], right) if own else right
+    step, gain = solved[:, 0], solved[:, 1:]
+    return Eliminated(gradient[own:] - across.T @ step, curvature[own:, own:] - across.T @ gain, step, gain)
+
 
 Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]
 """Per frame: camera name -> pixels that show an occluder."""

@@ -17,12 +17,11 @@ from torch import Tensor
 
 from ..errors import SequenceError
 from ..imaging.haze import dehazed, transmission
-from ..imaging.window import Window
+from ..imaging.working_image import Window, box_mean, pixel_weights, smoothed, stacked_images
 from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import Scene
 from ..recording import MeanBackground
 from ..threads import total
-from .inputs import box_mean, pixel_weights, smoothed, stacked_images
 from .predictor import FramePredictor
 
 _PATCH = 3

@@ -1,4 +1,4 @@
-"""The paper's objective for one frame: features of the image against those of the background with rendered arms."""
+"""The method of the paper: losses between observed and rendered features, as an optimization problem."""
 
 from collections.abc import Mapping
 
@@ -6,17 +6,59 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn import functional
 
-from ..imaging.window import Window
+from ..imaging.working_image import Window, attention, blurred, stacked_images, working_size
 from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor, hybrid
 from ..rendering import Renderer
 from ..settings import DescentSolver, Loss
 from ..settings.stages import FirstOrder, Observe, Stage
-from .evaluation import Evaluation
-from .inputs import blurred, stacked_images, working_size
-from .losses import attention, attentional_loss, cosine_similarity, smooth_l1
+from ..threads import one_thread
+from .observability import Evaluation
 from .variables import Variables
+
+_EMPTY = 1e-6
+
+
+def cosine_similarity(
+    observed: Float[Tensor, "*batch channels h w"], rendered: Float[Tensor, "*batch channels h w"]
+) -> Float[Tensor, "*batch h w"]:
+    """sim_cos of the paper, along the channels; two empty features count as equal."""
+    dot = (observed * rendered).sum(-3)
+    norms = (observed.square().sum(-3) + _EMPTY).sqrt() * (rendered.square().sum(-3) + _EMPTY).sqrt()
+    return (dot + _EMPTY) / norms
+
+
+@one_thread()
+def attentional_loss(
+    similarity: Float[Tensor, "*batch h w"],
+    weight: Float[Tensor, "*batch h w"],
+    loss: Loss,
+    pixels: int | None = None,
+) -> Float[Tensor, "*batch"]:
+    """ACS loss of the paper (its equation for L) in one of its forms, per image.
+
+    Args:
+        similarity: of features, at most 1; for `l1` the negated difference of predictions.
+        weight: attention map, in [0, 1].
+        loss: which form.
+        pixels: w x h of the whole image, where the maps are a window of it that holds all attention.
+    """
+    pixels = pixels or similarity.shape[-2] * similarity.shape[-1]
+    if loss == "acs_paper":
+        return 1.0 - (similarity * weight).sum((-2, -1)) / pixels
+    if loss == "acs_reference":
+        return ((1.0 - similarity) * weight).sum((-2, -1)) / pixels
+    area = weight.sum((-2, -1)).clamp(min=1.0)
+    return ((1.0 - similarity) * weight).sum((-2, -1)) / area
+
+
+@one_thread()
+def smooth_l1(observed: Float[Tensor, "*batch h w"], rendered: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch"]:
+    """Smooth L1 between predicted probabilities, over the whole image ("CaRTS L1"), per image."""
+    return functional.smooth_l1_loss(rendered, observed, reduction="none", beta=0.1).mean((-2, -1))
+
 
 _SURROUNDINGS = 16
 """How far the network's input reaches beyond the attention [px of the working image]."""

@@ -1,32 +1,72 @@
-"""One frame, optimized step by step. Command line, viewer, batch runs and tests all drive this object."""
+"""Optimizer of single frames."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
+from torch import Tensor
 
 from ..errors import SettingsError
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
-from ..settings.stages import FINEST
-from .base_frame_gain import base_frame_gain
+from ..settings.stages import FINEST, Descend
 from .counterfactual import Backgrounds
-from .evaluation import Evaluation
 from .factors import Factor
+from .factors.surface import SurfaceFactor
 from .feature_problem import FeatureProblem
-from .fit import Fit, Point, StopReason
 from .frame_problem import FrameProblem
-from .observability import Uncertainty
+from .observability import Evaluation, Uncertainty
 from .predictor import SurfacePredictor, predictor_of
-from .stages import run_stages
+from .solvers import bounded_step
+from .stages import Fit, Point, StopReason, run_stages
 from .variables import Variables
 from .verdict import Assessment
+
+BASE_FRAME_GAIN = 0.12
+"""Base frames are suspected if, free, they would explain at least this share of the remaining difference [1]."""
+
+_BLUR = 3.0
+"""Under which the linear model is made: it reaches about as far as the blur [px of the working image]."""
+
+
+@torch.no_grad()
+def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: FreeParameters) -> float:
+    """Share of the surface residual at a point that free base frames would explain [1].
+
+    What the present unknowns alone would still explain does not count, and a joint at its limit stays there.
+
+    Args:
+        problem: one frame.
+        offsets: the point.
+        free: the present unknowns.
+    """
+    settings, own = problem.settings, problem.variables
+    wider = Variables(problem.scene, own.start, replace(free, base_frames=True), settings.length_scale)
+    columns = [wider.names.index(name) for name in own.names]
+    point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(columns, device=offsets.device), offsets)
+    factor = SurfaceFactor(problem.scene, wider, problem.observation, settings, blur=_BLUR, robust=Descend.robust)
+    surface = factor.linearize(point)
+    total = wider.prior(settings).linearize(point) + surface
+    gradient, hessian = surface.gradient.double(), surface.hessian.double()
+    explained = []
+    for unknowns in (list(range(len(wider))), columns):
+        part = torch.tensor(unknowns, device=offsets.device)
+        step = torch.zeros_like(gradient)
+        step[part] = bounded_step(
+            point[part],
+            total.gradient.double()[part],
+            total.hessian.double()[part][:, part],
+            wider.lower[part],
+            wider.upper[part],
+        )
+        explained.append(-float(gradient @ step + 0.5 * step @ hessian @ step))
+    return (explained[0] - explained[1]) / max(surface.cost, 1e-12)
 
 
 @dataclass(frozen=True)

@@ -1,32 +1,33 @@
-"""What the images of one frame measure of its correction, near a place where it is looked for."""
+"""Measurements of single frames in a sequence, and checkpoints of them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..checkpoint import Checkpoint
+from ..files import OutputPath
+from ..fingerprints import fingerprint
+from ..imaging.working_image import working_size
 from ..model.scene import Scene
 from ..recording import Frame
 from ..rendering import Renderer
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
-from ..settings.presets import COMPARE, reduced
-from ..settings.stages import FINEST, Observe, Stage, first_observe
-from .base_frame_gain import base_frame_gain
+from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
 from .counterfactual import Backgrounds
 from .error_model import Gaussian, Information
-from .evaluation import Evaluation
 from .evidence import Evidence
 from .factors import Linearization, Prior
-from .fit import Fit
+from .frame import base_frame_gain
 from .frame_problem import FrameProblem
-from .inputs import working_size
-from .observability import Uncertainty
+from .observability import Evaluation, Uncertainty
 from .predictor import SurfacePredictor
-from .stages import run_stages
+from .stages import Fit, run_stages
 from .variables import Variables
 from .verdict import Assessment
 
@@ -236,3 +237,81 @@ def _of_edges(offsets: Tensor, edges: Linearization) -> Information:
 
 def _double(values: Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
+
+
+def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
+    """The checkpoint of a `SequenceOptimizer`.
+
+    Args:
+        path: the file.
+        made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
+    """
+    return Checkpoint(path, made_with, (Measurement, Information, Evidence))
+
+
+class ResumableFrameSolver(FrameSolver):
+    """A `FrameSolver` that looks up in a checkpoint what it has solved before: the same to the last bit.
+
+    Args:
+        solver: that solves what is not there.
+        checkpoint: made by `sequence_checkpoint`.
+    """
+
+    def __init__(self, solver: FrameSolver, checkpoint: Checkpoint) -> None:
+        self._solver, self._checkpoint = solver, checkpoint
+
+    def warm(
+        self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
+    ) -> Measurement:
+        """As `FrameSolver.warm`."""
+        key = _key("warm", frame, expected, start, wide)
+        return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start, wide=wide))
+
+    def cold(
+        self,
+        frame: Frame,
+        variables: Variables,
+        expected: Gaussian,
+        *,
+        quick: bool = False,
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Measurement:
+        """As `FrameSolver.cold`."""
+        key, options = _key("cold", frame, expected, quick), {"quick": quick, "cancelled": cancelled}
+        return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, **options))
+
+    def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
+        """As `FrameSolver.alone`; frames that failed only, so it is not kept."""
+        return self._solver.alone(frame, variables)
+
+    def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
+        """As `FrameSolver.at`."""
+        key = _key("at", frame, expected, correction)
+        return self._checkpoint.value(key, lambda: self._solver.at(frame, variables, expected, correction))
+
+    def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
+        """As `FrameSolver.losses`."""
+        key = _key("losses", frame, *corrections)
+        return self._checkpoint.value(key, lambda: self._solver.losses(frame, variables, corrections))
+
+    def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
+        """As `FrameSolver.evidence`."""
+        key = _key("evidence", frame, correction, loss)
+        return self._checkpoint.value(key, lambda: self._solver.evidence(frame, variables, correction, loss))
+
+    def base_frame_gain(
+        self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters
+    ) -> float:
+        """As `FrameSolver.base_frame_gain`; a few frames, so it is not kept."""
+        return self._solver.base_frame_gain(frame, variables, correction, free)
+
+
+def _key(method: str, frame: Frame, *arguments: Any) -> str:
+    images = [(name, frame.images[name]) for name in sorted(frame.images)]
+    measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
+    masks = sorted((frame.masks or {}).items())
+    return fingerprint(method, frame.index, images, masks, measured, _plain(arguments))
+
+
+def _plain(arguments: Iterable[Any]) -> list[Any]:
+    return [astuple(value) if is_dataclass(value) and not isinstance(value, type) else value for value in arguments]

@@ -1,14 +1,18 @@
-"""What predicts the surface maps of an image: the surface network, given masks, or in tests the truth."""
+"""Predictors of surface maps: the network, and masks given in its place."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..imaging.window import Window
+from ..errors import SettingsError
+from ..imaging.working_image import Window
+from ..model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 
@@ -108,3 +112,115 @@ class NetworkPredictor(ImagePredictor):
 def predictor_of(source: "FeatureExtractor | SurfacePredictor") -> SurfacePredictor:
     """A predictor as it is; the networks as one."""
     return NetworkPredictor(source) if isinstance(source, FeatureExtractor) else source
+
+
+GivenMask = Bool[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
+"""Which share of each pixel the arms cover, all of them together; a soft edge has values between 0 and 1."""
+
+_STRIDE = 8
+"""Windows are multiples of this without a network [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class GivenMasks:
+    """Masks from elsewhere than the recording, by frame."""
+
+    origin: str
+    """What they are called in "frame 7 has no ... of camera left", say "imported mask"."""
+    masks: Callable[[int], Mapping[str, GivenMask]]
+    """Position of a frame -> camera name -> mask in the camera's size, for the cameras that have one."""
+    there: Callable[[int, str], bool]
+    """Whether a frame, by position, has a mask of a camera."""
+    ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
+    """As `masks`: pixels of which it is not known whether they show an arm. Nothing is compared there."""
+
+    def filled(self, frame: Frame) -> Frame:
+        """The frame with these masks, for cameras that the recording has none of."""
+        masks = {**self.masks(frame.index), **(frame.masks or {})}
+        whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
+        return replace(frame, masks=whole or None)
+
+
+class MaskPredictor:
+    """Has each frame's given masks in the place of a network; a `SurfacePredictor`.
+
+    Args:
+        network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
+        masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
+        origin: what errors call a mask.
+    """
+
+    def __init__(
+        self,
+        network: SurfacePredictor | None = None,
+        masks: Callable[[int], Mapping[str, GivenMask]] | None = None,
+        origin: str = "mask",
+    ) -> None:
+        self._network, self._masks, self._origin = network, masks, origin
+        self.device = torch.device("cpu") if network is None else network.device
+
+    def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
+        """The predictor of one frame.
+
+        Raises:
+            SettingsError: a camera has no mask of the frame and there is no network, or a mask is of another size.
+        """
+        network = None if self._network is None else self._network.for_frame(frame, cameras)
+        given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)
+        missing = [name for name in cameras if name not in given]
+        if missing and network is not None:
+            return network
+        if missing:
+            raise SettingsError(
+                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to be fitted. Give one, leave "
+                "the frame or camera out, or observe both, masks and the network."
+            )
+        for name in cameras:
+            if given[name].shape != frame.images[name].shape[:2]:
+                raise SettingsError(
+                    f"the mask of camera {name!r} in frame {frame.frame_id} has shape {given[name].shape}, its image "
+                    f"{frame.images[name].shape[:2]}. Give a mask in the size of the image."
+                )
+        masks = tuple(np.asarray(given[name], np.float32) for name in cameras)
+        return _FrameMasks(masks, network, self.device)
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameMasks:
+    """The masks of one frame: where arms are, and of parts and normals what the network says, if there is one."""
+
+    masks: tuple[Float[np.ndarray, "height width"], ...]
+    """In the order of the cameras."""
+    network: FramePredictor | None
+    device: torch.device
+    masked: bool = True
+
+    @property
+    def knows_parts(self) -> bool:
+        """See `FramePredictor`."""
+        return self.network is not None
+
+    @property
+    def stride(self) -> int:
+        """See `FramePredictor`."""
+        return _STRIDE if self.network is None else self.network.stride
+
+    def predict(
+        self,
+        images: Float[Tensor, "cameras 3 height width"],
+        given: Float[Tensor, "cameras 6 height width"],
+        window: Window,
+    ) -> Float[Tensor, "cameras 6 h w"]:
+        """See `FramePredictor.predict`."""
+        size = images.shape[-1], images.shape[-2]
+        reduced = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in self.masks])
+        covered = window.of(torch.from_numpy(reduced)).to(self.device)
+        if self.network is None:
+            maps = covered.new_zeros(len(covered), SURFACE_CHANNELS, *covered.shape[-2:])
+        else:
+            maps = self.network.predict(images, given, window) * covered[:, None]
+        # All of the mask is some part; where the network predicts none, it is the first one.
+        parts = maps[:, COVERAGE]
+        parts = parts * (covered / parts.sum(1).clamp(min=1e-6)).clamp(max=1.0)[:, None]
+        parts[:, 0] += covered - parts.sum(1)
+        return torch.cat([parts, maps[:, NORMALS]], 1)

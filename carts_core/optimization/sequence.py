@@ -1,12 +1,15 @@
-"""A sequence, corrected frame by frame, each frame knowing what the others found."""
+"""Optimizer of sequences: frames inform one another through a model of the errors over time."""
 
 import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ..checkpoint import Checkpoint
 from ..errors import CartsError, SettingsError
@@ -16,18 +19,134 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
 from .counterfactual import Backgrounds
-from .error_model import ErrorModel, Gaussian, combined, remove_measurement
-from .initialization import initial_correction
-from .keyframes import GivenPositions, Keyframes
-from .measurement import FrameSolver, Ignore, Measurement
+from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
+from .measurement import FrameSolver, Ignore, Measurement, ResumableFrameSolver
 from .predictor import SurfacePredictor, predictor_of
-from .resumable import ResumableFrameSolver
-from .sequence_estimate import FrameEstimate, Origin, Visit
-from .sequence_verdict import assessed_estimates, assessed_sequence, sequence_base_frame_gain
-from .smoother import Smoother
+from .sequence_estimate import (
+    FrameEstimate,
+    Origin,
+    Visit,
+    assessed_estimates,
+    assessed_sequence,
+    sequence_base_frame_gain,
+)
 from .variables import Variables
-from .verdict_of_many import SequenceAssessment
-from .visiting_order import visiting_gaps
+from .verdict import SequenceAssessment
+
+
+def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
+    """Position -> seconds from the frame visited before it, in the order of the visits; 0 for the first one.
+
+    Args:
+        times: position -> time [s], or None where times are not known.
+        model: direction, and the time between frames whose times are not known.
+
+    Raises:
+        SettingsError: there are no frames, some have times and others none, or times do not increase.
+    """
+    if not times:
+        raise SettingsError("there are no frames to correct. Choose at least one.")
+    without = [index for index, seconds in sorted(times.items()) if seconds is None]
+    if 0 < len(without) < len(times):
+        raise SettingsError(
+            f"{len(without)} of {len(times)} frames have no time; the first is frame {without[0]}. Give all frames "
+            "times, or none."
+        )
+    known = {
+        index: index * model.frame_seconds if seconds is None else seconds for index, seconds in sorted(times.items())
+    }
+    for (a, before), (b, after) in pairwise(known.items()):
+        if not before < after:
+            raise SettingsError(
+                f"frame {b} was taken at {after:g} s and frame {a} at {before:g} s. Times must increase; correct them "
+                "in the sequence."
+            )
+    order = list(known) if model.direction == "forward" else list(reversed(known))
+    return {index: abs(known[index] - known[previous]) for previous, index in pairwise([order[0], *order])}
+
+
+def initial_correction(
+    corrections: Mapping[int, Float[np.ndarray, " n"]],
+    solver: FrameSolver,
+    open_frame: Callable[[int], tuple[Frame, Variables]],
+    allowance: float,
+) -> Float[np.ndarray, " n"]:
+    """The correction with the lowest loss, mean over the frames that were solved alone.
+
+    What does not suit the first of them is left out: the error may have jumped on the way to the others.
+
+    Args:
+        corrections: position of each of these frames -> the correction that it measured [rad].
+        solver: compares each correction with each of these frames.
+        open_frame: a frame and its unknowns.
+        allowance: how many times as large as the lowest loss in the first frame one there may be [1].
+    """
+    candidates = list(corrections.values())
+    losses = np.array([solver.losses(*open_frame(index), candidates) for index in corrections])
+    suits = losses[0] <= allowance * losses[0].min()
+    return candidates[int(np.where(suits, losses.mean(0), np.inf).argmin())]
+
+
+GivenPositions = Mapping[int, Mapping[str, ArrayLike]]
+"""Position of a frame -> arm name -> a value for each joint."""
+
+
+class Keyframes:
+    """Joint positions that stay as they are, exact or up to a standard deviation.
+
+    Args:
+        scene: the arms.
+        positions: joint positions [rad, m].
+        std: standard deviations [rad, m]; those that are missing or NaN are 0.
+
+    Raises:
+        RobotError: an arm lacks joint positions, or has the wrong number.
+    """
+
+    def __init__(self, scene: Scene, positions: GivenPositions | None, std: GivenPositions | None) -> None:
+        self._scene, self._positions, self._std = scene, _arrays(positions or {}), _arrays(std or {})
+        for given in self._positions.values():
+            scene.state(given)
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._positions
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._positions)
+
+    def __len__(self) -> int:
+        return len(self._positions)
+
+    def correction(self, index: int, variables: Variables) -> tuple[Float[np.ndarray, " n"], Information]:
+        """What a frame's measured values are corrected by, NaN for unknowns that are no joints, and how surely."""
+        given, std = self._positions[index], self._deviations(index)
+        correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
+        farther = variables.joint_offsets([given[arm.name] + std[arm.name] for arm in self._scene.arms])
+        return correction, Information.known(correction, farther - correction)
+
+    def as_given(self, estimate: FrameEstimate) -> FrameEstimate:
+        """The estimate of a frame, with the joint positions and deviations that it was given, if it was."""
+        if estimate.index not in self:
+            return estimate
+        given = self._positions[estimate.index]
+        state = self._scene.state(given, estimate.state.joint_positions[0].device)
+        return replace(
+            estimate,
+            state=replace(estimate.state, joint_positions=state.joint_positions),
+            joint_positions={arm.name: given[arm.name].copy() for arm in self._scene.arms},
+            joint_std=self._deviations(estimate.index),
+        )
+
+    def _deviations(self, index: int) -> dict[str, Float[np.ndarray, " dofs"]]:
+        known, given = self._std.get(index, {}), self._positions[index]
+        return {arm.name: np.nan_to_num(known.get(arm.name, 0.0 * given[arm.name])) for arm in self._scene.arms}
+
+
+def _arrays(given: GivenPositions) -> dict[int, dict[str, np.ndarray]]:
+    return {
+        index: {name: np.asarray(values, np.float64) for name, values in positions.items()}
+        for index, positions in given.items()
+    }
 
 
 class SequenceOptimizer:

@@ -1,11 +1,15 @@
-"""What each stage of a solver does. The stages themselves are data: `carts_core.settings.stages`."""
+"""Runs the stages of a solver. The stages themselves are data: `carts_core.settings.stages`."""
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import singledispatch
+from typing import Any, Protocol
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..settings.stages import (
     FINEST,
@@ -13,6 +17,7 @@ from ..settings.stages import (
     Descend,
     Evaluate,
     FirstOrder,
+    Given,
     IgnoreOccluders,
     Observe,
     OtherBackground,
@@ -21,15 +26,222 @@ from ..settings.stages import (
     RejectFailed,
     SilhouetteSearch,
     Stage,
+    first_descend,
 )
+from ..threads import total
 from .calibration_problem import CalibrationProblem
+from .factors import Linearization
 from .feature_problem import FeatureProblem
-from .fit import Fit, Point, StopReason
 from .frame_problem import FrameProblem
-from .search import arm_is_lost, best_random_start, start_explains_as_well
-from .solvers import FirstOrderDescent
-from .solvers.levenberg_marquardt import REJECTIONS
+from .observability import Evaluation
+from .observation import HAS_LEFT
+from .solvers import REJECTIONS, FirstOrderDescent, LevenbergMarquardt
+from .variables import Variables
 from .verdict import Assessment, Verdict, assess
+
+
+class StopReason(StrEnum):
+    """Why an optimization ended."""
+
+    CONVERGED = "converged"
+    ITERATIONS = "iterations"
+    START_KEPT = "start kept"
+    FAILED = "failed"
+    """The image contradicts the estimate, so the start is kept."""
+    NOT_OPTIMIZED = "not optimized"
+    CANCELLED = "cancelled"
+
+
+class Problem(Protocol):
+    """What stages work on: one frame, or many that share a calibration."""
+
+    @property
+    def variables(self) -> Variables:
+        """The unknowns."""
+        ...
+
+    def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
+        """Replace the observation."""
+        ...
+
+    def evaluate(self, offsets: Float[Tensor, " n"], stage: Any, *, gradient: bool = True) -> Evaluation:
+        """The objective at a point, as a stage compares it."""
+        ...
+
+    def objective_key(self, blur: float) -> tuple[int, float]:
+        """Which objective a stage with this blur evaluates. Losses compare among points of the same one."""
+        ...
+
+
+@dataclass(frozen=True)
+class Point:
+    """An evaluated point."""
+
+    offsets: Float[Tensor, " n"]
+    evaluation: Evaluation
+    objective_key: tuple[Any, ...]
+    """Which objective was evaluated. Losses compare among points of the same one."""
+
+    def improves_on(self, best: "Point | None") -> bool:
+        """Whether it replaces the best point so far: its loss is lower, or both do not compare and it came later."""
+        return best is None or self.objective_key != best.objective_key or self.evaluation.loss < best.evaluation.loss
+
+
+@dataclass
+class Fit:
+    """The state of a run, which every stage takes up and leaves behind.
+
+    Args:
+        problem: what is solved.
+        offsets: the present estimate, at first the start.
+        budget: largest number of evaluations.
+    """
+
+    problem: Problem
+    offsets: Float[Tensor, " n"]
+    budget: int
+    stop_reason: StopReason = StopReason.NOT_OPTIMIZED
+    best: Point | None = None
+    """The best point so far."""
+    reached: Point | None = None
+    """The best point of the last descent."""
+    edges: Linearization | None = None
+    """What edges say around the estimate, after `AlignEdges`."""
+    restarts: int = 0
+    """How often the estimate has jumped elsewhere; after the first time, descents stop at a smaller tolerance."""
+    used: int = 0
+    """Evaluations so far."""
+    solver: LevenbergMarquardt = field(init=False)
+    descent: FirstOrderDescent | None = None
+    """Its state goes on from one `FirstOrder` to the next."""
+    losses: list[float] = field(default_factory=list)
+    """Of all points of `FirstOrder` stages."""
+    assessment: Assessment | None = None
+    """How far the result can be relied on, after `RejectFailed`."""
+
+    def __post_init__(self) -> None:
+        self.solver = LevenbergMarquardt(self.problem.variables.lower, self.problem.variables.upper)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all evaluations are used up."""
+        return self.used >= self.budget
+
+    @property
+    def loss(self) -> float:
+        """Of the best point of the last descent [1]; infinite before any."""
+        return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
+
+    def evaluate(self, stage: Descend | FirstOrder, *, gradient: bool = True) -> Point:
+        """Evaluate the present estimate."""
+        self.used += 1
+        evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)
+        return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
+
+    def jump_to(self, offsets: Float[Tensor, " n"]) -> None:
+        """Go on from elsewhere; later descents then stop at the smaller tolerance."""
+        self.offsets, self.restarts = offsets, self.restarts + 1
+        self.solver.reset()
+
+    def start_over(self, start: Float[Tensor, " n"]) -> None:
+        """Forget the estimate; the budget is whole again."""
+        self.offsets, self.restarts, self.used = start, 0, 0
+        self.reached, self.edges = None, None
+        self.solver.reset()
+
+    def snapshot(self) -> "Snapshot":
+        """The estimate as it is now."""
+        return Snapshot(self.offsets, self.reached, self.edges, self.stop_reason)
+
+    def restore(self, snapshot: "Snapshot") -> None:
+        """Go back to an estimate."""
+        self.offsets, self.reached, self.edges = snapshot.offsets, snapshot.reached, snapshot.edges
+        self.stop_reason = snapshot.stop_reason
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The estimate at some moment of a run."""
+
+    offsets: Float[Tensor, " n"]
+    reached: Point | None
+    edges: Linearization | None
+    stop_reason: StopReason
+
+
+_SUPPORT = 0.5
+"""Share of an arm's silhouette that has to be observed as an arm, or the arm is lost [1]."""
+
+
+def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
+    """Whether an arm that was in sight at the start has left the image, or stands where no arm was observed."""
+    seen, images = problem.observation, problem.observation.images
+    before, after = (problem.variables.state(point) for point in (problem.start, offsets))
+    start, end = (images.renderer.segment(state) for state in (before, after))
+    found = seen.window.of(torch.from_numpy(end)).to(seen.maps.device)
+    coverage = seen.coverage
+    for arm in range(len(problem.scene.arms)):
+        here = found == arm
+        if not (start == arm).any():
+            continue
+        left = images.still_in_view(arm, (start, before), (end, after)) < HAS_LEFT
+        if left or total(coverage[here]) < _SUPPORT * int(here.sum()):
+            return True
+    return False
+
+
+@torch.no_grad()
+def best_random_start(
+    problem: FrameProblem, offsets: Float[Tensor, " n"], stage: RandomRestart, seed: int = 0
+) -> Float[Tensor, " n"]:
+    """The best of random points, arm by arm, compared with the whole image; that is observed once more for it.
+
+    Args:
+        problem: one frame; its observation is replaced by that of the whole image.
+        offsets: what has been found so far; it and the start are among the candidates.
+        stage: how many points, and how far apart.
+        seed: of the random numbers.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()
+    problem.observe(Observe(scale=stage.scale, given=Given.START, haze=False), offsets, whole=True)
+    best = offsets
+    for group in problem.variables.groups:
+        columns = list(group)
+        drawn = torch.stack([torch.randn(len(group), generator=generator) for _ in range(stage.candidates + 1)])
+        trials = best.repeat(len(drawn) + 1, 1)
+        trials[1:, columns] = (drawn * deviation[columns]).to(best)
+        trials[1, columns] = 0.0
+        trials = problem.variables.clamp(trials)
+        best = trials[problem.costs(trials, first_descend(stage.then)).argmin()]
+    return best
+
+
+@torch.no_grad()
+def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
+    """Whether the start explains an observation that is conditioned on it as well as the estimate does, and edges, too.
+
+    Where silhouettes differ much it does not, and nothing is observed. Where it does, that observation becomes the
+    problem's. A start is never preferred where a calibration is free: that is thought to be wrong.
+    """
+    if problem.variables.moves_calibration:
+        return False
+    start, before, state = problem.start, problem.observation, problem.variables.state
+    one, other = (before.images.renderer.segment(state(point)) >= 0 for point in (start, offsets))
+    if 2 * int((one & other).sum()) <= stage.overlap * (int(one.sum()) + int(other.sum())):
+        return False
+    problem.observe(Observe(given=Given.START), offsets)
+    points = torch.stack([start, offsets])
+    image_costs = problem.factor(FINEST).costs(points)
+    at_start, at_estimate = image_costs.tolist()
+    start_objective, estimate_objective = (image_costs + problem.other_costs(points)).tolist()
+    gain = start_objective - estimate_objective
+    as_well = gain < stage.improvement and at_start < stage.ratio * at_estimate
+    if as_well and not problem.masked:
+        as_well = problem.edge_distance(start) < stage.edges * problem.edge_distance(offsets)
+    if not as_well:
+        problem.observation = before
+    return as_well
 
 
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:

@@ -1,14 +1,27 @@
-"""Whether a fit can be relied on, as far as its images tell; nothing here knows how it was made."""
+"""Verdicts: whether a fit, a sequence or a calibration can be relied on, and whether a network knows a robot."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 
-from .evidence import OUT_OF_VIEW, Evidence
-from .failure import log_odds_of_failure
-from .frame_images import HAS_LEFT
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.special import stdtr
+from torch import Tensor
+
+from ..imaging.working_image import Window, attention
+from ..model.parts import COVERAGE, SURFACE_CHANNELS
+from ..model.scene import Scene
+from ..networks.extractor import FeatureExtractor
+from ..recording import Frame
+from ..settings import SurfaceSolver
+from .evidence import OUT_OF_VIEW, Evidence, log_odds_of_failure
 from .observability import Uncertainty
+from .observation import HAS_LEFT, FrameImages
+from .predictor import SurfacePredictor, predictor_of
 
 
 class Verdict(Enum):
@@ -171,3 +184,228 @@ def _weakest(found: Evidence) -> str:
 
 def _probability_of_failure(found: Evidence) -> float:
     return 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
+
+
+_TISSUE = 0.75, 0.55, 0.45
+"""What arms are rendered before, RGB."""
+
+_NEAR = 40
+"""How far from the arms as measured predictions count as theirs [px of the working image]."""
+
+RECOGNIZED, _ELSEWHERE = 0.95, 0.05
+"""Overlap from which a rendering is recognized as those of training are, and share of an image beyond which predictions
+mislead [1]."""
+
+UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
+
+
+def overlap_below_usual(overlap: float) -> str:
+    """Text on an overlap below `RECOGNIZED`, rounded down so that it reads as less."""
+    return f"an overlap of {math.floor(1000 * overlap) / 1000:.3f} only ({RECOGNIZED} or more is usual)"
+
+
+@dataclass(frozen=True)
+class DomainCheck:
+    """How well a network knows arms and images, from one frame."""
+
+    recognized: float | None
+    """Overlap (soft Dice) of what the network predicts of a rendering of the arms before plain tissue, conditioned on
+    nothing, with the arms that were rendered [1]; None where no arm is in view."""
+    elsewhere: float
+    """Share of the image, far from the arms as measured, that the network takes for arms [1]."""
+
+    def warnings(self, where: str, remedy: str = UNKNOWN_ROBOT_REMEDY, *, background: bool = False) -> list[str]:
+        """What people should know before they solve; nothing where all is well.
+
+        Args:
+            where: says which images are meant.
+            remedy: what to do where the network does not know arms or images.
+            background: whether the empty background is known; then what is taken for arms in it does no harm.
+        """
+        found = []
+        if self.recognized is None:
+            place = "Check T_camera_world, T_world_base and the units of the joints."
+            found.append(f"{where}: no arm is in view as measured. {place}")
+        elif self.recognized < RECOGNIZED:
+            found.append(
+                f"{where}: the network recognizes a rendering of these arms with "
+                f"{overlap_below_usual(self.recognized)}, so it may not know this robot at this distance. {remedy}"
+            )
+        if self.elsewhere > _ELSEWHERE and not background:
+            found.append(
+                f"{where}: the network takes {100 * self.elsewhere:.0f} % of the image for arms where none can be, and "
+                f"the empty background is not known. {remedy}"
+            )
+        return found
+
+
+@torch.no_grad()
+def check_domain(
+    scene: Scene, frame: Frame, networks: FeatureExtractor | SurfacePredictor, settings: SurfaceSolver | None = None
+) -> DomainCheck:
+    """Try a network on a frame; it predicts twice.
+
+    Args:
+        scene: with the cameras that take part.
+        frame: images and measured joint positions.
+        networks: the networks, or another predictor of surface maps.
+        settings: working size, and how much haze is taken off.
+
+    Raises:
+        SettingsError: an image is missing, or of another size than its camera.
+    """
+    settings = settings or SurfaceSolver()
+    predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
+    images = FrameImages.of(
+        scene,
+        frame.images,
+        {},
+        scale=1.0,
+        working_width=settings.working_width,
+        dehaze=settings.dehaze,
+        predictor=predictor,
+    )
+    rendered = images.renderer(scene.state(frame.measured, predictor.device, frame.mounts))
+    nothing = images.images.new_zeros(len(images.images), SURFACE_CHANNELS, *images.images.shape[-2:])
+    whole = Window(0, 0, *images.size)
+
+    def covered(pictures: Tensor) -> Tensor:
+        return predictor.predict(pictures, nothing, whole)[:, COVERAGE].sum(1, keepdim=True).clamp(0.0, 1.0)
+
+    arms = rendered.silhouette[:, None]
+    tissue = torch.tensor(_TISSUE, device=arms.device)[:, None, None]
+    overlap = None
+    if bool(arms.any()):
+        seen = covered(rendered.image * arms + tissue * (1.0 - arms))
+        overlap = float(2.0 * torch.minimum(seen, arms).sum() / (seen.sum() + arms.sum()))
+    far = 1.0 - attention((arms > 0).to(arms), round(_NEAR * images.scale))
+    return DomainCheck(overlap, float((covered(images.images) * far).mean()))
+
+
+_MANY, _MOST_FAILED = 0.1, 0.5
+"""Share of frames not to be relied on from which a sequence is doubtful, and share of failed ones from which it has
+failed [1]."""
+
+_LEVEL = 0.05
+"""Probability that any of the measures is called worse where all differences are chance [1]."""
+
+_SCATTER, _SCATTER_FREEDOM = 0.01, 4
+"""Usual deviation of a measure's change from frame to frame, and how many degrees of freedom it counts as [1]: with few
+frames their own scatter is hardly known, and with one frame not at all."""
+
+_BETTER_HIGHER = ("agreement", "unconditioned", "overlap_with_change")
+_BETTER_LOWER = ("residual", "loss")
+
+_CALIBRATION_REMEDY = (
+    "Check that robot, camera and joints are those of the images, start from a pose that is nearer, or give masks "
+    "(--observe masks)."
+)
+
+
+@dataclass(frozen=True)
+class SequenceAssessment:
+    """A verdict on frames that were corrected together."""
+
+    verdict: Verdict
+    reason: str
+    """One sentence for people."""
+    remedy: str
+    """What to try, one sentence; empty where nothing has to be."""
+    probability: float
+    """Mean of the frames' probabilities that their masks are wrong [1]."""
+    counts: Mapping[str, int]
+    """Verdict -> frames."""
+
+
+def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
+    """The verdict on a sequence of at least one frame.
+
+    Args:
+        frames: the verdicts on its frames.
+    """
+    counts = Counter(frame.verdict for frame in frames)
+    named = {verdict.value: counts[verdict] for verdict in Verdict}
+    probability = float(np.mean([frame.probability for frame in frames]))
+    against = Counter((frame.reason, frame.remedy) for frame in frames if frame.verdict is not Verdict.GOOD)
+    share = len(frames) - counts[Verdict.GOOD]
+    if counts[Verdict.FAILED] >= _MOST_FAILED * len(frames):
+        verdict = Verdict.FAILED
+    elif share > _MANY * len(frames):
+        verdict = Verdict.DOUBTFUL
+    else:
+        return SequenceAssessment(Verdict.GOOD, "The images support the fit.", "", probability, named)
+    (reason, remedy), _ = against.most_common(1)[0]
+    summary = f"{share} of {len(frames)} frames are not to be relied on, most of them for this: {reason}"
+    return SequenceAssessment(verdict, summary, remedy, probability, named)
+
+
+def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
+    """The verdict on a calibration, from the median evidence of its frames, with joints as measured.
+
+    All frames rely on it, and its masks can be right while it is off, so it is doubtful earlier than a frame.
+
+    Args:
+        frames: the evidence of each; at least one.
+    """
+    found = assess(median_evidence(frames), strict=True)
+    if found.verdict is Verdict.GOOD:
+        return replace(found, reason="The images support the calibration.")
+    reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")
+    reason = reason.replace("The image supports the fit only", "The images support the calibration only")
+    return replace(found, reason=reason, remedy=found.remedy if found.nothing_there else _CALIBRATION_REMEDY)
+
+
+def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assessment:
+    """The verdict on a calibration by a network that may not know the robot: what is doubtful then has failed.
+
+    Args:
+        found: the verdict from the images.
+        known: how well the network knows the arms, in some of the frames.
+    """
+    recognized = [one.recognized for one in known if one.recognized is not None]
+    if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
+        return found
+    reason = (
+        f"{found.reason.rstrip('.')}, and the network recognizes a rendering of these arms with "
+        f"{overlap_below_usual(float(np.median(recognized)))}."
+    )
+    return replace(found, verdict=Verdict.FAILED, reason=reason, remedy=UNKNOWN_ROBOT_REMEDY)
+
+
+def median_evidence(frames: Sequence[Evidence]) -> Evidence:
+    """Median over frames, so that a few broken ones decide nothing; what one of them does not know is left out."""
+    values = {}
+    for field in fields(Evidence):
+        known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
+        values[field.name] = float(np.median(known)) if len(known) == len(frames) else None
+    return Evidence(**values | {"masked": all(frame.masked for frame in frames)})
+
+
+def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]:
+    """Names of the measures that say that frames fit worse than before, beyond chance.
+
+    One-sided moderated t-tests (Smyth, Linear models and empirical Bayes methods for assessing differential expression,
+    2004) with Holm's correction for several tests (A simple sequentially rejective multiple test procedure, 1979).
+
+    Args:
+        before, after: of the same frames, in the same order.
+    """
+    chances = {}
+    for names, sign in ((_BETTER_HIGHER, -1.0), (_BETTER_LOWER, 1.0)):
+        for name in names:
+            pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(before, after, strict=True)]
+            if not any(None in pair for pair in pairs):
+                chances[name] = _chance(sign * np.array([new - old for old, new in pairs]))
+    found: list[str] = []
+    for name, chance in sorted(chances.items(), key=lambda item: item[1]):
+        if chance * (len(chances) - len(found)) > _LEVEL:
+            break
+        found.append(name)
+    return found
+
+
+def _chance(rises: Float[np.ndarray, " frames"]) -> float:
+    """Probability of a mean rise that large where there is none [1]."""
+    freedom = len(rises) - 1 + _SCATTER_FREEDOM
+    squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
+    return float(stdtr(freedom, -rises.mean() / np.sqrt(squares / freedom / len(rises))))

@@ -1,4 +1,4 @@
-"""The renderer: visibility, shading, surface maps and their derivatives, and picking of surface points."""
+"""Differentiable renderer of a scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,57 @@ from torch import Tensor
 from ..model.keypoints import Keypoint
 from ..model.parts import NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
-from .geometry import SceneGeometry, link_transforms, vertices_in_camera
 from .jacobian import JacobianBlock, Tangents, map_jacobian
-from .motion import carry_motion
 from .outline import Outline, normal_motion, outline_faces, outline_position
-from .points import phong, visible_points
+from .points import SceneGeometry, link_transforms, phong, vertices_in_camera, visible_points
 from .rasterizer import rasterize, visibility_torch
+
+
+class _CarryMotion(torch.autograd.Function):
+    """Identity on the image whose backward sends the image's gradient to the moving points as well."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, positions: Tensor, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
+        ctx.save_for_backward(image, pixels, inverse_depth)
+        return image.view_as(image)
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        (gradient,) = gradients
+        image, pixels, inverse_depth = ctx.saved_tensors
+        height, width = inverse_depth.shape[1:]
+        flat_image, flat_gradient = image.flatten(1), gradient.flatten(1)
+        nearness = inverse_depth.flatten()
+        here_image, here_gradient, here_near = flat_image[:, pixels], flat_gradient[:, pixels], nearness[pixels]
+        column, row = pixels % width, pixels // width % height
+        moving = image.new_zeros(2, len(pixels))
+        for axis, step, position, length in ((0, 1, column, width), (1, width, row, height)):
+            for sign in (1, -1):
+                exists = position < length - 1 if sign > 0 else position > 0
+                # A pixel at the image's border is its own neighbour, which adds nothing.
+                other = torch.where(exists, pixels + sign * step, pixels)
+                # Of two equally near points the first one carries the motion.
+                near = here_near >= nearness[other] if sign > 0 else here_near > nearness[other]
+                change = (flat_image[:, other] - here_image) * (flat_gradient[:, other] + here_gradient)
+                moving[axis] -= 0.5 * sign * change.sum(0) * near
+        return gradient, moving, None, None
+
+
+def carry_motion(
+    image: Float[Tensor, "channels views height width"],
+    positions: Float[Tensor, "2 K"],
+    pixels: Int[Tensor, " K"],
+    inverse_depth: Float[Tensor, "views height width"],
+) -> Float[Tensor, "channels views height width"]:
+    """The image, unchanged in value, moving with its visible points.
+
+    Args:
+        image: rendered channels, which may carry gradients of their own (shading).
+        positions: projected surface point of every visible pixel [px], with gradient.
+        pixels: index of these pixels in the flattened `views x height x width`.
+        inverse_depth: 1 / depth [1/m], 0 for background.
+    """
+    return _CarryMotion.apply(image, positions, pixels, inverse_depth)  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ Both are kept on disk, so that the first picture does not wait for them.
 
 import numpy as np
 
-from ..imaging.edges_numba import nearest_edges
 from ..model.camera import Camera
 from ..model.robot import Robot
 from ..model.scene import Arm, Scene
+from ..optimization.factors.edges import nearest_edges
 from ..resources import shipped_robot
 from .renderer import Renderer
 

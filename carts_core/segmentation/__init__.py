@@ -3,7 +3,7 @@
 `onnx_segmenter` loads SAM-type models; it needs ONNX Runtime, which nothing else here does.
 """
 
-from .builtin import NetworkSegmenter as NetworkSegmenter
-from .builtin import instrument_probability as instrument_probability
-from .prompt import Prompt as Prompt
-from .prompt import Segmenter as Segmenter
+from .segmenter import NetworkSegmenter as NetworkSegmenter
+from .segmenter import Prompt as Prompt
+from .segmenter import Segmenter as Segmenter
+from .segmenter import instrument_probability as instrument_probability

@@ -17,7 +17,7 @@ from ..errors import WeightsError
 from ..files.reading import WEIGHTS, read_bytes
 from ..onnx_runtime import inference_session
 from ..wording import shortened
-from .prompt import Prompt
+from .segmenter import Prompt
 
 if TYPE_CHECKING:
     from ..onnx_runtime import InferenceSession

@@ -3,9 +3,9 @@
 Nothing here imports torch or what needs it, so that the command line knows its options at once.
 """
 
-from .export import FormatName as FormatName
-from .export import Images as Images
-from .export import Parts as Parts
+from .interchange import FormatName as FormatName
+from .interchange import Images as Images
+from .interchange import Parts as Parts
 from .optimization import CALIBRATION as CALIBRATION
 from .optimization import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS
 from .optimization import DescentSolver as DescentSolver

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from ..errors import SettingsError
-from . import presets
-from .checks import require
-from .stages import Stage
+from .stages import LIVE_SEARCH, WARM, WARM_WIDE, Stage, require
 
 
 class StreamKind(StrEnum):
@@ -68,11 +66,11 @@ class StreamAddress:
 class LiveSettings:
     """What a tracker does with each frame, and when it takes the arms for lost."""
 
-    small: tuple[Stage, ...] = presets.WARM
+    small: tuple[Stage, ...] = WARM
     """Stages of a frame that is where it is expected."""
-    full: tuple[Stage, ...] = presets.WARM_WIDE
+    full: tuple[Stage, ...] = WARM_WIDE
     """Stages where the small ones end in a bad fit."""
-    search: tuple[Stage, ...] = presets.LIVE_SEARCH
+    search: tuple[Stage, ...] = LIVE_SEARCH
     """Stages where the arms are lost; `small` follows."""
     bad_loss: float = 0.06
     """Loss from which a fit is bad [1]."""

@@ -5,9 +5,20 @@ from enum import StrEnum
 from typing import Literal, get_args
 
 from ..errors import SettingsError
-from . import presets
-from .checks import require
-from .stages import FirstOrder, Stage
+from .stages import (
+    CALIBRATION_STAGES,
+    COLD,
+    FEATURES,
+    FRAME,
+    NONE,
+    OCCLUDED,
+    PAPER,
+    WARM,
+    WARM_WIDE,
+    FirstOrder,
+    Stage,
+    require,
+)
 
 Inference = Literal["auto", "torch", "onnx"]
 """`torch`, `onnx` (ONNX Runtime, on a CPU), or whichever is faster here and gives the same."""
@@ -49,11 +60,11 @@ class SequenceSettings:
     """Where the first pass begins: at the first frame, or at the last one."""
     frame_seconds: float = 0.25
     """Time between frames, where the sequence has no times [s]."""
-    cold: tuple[Stage, ...] = presets.COLD
+    cold: tuple[Stage, ...] = COLD
     """Stages from measured kinematics; `warm` follows."""
-    warm: tuple[Stage, ...] = presets.WARM
+    warm: tuple[Stage, ...] = WARM
     """Stages from the correction that the other frames predict."""
-    wide: tuple[Stage, ...] = presets.WARM_WIDE
+    wide: tuple[Stage, ...] = WARM_WIDE
     """Stages where `warm` ends with an unusual loss, before a cold start."""
 
     def __post_init__(self) -> None:
@@ -122,7 +133,7 @@ class FreeParameters:
 class SurfaceSolver:
     """Compares predicted surface maps with rendered ones, by Levenberg-Marquardt: the default."""
 
-    stages: tuple[Stage, ...] = presets.FRAME
+    stages: tuple[Stage, ...] = FRAME
     """What runs, in this order."""
     iterations: int = 60
     """Largest number of evaluations [1]; where stages run again from the start, they have as many again."""
@@ -185,7 +196,7 @@ class DescentSolver:
     """Which loss."""
     method: Method = "adam"
     """Optimizer that descends it."""
-    stages: tuple[Stage, ...] = presets.FEATURES
+    stages: tuple[Stage, ...] = FEATURES
     """What runs, in this order."""
     iterations: int = 60
     """Planned number of steps [1]."""
@@ -235,7 +246,7 @@ class DescentSolver:
         """
         return DescentSolver(
             loss=loss,
-            stages=presets.PAPER,
+            stages=PAPER,
             iterations=iterations,
             learning_rate=1e-3,
             decay=0.9,
@@ -296,9 +307,9 @@ def solver(name: SolverName | str) -> SolverSettings:
         case SolverName.SURFACE:
             return SurfaceSolver()
         case SolverName.OCCLUDED:
-            return SurfaceSolver(stages=presets.OCCLUDED)
+            return SurfaceSolver(stages=OCCLUDED)
         case SolverName.NONE:
-            return SurfaceSolver(stages=presets.NONE)
+            return SurfaceSolver(stages=NONE)
         case SolverName.PAPER:
             return DescentSolver.paper()
         case other:
@@ -314,7 +325,7 @@ CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
 """What a calibration frees by default."""
 
 CALIBRATION_SETTINGS = SurfaceSolver(
-    stages=presets.CALIBRATION,
+    stages=CALIBRATION_STAGES,
     noise=0.5,
     normals_weight=0.0,
     frame_prior_deg=3.0,

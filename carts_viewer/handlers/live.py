@@ -7,7 +7,7 @@ from typing import Protocol
 
 from carts_core.errors import CartsError
 from carts_core.live import LiveTracker, Recorder, Results, Tracked, open_stream
-from carts_core.live.moments import mounts_of
+from carts_core.live.messages import mounts_of
 from carts_core.optimization import Backgrounds
 from carts_core.project import Provenance, Source
 from carts_core.settings.live import StreamAddress, StreamKind

@@ -9,7 +9,7 @@ from typing import Any, get_args
 from carts_core.errors import SettingsError
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording.importing.found import recording_name
-from carts_core.settings.importing import NO_TABLE, AngleUnit, LengthUnit
+from carts_core.settings.interchange import NO_TABLE, AngleUnit, LengthUnit
 from carts_viewer.recording.draft import Draft, Step
 
 _CHOICES = {

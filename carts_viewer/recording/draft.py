@@ -14,7 +14,7 @@ from carts_core.files import remove_file, write_text
 from carts_core.files.reading import SETTINGS, VALUES, check_path, is_regular, parse_json, read_text, typed
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.identity import data_dir
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 from carts_viewer.recording.report import CalibrationReport
 
 _FORMAT = "carts-draft/1"

@@ -8,7 +8,7 @@ from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording import TimeOffsetEstimate
 from carts_core.recording.importing.columns import sample
 from carts_core.recording.importing.found import FoundArm, FoundCamera
-from carts_core.settings.importing import NO_TABLE, AngleUnit, LengthUnit
+from carts_core.settings.interchange import NO_TABLE, AngleUnit, LengthUnit
 from carts_viewer.recording.delay import delay_note
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.guess import FOLDER, Guess

@@ -16,7 +16,7 @@ from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.recording.importing.importer import detect, find
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
 from carts_core.recording.sources.folder import kinematics_table
-from carts_core.settings.importing import NO_TABLE, ImportOptions
+from carts_core.settings.interchange import NO_TABLE, ImportOptions
 from carts_viewer.recording.draft import Draft
 
 FOLDER = "folder"

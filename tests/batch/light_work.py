@@ -4,9 +4,9 @@ import os
 import signal
 from dataclasses import dataclass
 
-from carts_core.batch.engine import Outcome
+from carts_core.batch.engines import Outcome
+from carts_core.batch.folder import read_state, running
 from carts_core.batch.manifest import Job
-from carts_core.batch.state import read_state, running
 from carts_core.files import OutputPath, append_line, write_text
 
 

@@ -7,11 +7,9 @@ from pathlib import Path
 import pytest
 from light_work import LightWork
 
-from carts_core.batch.cluster import Cluster
-from carts_core.batch.engine import ATTEMPTS, Outcome, Work
+from carts_core.batch.engines import ATTEMPTS, Cluster, Outcome, Pool, Work
+from carts_core.batch.folder import present_status
 from carts_core.batch.manifest import Job
-from carts_core.batch.pool import Pool
-from carts_core.batch.state import present_status
 from carts_core.files import OutputPath, output_path
 
 Engine = Callable[[Work], Pool | Cluster]

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from carts_core.batch.folder import JOB_FILE, present_status
 from carts_core.batch.manifest import read_manifest
 from carts_core.batch.report import write_batch_report
-from carts_core.batch.state import FILE, present_status
 from carts_core.cli import main
 from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError
@@ -54,7 +54,7 @@ def results(batch: Path) -> dict[str, bytes]:
     return {
         name: path.read_bytes()
         for name, path in names.items()
-        if not name.startswith("report/") and not name.endswith((FILE, ".log"))
+        if not name.startswith("report/") and not name.endswith((JOB_FILE, ".log"))
     }
 
 
@@ -147,7 +147,7 @@ def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: 
     assert statuses() == ["done", "done"] and statuses() == ["known", "known"]
     path.write_text(path.read_text().replace('"--frames", "001"]', '"--frames", "002"]'))
     assert statuses() == ["done", "done"]
-    (batch / "jobs" / read_manifest(path)[0].name / FILE).path.write_text("{")
+    (batch / "jobs" / read_manifest(path)[0].name / JOB_FILE).path.write_text("{")
     assert statuses() == ["done", "known"]
 
 

@@ -24,8 +24,8 @@ sys.path.append(str(Path(__file__).parent.parent / "recording" / "sources"))
 
 from recordings import BagKind, write_bag  # pyright: ignore[reportMissingImports]
 
+from carts_core.batch.folder import read_state
 from carts_core.batch.manifest import read_manifest
-from carts_core.batch.state import read_state
 from carts_core.cli.options import SolverOptions
 from carts_core.errors import RobotError
 from carts_core.files import output_path

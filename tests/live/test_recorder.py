@@ -8,10 +8,10 @@ import numpy as np
 from moving import swing
 
 from carts_core.export.kinematics import read_kinematics_csv
-from carts_core.live.estimate import Effort, LiveEstimate, LiveVerdict
 from carts_core.live.loop import Tracked
-from carts_core.live.moments import Moment
+from carts_core.live.messages import Moment
 from carts_core.live.recorder import Recorder
+from carts_core.live.tracker import Effort, LiveEstimate, LiveVerdict
 from carts_core.project import Project, Provenance, Source
 from carts_core.recording import Sequence
 

@@ -299,7 +299,7 @@ def test_silent_clients_make_room_when_all_places_are_taken(
         with socket.create_connection(("127.0.0.1", server.port), timeout=20) as late:
             (answer,) = _answers(late)
             assert isinstance(answer, ErrorMessage) and "16 clients are connected" in answer.message
-        monkeypatch.setattr("carts_core.live.server._SILENCE", 0.2)
+        monkeypatch.setattr("carts_core.live.sources._SILENCE", 0.2)
         time.sleep(0.3)
         silent[0].sendall(packed(FrameMessage(0.1, JOINTS)))
         time.sleep(0.1)

@@ -16,7 +16,7 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.live import Effort, LiveTracker, LiveVerdict
 from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor

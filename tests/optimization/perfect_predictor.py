@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch.nn import functional
 
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.model.scene import SceneState
 from carts_core.optimization import ImagePredictor
 from carts_core.recording import Sequence

@@ -11,7 +11,7 @@ import torch
 from torch.nn import functional
 
 from carts_core.errors import RobotError, SettingsError
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.model.scene import Scene
 from carts_core.optimization import (
     CALIBRATION,
@@ -25,8 +25,7 @@ from carts_core.optimization import (
     Verdict,
 )
 from carts_core.optimization.calibration import UnknownChange, with_fixed_gauge
-from carts_core.optimization.calibration_problem import frame_weights
-from carts_core.optimization.elimination import eliminate
+from carts_core.optimization.calibration_problem import eliminate, frame_weights
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings.stages import Descend, Observe

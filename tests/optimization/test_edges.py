@@ -13,9 +13,8 @@ from carts_core.errors import SettingsError
 from carts_core.evaluation import dice, start_positions
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters
-from carts_core.optimization.edge_alignment import align_edges
 from carts_core.optimization.factors import Linearization, Prior
-from carts_core.optimization.factors.edges import EdgeFactor
+from carts_core.optimization.factors.edges import EdgeFactor, align_edges
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from carts_core.evaluation import dice
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.lab.benchmark.rooms import AnotherRoom, made_rooms
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor
 from carts_core.optimization.counterfactual import Background, without_background
-from carts_core.optimization.frame_images import FrameImages
+from carts_core.optimization.observation import FrameImages
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 

@@ -13,7 +13,7 @@ from carts_core.model.parts import COVERAGE
 from carts_core.model.scene import Scene
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
-from carts_core.settings import presets
+from carts_core.settings.stages import CALIBRATION_STAGES
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
 
     def errors(outline_error: float) -> np.ndarray:
         # The edges of the image itself are where they belong, and its plain grey is no smoke.
-        settings = SurfaceSolver(stages=presets.CALIBRATION, prior_deg=3.0, dehaze=0.0, outline_error=outline_error)
+        settings = SurfaceSolver(stages=CALIBRATION_STAGES, prior_deg=3.0, dehaze=0.0, outline_error=outline_error)
         optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=frame.truth, settings=settings)
         list(optimizer)
         assert optimizer.best is not None

@@ -10,7 +10,7 @@ from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, SurfaceSolver, propose_ignore
 from carts_core.recording import Sequence
-from carts_core.settings import presets
+from carts_core.settings.stages import OCCLUDED
 
 WIDTH, HEIGHT = 320, 240
 
@@ -63,7 +63,7 @@ def test_a_frame_is_solved_again_without_what_contradicts_and_reset_forgets_it(
     height, width = frame.images["left"].shape[:2]
     left_half = np.arange(width) < width // 2
     proposal = {"left": np.broadcast_to(left_half, (height, width))}
-    settings = SurfaceSolver(stages=presets.OCCLUDED)
+    settings = SurfaceSolver(stages=OCCLUDED)
     given = {"left": np.zeros((height, width), bool)}
 
     def optimizer(chosen: SurfaceSolver, ignore: dict[str, np.ndarray]) -> FrameOptimizer:
@@ -87,6 +87,6 @@ def test_without_a_proposal_a_frame_is_solved_once(sample_sequence_path: Path, m
     frame = sequence.frame(0, cameras=["left"])
     runs = [
         list(FrameOptimizer(sequence.scene, frame, {}, extractor, settings=settings, cameras=["left"]))
-        for settings in (SurfaceSolver(), SurfaceSolver(stages=presets.OCCLUDED))
+        for settings in (SurfaceSolver(), SurfaceSolver(stages=OCCLUDED))
     ]
     assert [iterate.loss for iterate in runs[0]] == [iterate.loss for iterate in runs[1]]

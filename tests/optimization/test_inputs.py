@@ -3,7 +3,7 @@
 import torch
 from torch.nn.functional import avg_pool2d
 
-from carts_core.optimization.inputs import blurred, box_mean, smoothed
+from carts_core.imaging.working_image import blurred, box_mean, smoothed
 
 
 def test_any_number_of_maps_is_smoothed_like_each_alone() -> None:

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from carts_core.optimization.losses import attention, attentional_loss, cosine_similarity, smooth_l1
+from carts_core.imaging.working_image import attention
+from carts_core.optimization.feature_problem import attentional_loss, cosine_similarity, smooth_l1
 from carts_core.settings import Loss
 
 

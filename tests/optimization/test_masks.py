@@ -12,7 +12,7 @@ from perfect_predictor import PerfectPredictor
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.model.perturbation import perturb
 from carts_core.optimization import (

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from carts_core.evaluation import dice
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.optimization import FrameOptimizer, ImagePredictor, SurfaceSolver, Verdict
 from carts_core.recording import Sequence

@@ -14,7 +14,7 @@ from carts_core.optimization.sequence_estimate import Origin
 from carts_core.optimization.variables import Variables
 from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence
-from carts_core.settings import presets
+from carts_core.settings.stages import NONE
 
 HELD = SequenceSettings(initial_frames=1, constant_deg=1e-3, drift_deg=1e-3, jitter_deg=1e-3)
 """Takes the measured kinematics for exact."""
@@ -58,7 +58,7 @@ def test_frames_that_fail_alone_as_well_keep_what_was_measured_and_are_not_all_t
     truths: Off, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = watched(monkeypatch)
-    sequence = finished(truths, settings=SurfaceSolver(stages=presets.NONE))
+    sequence = finished(truths, settings=SurfaceSolver(stages=NONE))
     assert tried == [0, 1, 2, 3, 4] and FRAMES > len(tried)
     assert sequence.assessment is not None and sequence.assessment.verdict is Verdict.FAILED
     for index, estimate in sequence.estimates.items():

@@ -20,13 +20,12 @@ from carts_core.optimization import (
     SurfaceSolver,
 )
 from carts_core.optimization.error_model import Gaussian
-from carts_core.optimization.initialization import initial_correction
 from carts_core.optimization.measurement import FrameSolver, Measurement
+from carts_core.optimization.sequence import initial_correction
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
-from carts_core.settings import presets
-from carts_core.settings.stages import AlignEdges
+from carts_core.settings.stages import WARM_WIDE, AlignEdges
 
 WRIST_PITCH = 4
 
@@ -343,7 +342,7 @@ def test_a_measurement_informs_others_as_firmly_as_its_noise_says(truths: Truths
         seen = solver.warm(frame, variables, expected, np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
         return solver.warm(frame, variables, expected, seen.correction)
 
-    model = SequenceSettings(measurement_noise=settings.noise, warm=presets.WARM_WIDE)
+    model = SequenceSettings(measurement_noise=settings.noise, warm=WARM_WIDE)
     firm, loose = (measure(replace(model, measurement_noise=factor * settings.noise)) for factor in (1, 2))
     np.testing.assert_allclose(firm.correction, loose.correction, atol=1e-6)
     precision = firm.information.precision

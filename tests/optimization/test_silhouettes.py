@@ -13,7 +13,7 @@ from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
 from carts_core.optimization import CALIBRATION_SETTINGS, CalibrationOptimizer, FreeParameters, MaskPredictor, Verdict
-from carts_core.optimization.silhouettes import mask_distances, search_silhouettes, silhouette_distance
+from carts_core.optimization.frame_problem import mask_distances, search_silhouettes, silhouette_distance
 from carts_core.recording import Frame
 from carts_core.rendering import Renderer
 from carts_core.settings.stages import SilhouetteSearch

@@ -12,14 +12,12 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor
 
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.evaluation import Evaluation
-from carts_core.optimization.fit import Fit, StopReason
 from carts_core.optimization.frame_problem import FrameProblem
-from carts_core.optimization.search import start_explains_as_well
+from carts_core.optimization.observability import Evaluation
 from carts_core.optimization.solvers import FirstOrderDescent
-from carts_core.optimization.stages import run_stage, run_stages
+from carts_core.optimization.stages import Fit, StopReason, run_stage, run_stages, start_explains_as_well
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.settings import DescentSolver, SurfaceSolver

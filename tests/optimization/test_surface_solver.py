@@ -12,21 +12,19 @@ from torch.nn import functional
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
-from carts_core.imaging.window import Window
+from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior
 from carts_core.optimization.factors.surface import SurfaceFactor
-from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.frame_problem import FrameProblem
-from carts_core.optimization.observation import Observation
+from carts_core.optimization.observation import FrameImages, Observation
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
-from carts_core.settings import presets
-from carts_core.settings.stages import Descend, Observe, PreferStart, RandomRestart
+from carts_core.settings.stages import FRAME, Descend, Observe, PreferStart, RandomRestart
 
 
 @pytest.fixture
@@ -147,7 +145,7 @@ def test_stages_that_others_follow_end_earlier(sequence: Sequence, predictor: Pe
     for tolerance in (1e-5, 0.5):
         stages = tuple(
             replace(stage, tolerance=tolerance) if isinstance(stage, Descend) and stage.blur > 1 else stage
-            for stage in presets.FRAME
+            for stage in FRAME
         )
         settings = SurfaceSolver(stages=stages)
         optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=start, settings=settings)
@@ -165,7 +163,7 @@ def test_first_steps_are_longer_where_the_coarsest_stage_has_a_wide_robust_scale
     mask = renderer.segment(sequence.scene.state({"PSM1": truth}))[0] >= 0
     overlaps = []
     for robust in (0.5, 2.0):
-        stages = list(presets.FRAME)
+        stages = list(FRAME)
         place, coarse = next((i, stage) for i, stage in enumerate(stages) if isinstance(stage, Descend))
         stages[place] = replace(coarse, robust=robust)
         settings = SurfaceSolver(stages=tuple(stages))
@@ -237,7 +235,7 @@ def test_what_is_seen_through_haze_counts_less_in_observations_that_say_so(
     found = {}
     for through in (1.0, 0.5):
         monkeypatch.setattr(
-            "carts_core.optimization.frame_images.transmission",
+            "carts_core.optimization.observation.transmission",
             lambda images, _, t=through: torch.full_like(images[:, :1], t),
         )
         problem = problem_of(sequence, predictor)

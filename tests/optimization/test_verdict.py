@@ -17,10 +17,9 @@ from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Evidence, FrameOptimizer, FreeParameters, MaskPredictor, SurfaceSolver, Verdict
 from carts_core.optimization.evidence import evidence
-from carts_core.optimization.frame_images import FrameImages
 from carts_core.optimization.observability import Uncertainty
-from carts_core.optimization.verdict import assess
-from carts_core.optimization.verdict_of_many import assess_calibration
+from carts_core.optimization.observation import FrameImages
+from carts_core.optimization.verdict import assess, assess_calibration
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 

@@ -8,9 +8,9 @@ from evidence import CONVINCING
 
 from carts_core.cli.printing import calibration_hint, sequence_hint, verdict_line
 from carts_core.optimization import Assessment, StopReason, Verdict
-from carts_core.optimization.familiarity import Familiarity
-from carts_core.optimization.verdict import assess
-from carts_core.optimization.verdict_of_many import (
+from carts_core.optimization.verdict import (
+    DomainCheck,
+    assess,
     assess_calibration,
     assess_sequence,
     median_evidence,
@@ -59,7 +59,7 @@ def test_a_calibration_is_judged_by_the_median_of_its_frames() -> None:
 
 def test_a_doubtful_calibration_fails_where_the_network_does_not_know_the_robot() -> None:
     doubtful = Assessment(Verdict.DOUBTFUL, "The edges do not agree.", "Look at it.", 0.3, RIGHT)
-    stranger, friend, unseen = (Familiarity(recognized=value, elsewhere=0.0) for value in (0.9, 0.97, None))
+    stranger, friend, unseen = (DomainCheck(recognized=value, elsewhere=0.0) for value in (0.9, 0.97, None))
     found = without_knowledge(doubtful, [stranger, unseen, stranger])
     assert found.verdict is Verdict.FAILED and "The edges do not agree, and the network recognizes" in found.reason
     assert "overlap of 0.90" in found.reason and "--observe masks" in found.remedy

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.nn import functional
 
+from carts_core.imaging.working_image import smoothed
 from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.inputs import smoothed
 from carts_core.optimization.variables import APART, Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, jacobian

@@ -8,8 +8,14 @@ import torch
 from torch import Tensor
 
 from carts_core.recording import Sequence
-from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera, vertices_in_camera_at_once
-from carts_core.rendering.points import visible_points, visible_points_torch
+from carts_core.rendering.points import (
+    SceneGeometry,
+    link_transforms,
+    vertices_in_camera,
+    vertices_in_camera_at_once,
+    visible_points,
+    visible_points_torch,
+)
 from carts_core.rendering.rasterizer import rasterize
 
 WIDTH, HEIGHT = 160, 120

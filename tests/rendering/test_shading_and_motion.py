@@ -1,11 +1,11 @@
 """Shading and the carried motion against their slow twins."""
 
 import torch
+from slow_references import carry_motion_ref, phong_ref
 
 from carts_core.model.scene import Light
-from carts_core.rendering.motion import carry_motion
 from carts_core.rendering.points import phong
-from carts_core.rendering.reference import carry_motion_ref, phong_ref
+from carts_core.rendering.renderer import carry_motion
 
 
 def random_points(count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

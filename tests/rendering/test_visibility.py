@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from slow_references import visibility_ref
 from tiny import tiny_scene
 
 from carts_core.model.meshes import is_closed
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, visibility, visibility_torch
-from carts_core.rendering.geometry import SceneGeometry, link_transforms, vertices_in_camera
+from carts_core.rendering.points import SceneGeometry, link_transforms, vertices_in_camera
 from carts_core.rendering.rasterizer import rasterize
-from carts_core.rendering.reference import visibility_ref
 from carts_core.resources import sample_sequence
 
 INTRINSICS = (30.0, 34.0, 17.3, 11.8)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.evaluation.metrics import dice
+from carts_core.evaluation.evaluate import dice
 from carts_core.networks import FeatureExtractor
 from carts_core.recording import Sequence
 from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter

@@ -7,9 +7,9 @@ import pytest
 
 from carts_core.cli.options import SolverOptions
 from carts_core.errors import SettingsError
-from carts_core.settings import DescentSolver, SequenceSettings, SolverName, SurfaceSolver, presets, solver
+from carts_core.settings import DescentSolver, SequenceSettings, SolverName, SurfaceSolver, solver
 from carts_core.settings.serialization import changed, to_plain
-from carts_core.settings.stages import Descend, FirstOrder, Observe, RandomRestart
+from carts_core.settings.stages import COLD, Descend, FirstOrder, Observe, RandomRestart, reduced
 
 
 @pytest.mark.parametrize("name", list(SolverName))
@@ -84,9 +84,9 @@ def test_a_setting_out_of_range_says_what_is_allowed(name: str, value: object) -
 
 
 def test_a_smaller_preset_observes_smaller_images_and_changes_nothing_else() -> None:
-    small = presets.reduced(presets.COLD, 1.0)
+    small = reduced(COLD, 1.0)
     assert max(stage.scale for stage in small if isinstance(stage, Observe)) == 1.0
-    assert [type(stage) for stage in small] == [type(stage) for stage in presets.COLD]
+    assert [type(stage) for stage in small] == [type(stage) for stage in COLD]
 
 
 def test_nested_stages_keep_their_kind() -> None:

@@ -192,7 +192,7 @@ def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
     at_desk.do(intents.SetSetting("solver", "surface"), intents.SetSetting("iterations", 1))
     state = at_desk.do(intents.Step())
     assert all("Fit masks (Fit to), or adapt the network" in line for line in state.unfamiliar)
-    monkeypatch.setattr(sys.modules["carts_core.optimization.familiarity"], "RECOGNIZED", 1.01)
+    monkeypatch.setattr(sys.modules["carts_core.optimization.verdict"], "RECOGNIZED", 1.01)
     at_desk.factory.use(None)
     at_desk.factory._unfamiliar.clear()
     state = at_desk.do(intents.Reset(), intents.Step())

@@ -22,7 +22,7 @@ from carts_core.cli.batch_job import BatchWork
 from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.identity import data_dir
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 from carts_viewer.jobs import JobState
 from carts_viewer.networks import STARTED
 from carts_viewer.recording.draft import Draft, Step

@@ -20,12 +20,10 @@ from playwright.sync_api import Browser
 from playwright.sync_api import Page as Tab
 from waiting import wait_in
 
-from carts_core.batch.findings import Findings, FrameFinding
-from carts_core.batch.folder import write_jobs
+from carts_core.batch.folder import Findings, FrameFinding, write_jobs, write_state
+from carts_core.batch.folder import JobState as BatchJobState
 from carts_core.batch.manifest import Job as BatchJob
 from carts_core.batch.report import write_batch_report
-from carts_core.batch.state import JobState as BatchJobState
-from carts_core.batch.state import write_state
 from carts_core.files import output_path
 from carts_core.project import FitVerdict, JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence

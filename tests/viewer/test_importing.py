@@ -11,7 +11,7 @@ from viewer_desk import Desk
 from viewer_tab import Tab
 
 from carts_core.errors import CartsError
-from carts_core.evaluation.metrics import dice
+from carts_core.evaluation.evaluate import dice
 from carts_core.project import Key, MaskCorrection, Project
 from carts_core.recording import Sequence
 from carts_viewer import intents

@@ -9,7 +9,7 @@ import torch
 from moving import let_camera_move, swing
 from viewer_desk import Desk
 
-from carts_core.evaluation.metrics import dice
+from carts_core.evaluation.evaluate import dice
 from carts_core.project import CorrectedTransform, Key, Project, Provenance, Source
 from carts_core.recording import Sequence
 from carts_viewer import intents

@@ -21,8 +21,8 @@ from viewer_canvas import eventually
 from visitor import Visitor, write_lab_files
 from waiting import wait_in
 
-from carts_core.evaluation.metrics import dice
-from carts_core.imaging.window import Window
+from carts_core.evaluation.evaluate import dice
+from carts_core.imaging.working_image import Window
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from viewer_desk import Desk
 
-from carts_core.evaluation.metrics import dice
+from carts_core.evaluation.evaluate import dice
 from carts_core.optimization import SurfaceSolver
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
 from carts_viewer import intents

@@ -10,7 +10,7 @@ from viewer_canvas import eventually
 from viewer_desk import Desk
 from viewer_tab import Tab
 
-from carts_core.evaluation.metrics import dice
+from carts_core.evaluation.evaluate import dice
 from carts_core.project import Key, Project
 from carts_core.recording import Sequence
 from carts_core.segmentation import Prompt

@@ -10,7 +10,7 @@ from carts_core.errors import SettingsError
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 from carts_viewer import intents
 from carts_viewer.recording.draft import Draft, DraftFile, Step, delete_draft, drafts
 from carts_viewer.recording.place import RecordingPlace

@@ -24,7 +24,7 @@ from ...model.parts import SURFACE_CHANNELS
 from ...networks.network import FeatureNetwork
 from ...networks.weights import read_weights, tensor_bytes
 from ...settings import Architecture
-from ...settings.baseline import BaselineNetwork
+from ...settings.training import BaselineNetwork
 from ...wording import shortened
 
 EXTRA = "baselines"

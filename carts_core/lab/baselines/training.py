@@ -26,7 +26,7 @@ from ...networks.network import channels_last
 from ...networks.weights import tensor_bytes
 from ...resources import shipped_robot
 from ...settings import ImageSettings
-from ...settings.baseline import Augmentation, BaselineNetwork, BaselineTraining
+from ...settings.training import Augmentation, BaselineNetwork, BaselineTraining
 from ...stopping import finished_first
 from ..randomization import SURFACE_UNIT, SurfaceGenerator
 from ..training.checkpoint import History, load_checkpoint, save_checkpoint

@@ -19,13 +19,13 @@ from ...errors import CartsError
 from ...evaluation import start_positions
 from ...files import OutputPath, append_line, write_text
 from ...files.reading import TABLE, VALUES, parse_json, read_bytes
+from ...imaging.working_image import working_size
 from ...model.scene import Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
-from ...optimization.inputs import working_size
 from ...recording import Sequence
 from ...rendering import Renderer, visibility_torch
-from ...rendering.geometry import link_transforms, vertices_in_camera
+from ...rendering.points import link_transforms, vertices_in_camera
 from ...rendering.rasterizer import rasterize
 from ...resources import sample_sequence
 from ...settings.serialization import to_plain
@@ -47,7 +47,6 @@ _MEASURED = (
     "optimization/**/*.py",
     "rendering/**/*.py",
     "settings/optimization.py",
-    "settings/presets.py",
     "settings/stages.py",
     "lab/baselines/networks.py",
     "lab/benchmark/conditions.py",

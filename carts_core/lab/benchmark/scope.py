@@ -6,7 +6,7 @@ from typing import get_args
 
 from ...errors import SettingsError
 from ...settings import DOMAINS, DescentSolver, Loss, SolverName, SolverSettings, SurfaceSolver, solver
-from ...settings.baseline import Augmentation, BaselineName, BaselineNetwork
+from ...settings.training import Augmentation, BaselineName, BaselineNetwork
 
 SYNTHETIC = "synthetic"
 REAL = "real"

@@ -2,4 +2,4 @@
 
 from .base import Factor as Factor
 from .base import Linearization as Linearization
-from .prior import Prior as Prior
+from .base import Prior as Prior

@@ -1,28 +1,88 @@
-"""The last pixel: outlines are drawn to the edges of the image that are near them.
-
-The network knows what an instrument is, but not to a pixel where it ends; the image often does. For every pixel
-of an outline the strongest edge along its normal is found, as in RAPiD (Harris and Stennett, 1990) and the trackers
-after it. Whether that edge is the right one nobody says, so a robust weight keeps those far away from pulling.
-"""
+"""Edge factor: distances between rendered outlines and image edges, and the alignment that minimizes them."""
 
 import math
 from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from ...imaging.edges_numba import nearest_edges
+from ...compiled import compiled
 from ...imaging.haze import certainty, dehazed, transmission
+from ...imaging.working_image import attention, pixel_weights, smoothed, stacked_images, working_size
 from ...model.scene import Scene
 from ...rendering import Outline, Renderer
+from ...settings.stages import AlignEdges
 from ...threads import total
-from ..inputs import pixel_weights, smoothed, stacked_images, working_size
-from ..losses import attention
+from ..solvers import bounded_step
 from ..variables import APART, Variables
 from .base import Linearization
+
+
+@compiled
+def _nearest(gradient, camera, position, normal, samples, expected, sampling, distance, found):
+    height, width, channels = gradient.shape[1:]
+    half, last = channels // 2, len(samples) - 1
+    strength = np.empty(len(samples), np.float32)
+    for k in range(len(camera)):
+        image = gradient[camera[k]]
+        nx, ny = normal[0, k], normal[1, k]
+        best = 0
+        for s in range(len(samples)):
+            x, y = position[0, k] + nx * samples[s], position[1, k] + ny * samples[s]
+            # Beyond the image there is no change of colour.
+            if not (x >= 0.0 and y >= 0.0 and x <= width - 1.0 and y <= height - 1.0):
+                strength[s] = 0.0
+            else:
+                column, row = min(int(x), width - 2), min(int(y), height - 2)
+                u, v = x - np.float32(column), y - np.float32(row)
+                upper, lower = image[row], image[row + 1]
+                squared = np.float32(0.0)
+                for c in range(half):
+                    right_above = upper[column, c] + u * (upper[column + 1, c] - upper[column, c])
+                    right_below = lower[column, c] + u * (lower[column + 1, c] - lower[column, c])
+                    d = half + c
+                    down_above = upper[column, d] + u * (upper[column + 1, d] - upper[column, d])
+                    down_below = lower[column, d] + u * (lower[column + 1, d] - lower[column, d])
+                    along = nx * (right_above + v * (right_below - right_above))
+                    along += ny * (down_above + v * (down_below - down_above))
+                    squared += along * along
+                strength[s] = squared * expected[s]
+            if strength[s] > strength[best]:
+                best = s
+        middle = min(max(best, 1), last - 1)
+        before, peak, after = strength[middle - 1], strength[middle], strength[middle + 1]
+        finer = np.float32(0.5) * (after - before) / max(np.float32(2.0) * peak - before - after, np.float32(1e-12))
+        distance[k] = samples[middle] + sampling * min(max(finer, np.float32(-0.5)), np.float32(0.5))
+        # The strongest one at either end is the flank of an edge further away.
+        found[k] = 1.0 if 0 < best < last else 0.0
+
+
+def nearest_edges(
+    gradient: Float[np.ndarray, "cameras height width 6"],
+    camera: Int[np.ndarray, " K"],
+    position: Float[np.ndarray, "2 K"],
+    normal: Float[np.ndarray, "2 K"],
+    samples: Float[np.ndarray, " samples"],
+    expected: Float[np.ndarray, " samples"],
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """Distance to the strongest edge along the outward normal [px], and 1 where there is one, 0 elsewhere.
+
+    Args:
+        gradient: of the images' three colours, to the right and then down [1/px].
+        camera: of each pixel of the outline.
+        position: where the outline is [px].
+        normal: unit vectors, outwards.
+        samples: distances at which edges are looked for, evenly spaced, at least three [px].
+        expected: what each of them counts [1].
+    """
+    distance, found = (np.empty(len(camera), np.float32) for _ in range(2))
+    sampling = samples[1] - samples[0]
+    _nearest(gradient, camera, position, normal, samples, expected, sampling, distance, found)
+    return distance, found
+
 
 _SCALE = 2.0
 """How many times larger than the working image that is in which edges are looked for, up to the camera's image [1]."""
@@ -189,3 +249,42 @@ class LocalEdgeFactor:
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
         """How far outlines move with a step [px]."""
         return self._outline.moved_by(step)
+
+
+_STILL = 0.03
+"""Outlines that move by no more than this have arrived [px]."""
+
+
+@torch.no_grad()
+def align_edges(
+    edges: EdgeFactor,
+    stage: AlignEdges,
+    offsets: Float[Tensor, " n"],
+    known: Linearization,
+    coverage: Float[Tensor, "cameras rows columns"],
+) -> tuple[Float[Tensor, " n"], Linearization]:
+    """Minimize the sum of the edge factor and of a fixed quadratic model.
+
+    Args:
+        edges: the edge factor.
+        stage: number of steps, and weight of the edges.
+        offsets: where to begin.
+        known: the quadratic model there of all other factors.
+        coverage: of the arms as observed, see `EdgeFactor.near`.
+
+    Returns:
+        The minimum, and the quadratic model of the edges alone around it.
+    """
+    factor, variables, origin = edges.near(offsets, coverage, stage.weight), edges.variables, offsets
+    step = torch.zeros_like(offsets)
+    found = Linearization(0.0, torch.zeros_like(offsets), torch.zeros_like(known.hessian))
+    for _ in range(stage.steps):
+        found, before = factor.linearize(offsets), offsets
+        gradient = known.gradient + known.hessian @ (before - origin) + found.gradient
+        hessian = known.hessian + found.hessian
+        step = bounded_step(before, gradient, hessian, variables.lower, variables.upper).to(offsets)
+        offsets = variables.clamp(before + step)
+        step = offsets - before
+        if factor.moved_by(step) < _STILL:
+            break
+    return offsets, Linearization(found.cost, found.gradient + found.hessian @ step, found.hessian)

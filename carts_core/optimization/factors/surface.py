@@ -14,13 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from ...imaging.window import Window
+from ...imaging.working_image import Window, kernel_radius, smoothed
 from ...model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...model.scene import Scene, SceneState
 from ...rendering import JacobianBlock, Renderer, SurfaceRendering
 from ...settings import SurfaceSolver
 from ...threads import one_thread, total
-from ..inputs import kernel_radius, smoothed
 from ..observation import Observation
 from ..variables import APART, Variables
 from .base import Linearization

@@ -1,11 +1,11 @@
-"""Points in a table, and what was found from them as JSON."""
+"""Points and results of hand-eye calibration in files, and cameras that move between frames."""
 
 import csv
 import io
 import math
 from collections.abc import Mapping
 from collections.abc import Sequence as Rows
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from jaxtyping import Float
 
 from ...errors import SettingsError
 from ...files.reading import TABLE, VALUES, parse_json, read_bytes, read_text
+from ...model.scene import Scene
 from ...recording import Sequence
-from .points import ImagePoint
+from .problem import ImagePoint
 from .result import HandEyeResult
 
 RESULT_FILE = "hand_eye.json"
@@ -141,3 +142,44 @@ def result_json(
             for camera, deviation in result.focal_deviation.items()
         },
     }
+
+
+_STANDS = 1e-3
+"""Mounts whose transforms differ by less are at the same place [rad, m]."""
+
+
+def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Camera -> T_mount_world [m] in the frames of points, of the cameras that move.
+
+    Raises:
+        SettingsError: a camera stands at different places in these frames, or a point names a missing frame.
+    """
+    found: dict[str, tuple[int, np.ndarray]] = {}
+    for point in points:
+        if not 0 <= point.frame < len(recording):
+            raise SettingsError(f"there is no frame {point.frame}; frames are 0 to {len(recording) - 1}.")
+        for camera, T in recording.mounts(point.frame).items():
+            frame, first = found.setdefault(camera, (point.frame, T))
+            if not np.allclose(T, first, atol=_STANDS):
+                ids = recording.frame_ids
+                raise SettingsError(
+                    f"camera {camera!r} moves between frames {ids[frame]!r} and {ids[point.frame]!r}, which have "
+                    "points. Click in frames in which it stands still, and refine with carts calibrate."
+                )
+    return {camera: T for camera, (_, T) in found.items()}
+
+
+def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], *, back: bool = False) -> Scene:
+    """The scene with its cameras where their mounts take them, or, of such a scene, with cameras on their mounts.
+
+    Args:
+        scene: arms and cameras.
+        mounts: camera -> T_mount_world [m], of the cameras that move.
+        back: from the world to the mounts.
+    """
+    steps = {camera: np.linalg.inv(T) if back else T for camera, T in mounts.items()}
+    cameras = (
+        replace(camera, T_camera_world=camera.T_camera_world @ steps.get(camera.name, np.eye(4)))
+        for camera in scene.cameras
+    )
+    return replace(scene, cameras=tuple(cameras))

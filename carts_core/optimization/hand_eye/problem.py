@@ -1,17 +1,240 @@
-"""Poses of arms and cameras around a beginning, as a vector that a solver can change."""
+"""Hand-eye calibration from points as a least-squares problem, with its start from homographies."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ...errors import SettingsError
+from ...model.camera import HALF_PIXEL
+from ...model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
 from ...model.scene import Scene
 from ...wording import counted
-from .points import View
-from .settings import HandEyeSettings
-from .start import FEWEST_POINTS, poses_of
+
+
+@dataclass(frozen=True)
+class HandEyeSettings:
+    """What is solved for from clicked points, and how exactly a person clicks."""
+
+    pixel_error: float = 2.0
+    """Expected error of a point [px]."""
+    focal_length: bool = False
+    """Solve for the focal lengths of all cameras that have points, too."""
+    free_cameras: tuple[str, ...] = ()
+    """Cameras whose pose relative to the others is not known."""
+
+    def __post_init__(self) -> None:
+        if not 0.05 <= self.pixel_error <= 100:
+            raise SettingsError(f"pixel_error is {self.pixel_error:g}; allowed is 0.05 to 100 px.")
+
+
+NEAREST = 1e-3
+"""[m] Depths below this count as this, so that what is behind the camera is far off instead of undefined."""
+
+
+@dataclass(frozen=True)
+class ImagePoint:
+    """A landmark of an arm, and where a person has found it."""
+
+    frame: int
+    """Position in the sequence, from 0."""
+    camera: str
+    arm: str
+    landmark: str
+    """Its name, as in `model.keypoints.landmarks`."""
+    pixel: tuple[float, float]
+    """Column and row in the undistorted image, from the upper left corner [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """All points of one arm in one camera, with what the joints say where they are in the arm's base frame."""
+
+    camera: int
+    """Index into the scene's cameras."""
+    arm: int
+    rows: tuple[int, ...]
+    """Which of the given points these are."""
+    frames: tuple[int, ...]
+    landmarks: tuple[Landmark, ...]
+    starts: Float[np.ndarray, "points 3"]
+    """The point itself, or one end of the axis [m]."""
+    ends: Float[np.ndarray, "points 3"]
+    """The same, or the other end of the axis [m]."""
+    pixels: Float[np.ndarray, "points 2"]
+
+    @property
+    def has_edges(self) -> bool:
+        """Whether some are edges of a shaft."""
+        return any(landmark.kind is LandmarkKind.EDGE for landmark in self.landmarks)
+
+    @property
+    def is_point(self) -> np.ndarray:
+        """Which of them are points instead of lines [points]."""
+        return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
+
+    def distances(
+        self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
+    ) -> Float[np.ndarray, "points 2"]:
+        """How far the landmarks are from where they were found [px]; of lines, the second number is 0.
+
+        Args:
+            T_camera_base: pose of the arm.
+            intrinsics: fx, fy, cx, cy [px].
+            side: of the shaft that all its edges were found on, 1 or -1; 0 takes the nearer side for each.
+        """
+        starts = self.starts @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
+        ends = self.ends @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
+        seen = intrinsics[:2] * starts[:, :2] / np.maximum(starts[:, 2:], NEAREST) + intrinsics[2:]
+        found = seen - self.pixels
+        for row, landmark in enumerate(self.landmarks):
+            if landmark.kind is not LandmarkKind.POINT:
+                distance = _line_distance(starts[row], ends[row], self.pixels[row], intrinsics, landmark, side)
+                found[row] = distance, 0.0
+        return found
+
+
+def views_of(
+    scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]], points: Sequence[ImagePoint]
+) -> list[View]:
+    """Points by camera and arm, in the scene's order.
+
+    Args:
+        scene: arms and cameras.
+        measured: arm -> joint positions of all frames [rad, m].
+        points: what a person has found.
+
+    Raises:
+        SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
+        RobotError: a point names an arm or a camera that does not exist.
+    """
+    grouped: dict[tuple[int, int], list[int]] = {}
+    for row, point in enumerate(points):
+        camera, arm = scene.cameras.index(scene.camera(point.camera)), scene.arms.index(scene.arm(point.arm))
+        frames = len(measured[point.arm])
+        if not 0 <= point.frame < frames:
+            raise SettingsError(f"there is no frame {point.frame}; frames are 0 to {frames - 1}.")
+        if not np.isfinite(point.pixel).all():
+            raise SettingsError(f"the {point.landmark} in frame {point.frame} is at {point.pixel}. Give two numbers.")
+        grouped.setdefault((camera, arm), []).append(row)
+    return [_view(scene, measured, points, camera, arm, tuple(rows)) for (camera, arm), rows in sorted(grouped.items())]
+
+
+def _view(
+    scene: Scene, measured: Mapping[str, np.ndarray], points: Sequence[ImagePoint], camera: int, arm: int, rows
+) -> View:
+    entry = scene.arms[arm]
+    known = landmarks(entry)
+    chosen = [points[row] for row in rows]
+    for point in chosen:
+        if point.landmark not in known:
+            raise SettingsError(f"{entry.name} has no {point.landmark!r}. Its landmarks are: {', '.join(known)}.")
+    Ts = link_transforms(entry, np.asarray(measured[entry.name])[[point.frame for point in chosen]])
+    ends = [known[point.landmark].positions(T) for point, T in zip(chosen, Ts, strict=True)]
+    return View(
+        camera=camera,
+        arm=arm,
+        rows=rows,
+        frames=tuple(point.frame for point in chosen),
+        landmarks=tuple(known[point.landmark] for point in chosen),
+        starts=np.stack([each[0] for each in ends]),
+        ends=np.stack([each[-1] for each in ends]),
+        pixels=np.array([point.pixel for point in chosen], np.float64),
+    )
+
+
+def _line_distance(
+    start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark, side: int
+) -> float:
+    """From the ray through a pixel to a cylinder's axis, less its radius [px at the depth where they are closest]."""
+    ray = np.array([*((pixel - intrinsics[2:]) / intrinsics[:2]), 1.0])
+    ray /= np.linalg.norm(ray)
+    axis = (end - start) / np.linalg.norm(end - start)
+    across = np.cross(ray, axis)
+    length = max(float(np.linalg.norm(across)), 1e-9)
+    # The place on the axis that is closest to the ray, which begins at the origin.
+    along = float(np.dot(np.cross(ray, start), across)) / length**2
+    depth = max(float((start - along * axis)[2]), NEAREST)
+    away = float(start @ across) / length
+    if landmark.kind is LandmarkKind.EDGE:
+        away = (side * away if side else abs(away)) - landmark.radius
+    return away * float(intrinsics[:2].mean()) / depth
+
+
+FEWEST_POINTS = 4
+"""With three, up to four poses fit equally well."""
+_RANDOM_SUBSETS = 40
+_KEPT = 4
+"""How many of the best poses are refined."""
+
+
+def poses_of(
+    view: View, intrinsics: Float[np.ndarray, "4"], pixel_error: float
+) -> list[tuple[float, Float[np.ndarray, "4 4"]]]:
+    """The best few poses T_camera_base with their costs, the best first.
+
+    Perspective-n-point (SQPnP, EPnP) on all points, on all but each frame's and each single one, and on random few, so
+    that some subset is free of wrong points; each pose is judged by all points, wrong ones with little weight.
+
+    Args:
+        view: at least `FEWEST_POINTS` points.
+        intrinsics: fx, fy, cx, cy [px].
+        pixel_error: expected error of a point [px].
+    """
+    found: list[tuple[float, np.ndarray]] = []
+    for rows in _subsets(view):
+        for T in _perspective(view, rows, intrinsics):
+            if (T[2, :3] @ view.starts[view.is_point].T + T[2, 3] > 0).all():
+                found.append((robust_cost(view.distances(T, intrinsics) / pixel_error), T))
+    found.sort(key=lambda entry: entry[0])
+    return found[:_KEPT]
+
+
+def robust_cost(scaled: Float[np.ndarray, "points 2"]) -> float:
+    """Sum of Cauchy's loss of the distances, in expected errors."""
+    return float(np.log1p((scaled**2).sum(-1) / 4.0).sum())
+
+
+def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:
+    """Points to be used together: all, all but a few, and random few."""
+    points = view.is_point
+    yield points
+    frames = np.array(view.frames)
+    for frame in dict.fromkeys(view.frames):
+        yield points & (frames != frame)
+    for row in np.flatnonzero(points):
+        yield points & (np.arange(len(points)) != row)
+    random = np.random.default_rng(0)
+    count = int(points.sum())
+    for _ in range(_RANDOM_SUBSETS if count > FEWEST_POINTS else 0):
+        chosen = np.zeros(len(points), bool)
+        chosen[random.choice(np.flatnonzero(points), min(count, FEWEST_POINTS + 1), replace=False)] = True
+        yield chosen
+
+
+def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterator[np.ndarray]:
+    if rows.sum() < FEWEST_POINTS:
+        return
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    pixels = view.pixels[rows] - HALF_PIXEL
+    for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                np.ascontiguousarray(view.starts[rows]), pixels, K, None, flags=method
+            )
+        except cv2.error:
+            # Points that coincide or lie on a line have no pose.
+            continue
+        for rotation, translation in zip(rotations, translations, strict=True):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+            if np.isfinite(T).all():
+                yield T
 
 
 class HandEyeProblem:

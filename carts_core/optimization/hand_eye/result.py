@@ -1,17 +1,18 @@
-"""Where arms are according to points, and how far that can be relied on."""
+"""Solver of hand-eye calibration, its result with standard deviations, and its agreement with a later calibration."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import OptimizeResult
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from ...errors import SettingsError
 from ...model.scene import Scene
-from .points import View
-from .problem import HandEyeProblem, place_of
+from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, place_of, views_of
 
 _OUTLIER = 4.0
 """Points that are further off than this many expected errors are said to contradict the others."""
@@ -195,3 +196,148 @@ def _differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, s
     """The Jacobian by central differences."""
     columns = [(function(at + step * unit) - function(at - step * unit)) / (2 * step) for unit in np.eye(len(at))]
     return np.stack(columns, axis=1)
+
+
+_FOCAL_FACTORS = (1.0, 0.55, 0.75, 1.35, 1.8)
+"""Of the given focal length: where a search for it begins."""
+_COMBINED = 4
+"""Most views with edges of which every combination of sides is tried."""
+_STEPS = 60
+"""Most steps from each beginning."""
+_TOLERANCE = 1e-12
+"""Relative change at which the search ends."""
+
+
+def solve_hand_eye(
+    scene: Scene,
+    measured: Mapping[str, Float[np.ndarray, "frames dofs"]],
+    points: Sequence[ImagePoint],
+    settings: HandEyeSettings | None = None,
+) -> HandEyeResult:
+    """Find where the arms are before the cameras, from points in a few frames; no initial pose is needed.
+
+    Minimizes Cauchy's loss of the distances in the image, each over `pixel_error`, from several beginnings by
+    perspective-n-point. Which side of a shaft its edges are on is not given, so both are tried. Joint positions are
+    taken as measured. Base frames move, and the cameras in `free_cameras`; where all cameras with points are among
+    these, the one with most points keeps its pose.
+
+    Args:
+        scene: arms and cameras; its base frames are not used, those of arms without points stay.
+        measured: arm -> joint positions of all frames [rad, m], as `Sequence.measured`.
+        points: 3 to 6 frames with three or more points each are good; an arm needs 4 points in one camera.
+        settings: what is free.
+
+    Raises:
+        SettingsError: no arm has enough points, all lie on each other, or a point names what is not there.
+        RobotError: a point or `free_cameras` names an arm or a camera that does not exist.
+    """
+    settings = settings or HandEyeSettings()
+    free = {scene.cameras.index(scene.camera(name)) for name in settings.free_cameras}
+    views = views_of(scene, measured, points)
+    best: tuple[float, HandEyeProblem, OptimizeResult] | None = None
+    for factor in _FOCAL_FACTORS if settings.focal_length else (1.0,):
+        problem = HandEyeProblem(scene, views, free, settings, factor)
+        fit = _minimum(problem, problem.origin)
+        if best is None or fit.cost < best[0]:
+            best = (fit.cost, problem, fit)
+    assert best is not None
+    _, problem, fit = best
+    for sides in _sides(problem):
+        other = _minimum(problem, _minimum(problem, fit.x, sides).x)
+        fit = min(fit, other, key=lambda found: found.cost)
+    return result_of(problem, fit, len(points))
+
+
+def _minimum(problem: HandEyeProblem, start: np.ndarray, sides: Sequence[int] | None = None) -> OptimizeResult:
+    """A minimum near a start; `sides` as in `HandEyeProblem.distances`."""
+    return least_squares(
+        problem.residuals,
+        start,
+        jac="3-point",
+        loss="cauchy",
+        f_scale=2.0,
+        x_scale="jac",
+        ftol=_TOLERANCE,
+        xtol=_TOLERANCE,
+        gtol=_TOLERANCE,
+        max_nfev=_STEPS,
+        args=(sides,),
+    )
+
+
+def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
+    """Sides of the shafts in all views: each combination of few views, and the same side in all of many."""
+    choices = [(1, -1) if view.has_edges else (0,) for view in problem.views]
+    if sum(len(choice) > 1 for choice in choices) <= _COMBINED:
+        yield from (sides for sides in product(*choices) if any(sides))
+        return
+    for place in (0, -1):
+        yield tuple(choice[place] for choice in choices)
+
+
+_LEVEL = 0.01
+"""Probability that a true calibration is said to disagree, by any single point or by all together [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointAgreement:
+    """Residuals of points before and after a calibration, and how large the noise of points makes them."""
+
+    before: Float[np.ndarray, " points"]
+    """[px], of the calibration from the points; NaN for points that were not used."""
+    after: Float[np.ndarray, " points"]
+    """[px]"""
+    limits: Float[np.ndarray, " points"]
+    """Largest residual that noise explains [px]; infinite for points that were not used or contradict the others."""
+    rms_before: float
+    """Root mean square of the residuals of points with a limit [px]."""
+    rms_after: float
+    rms_limit: float
+    """Largest root mean square that noise explains [px]."""
+
+    @property
+    def disagreeing(self) -> tuple[int, ...]:
+        """Points whose residual has grown beyond its limit."""
+        return tuple(np.flatnonzero((self.after > self.limits) & (self.after > self.before)).tolist())
+
+    @property
+    def agrees(self) -> bool:
+        """Whether neither a single point nor all together speak against the calibration."""
+        return not self.disagreeing and self.rms_after <= max(self.rms_limit, self.rms_before)
+
+
+def agreement_with_points(
+    scene: Scene,
+    measured: Mapping[str, Float[np.ndarray, "frames dofs"]],
+    points: Sequence[ImagePoint],
+    found: HandEyeResult,
+) -> PointAgreement:
+    """Compare a calibration with points.
+
+    Where a calibration is true, squared residuals over the variance of a point follow a chi-square distribution, with
+    two degrees of freedom for a point and one for a line. A single point is tested at a level that is divided by the
+    number of points (Bonferroni), and the sum over all points at the same level.
+
+    Args:
+        scene: with the calibration.
+        measured: arm -> joint positions of all frames [rad, m].
+        points: what a person has found.
+        found: the calibration from these points.
+
+    Raises:
+        SettingsError: a point names a frame or a landmark that does not exist.
+        RobotError: a point names an arm or a camera that does not exist.
+    """
+    after, freedom = np.full(len(points), np.nan), np.ones(len(points))
+    for view in views_of(scene, measured, points):
+        camera, arm = scene.cameras[view.camera], scene.arms[view.arm]
+        distances = view.distances(camera.T_camera_world @ arm.T_world_base, np.array(camera.intrinsics))
+        after[list(view.rows)] = np.linalg.norm(distances, axis=-1)
+        freedom[list(view.rows)] += view.is_point
+    counted = np.setdiff1d(np.flatnonzero(np.isfinite(found.distances)), found.contradicting)
+    limits = np.full(len(points), np.inf)
+    limits[counted] = found.noise * np.sqrt(chdtri(freedom[counted], _LEVEL / len(counted)))
+    rms_limit = found.noise * np.sqrt(chdtri(freedom[counted].sum(), _LEVEL) / len(counted))
+    before = found.distances
+    rms_before, rms_after = (float(np.sqrt((each[counted] ** 2).mean())) for each in (before, after))
+    return PointAgreement(before, after, limits, rms_before, rms_after, float(rms_limit))

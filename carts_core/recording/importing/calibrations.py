@@ -16,7 +16,7 @@ from ...errors import SequenceError, SettingsError
 from ...files.decoding import decoded
 from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_yaml, read_text
 from ...model.camera import DISTORTION_LENGTHS, T_DVRK_OPENCV, rigid_transform
-from ...settings.importing import Axes
+from ...settings.interchange import Axes
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _PINHOLES = ("pinhole", "perspective", "")

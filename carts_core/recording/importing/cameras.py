@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.camera import implausible_intrinsics
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import SUFFIXES, Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration

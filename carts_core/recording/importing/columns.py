@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..kinematics_table import LENGTH_UNITS, Joint, joints_of
 from .cameras import IMAGE_SUFFIXES
 from .foreign_tables import ForeignTable

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 
 NoteKind = Literal["found", "guessed", "missing", "warning"]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...errors import SequenceError
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ...wording import closest, shown
 from ..sources import SOURCES, Source
 from .found import FoundRecording

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.instruments import robot_file
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..kinematics_table import ANGLE_UNITS, LENGTH_UNITS, Joint, fits_roughly, joints_of, misfits
 from .found import FoundArm, Note
 

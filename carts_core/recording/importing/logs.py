@@ -12,7 +12,7 @@ from ...errors import CartsError, SequenceError
 from ...model import ecm_kinematics
 from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ...wording import counted
 from ..kinematics_table import Joint
 from .calibrations import read_base_frames

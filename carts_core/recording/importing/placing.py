@@ -12,7 +12,7 @@ from ...errors import SequenceError
 from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, forward
 from ...model.robot import Robot
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ...wording import counted
 from .cameras import check_intrinsics, placed_cameras
 from .found import FoundArm, FoundCamera, FoundRecording, Note

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...errors import SequenceError
-from ...settings.importing import SECONDS, Clock, ImportOptions
+from ...settings.interchange import SECONDS, Clock, ImportOptions
 from ...wording import counted
 from .cameras import Images
 from .found import FoundArm, Note

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ...errors import SequenceError
 from ...model import ecm_kinematics
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..image_sources import BAG_SUFFIXES, Bag, decode_message
 from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of
 from ..importing.columns import order_of_names, rows_of, strange_names

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..images import mask_remarks, read_mask, spread_files
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.foreign_tables import read_array, read_foreign_table

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
 from ...files.reading import TABLE, VALUES, parse_yaml, read_text
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ...wording import listed
 from ..importing.cameras import cameras_of, common_ids, find_images, image_files
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source

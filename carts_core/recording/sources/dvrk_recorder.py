@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..image_sources import Bag
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import order_of_names

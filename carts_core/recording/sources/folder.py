@@ -8,7 +8,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import NO_TABLE, ImportOptions
+from ...settings.interchange import NO_TABLE, ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table

@@ -10,7 +10,7 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...imports import needs_extra
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet

@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.importing import ImportOptions
+from ...settings.interchange import ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table

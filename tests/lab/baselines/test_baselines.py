@@ -23,7 +23,7 @@ from carts_core.lab.baselines.training import (
 )
 from carts_core.networks.weights import read_weights
 from carts_core.settings import Architecture
-from carts_core.settings.baseline import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
+from carts_core.settings.training import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
 
 SMALLEST = {
     "unet": {"unet": Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)},

@@ -16,7 +16,7 @@ from carts_core.lab.benchmark.tables import main_tables
 from carts_core.lab.benchmark.targets import image_alone_table, image_alone_targets
 from carts_core.lab.synthesis import DOMAINS
 from carts_core.settings import Architecture
-from carts_core.settings.baseline import BaselineNetwork
+from carts_core.settings.training import BaselineNetwork
 
 SMALLEST = {
     "unet": BaselineNetwork("unet", unet=Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)),

@@ -29,7 +29,7 @@ from carts_core.model.ecm_kinematics import forward as ecm
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.rendering import Renderer
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 
 KINDS = {
     "ROS 2 sqlite3, dVRK 2.2": ("bag", BagKind()),

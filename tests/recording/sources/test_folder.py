@@ -19,7 +19,7 @@ from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.recording.importing.writing import write_sequence
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 
 FRAMES = 5
 ROS_YAML = f"""image_width: {SIZE[0]}

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from carts_core.errors import CartsError
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.importer import find
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 from carts_viewer.recording.changes import changed
 from carts_viewer.recording.draft import Draft
 from carts_viewer.recording.form import check_form

@@ -31,7 +31,7 @@ from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.importer import find, import_recording
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 
 FRAMES = 8
 RATE = 4.0

@@ -15,7 +15,7 @@ from carts_core.errors import CartsError
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
-from carts_core.settings.importing import ImportOptions
+from carts_core.settings.interchange import ImportOptions
 
 FRAMES = 6
 LENGTHS = (4, FRAMES)

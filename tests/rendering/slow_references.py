@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..model.scene import Light
-from .rasterizer import BACKGROUND, NEAR
+from carts_core.model.scene import Light
+from carts_core.rendering.rasterizer import BACKGROUND, NEAR
 
 
 def visibility_ref(

@@ -1,4 +1,4 @@
-"""What a person can say about a recording; everything else is found or guessed, and each guess is shown."""
+"""Settings of imports and exports."""
 
 import math
 import re
@@ -76,3 +76,29 @@ class ImportOptions:
             if unit not in (*get_args(AngleUnit), *get_args(LengthUnit)):
                 allowed = ", ".join((*get_args(AngleUnit), *get_args(LengthUnit)))
                 raise SettingsError(f"the unit of {joint} is {unit!r}; allowed is {allowed}.")
+
+
+FormatName = Literal[
+    "masks",
+    "coco",
+    "coco-keypoints",
+    "bop",
+    "yolo",
+    "voc",
+    "cvat",
+    "datumaro",
+    "csv",
+    "npz",
+    "json",
+    "dvrk",
+    "dvrk-2.3",
+    "dvrk-suj",
+    "video",
+]
+"""Names of the export formats."""
+
+Parts = Literal["arms", "parts", "links"]
+"""What gets a category of its own: every arm, every part of it (shaft, wrist, jaws), or every link."""
+
+Images = Literal["named", "copied", "none"]
+"""Images of an export: labels name the recording's own files, or copies of them, byte for byte, or none are written."""

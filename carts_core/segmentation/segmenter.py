@@ -1,20 +1,64 @@
-"""The segmenter that ships: where our network sees instruments, with outlines along the edges of the image.
-
-The network says roughly which pixels are instrument, without knowing of any arm. GrabCut (Rother et al., SIGGRAPH 2004)
-draws the outline: it decides the pixels near the network's outline by colour and by edges. Where the network sees no
-instrument, colour and edges around the place decide alone.
-"""
+"""Prompts, the protocol of segmenters, and the built-in segmenter."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
+from ..errors import SettingsError
 from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..networks import FeatureExtractor
-from .prompt import Prompt
+
+MOST_POINTS = 100
+"""Of one prompt."""
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """Where something is in an image: points on it, points beside it, a box around it.
+
+    Raises:
+        SettingsError: neither a point on it nor a box, too many points, a place that is not finite, or an empty box.
+    """
+
+    inside: tuple[tuple[float, float], ...] = ()
+    """Points on it: column and row, pixel centres at 0.5 [px]."""
+    outside: tuple[tuple[float, float], ...] = ()
+    """Points beside it [px]."""
+    box: tuple[float, float, float, float] | None = None
+    """Left, top, right and lower end of a box that it is in [px]."""
+
+    def __post_init__(self) -> None:
+        if not self.inside and self.box is None:
+            raise SettingsError("a prompt needs a point on the thing, or a box around it.")
+        if len(self.inside) + len(self.outside) > MOST_POINTS:
+            raise SettingsError(f"a prompt has at most {MOST_POINTS} points. Begin another one.")
+        numbers = [value for place in (*self.inside, *self.outside, self.box or ()) for value in place]
+        if not np.isfinite(numbers).all():
+            raise SettingsError("a place of a prompt is not finite.")
+        if self.box is not None and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
+            raise SettingsError(f"the box {self.box} is empty. Give left, top, right and lower end.")
+
+
+class Segmenter(Protocol):
+    """Segments what a prompt points at; a plug-in may be anything that has this method."""
+
+    def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
+        """The mask of what is there.
+
+        Args:
+            image: RGB.
+            prompt: places in it.
+
+        Raises:
+            CartsError: it could not be done.
+        """
+        ...
+
 
 _LONGEST_SIDE = 640
 """Of the image that outlines are looked for in [px]."""

@@ -1,7 +1,8 @@
-"""Camera images as an objective takes them: checked, in the working size, stacked."""
+"""Images in the working size: checks, stacking, filters, and the window that is compared."""
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -9,10 +10,72 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn import functional
 
 from ..errors import SettingsError
 from ..model.scene import Scene
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of the working image [px]."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def area(self) -> int:
+        """Number of pixels."""
+        return self.width * self.height
+
+    @staticmethod
+    def around(silhouette: Float[Tensor, "cameras h w"], margin: int, multiple: int, size: tuple[int, int]) -> "Window":
+        """What holds the silhouettes of all cameras with a margin, in multiples of a size; all where they are empty."""
+        covered = silhouette.amax(0) > 0
+        columns, rows = covered.any(0).nonzero()[:, 0], covered.any(1).nonzero()[:, 0]
+        if not len(columns):
+            return Window(0, 0, *size)
+        spans = []
+        for index, length in ((columns, size[0]), (rows, size[1])):
+            first = max(int(index[0]) - margin, 0) // multiple * multiple
+            last = min(-(-(int(index[-1]) + 1 + margin) // multiple) * multiple, length)
+            spans.append((first, last - first))
+        return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
+
+    def holds(self, other: "Window") -> bool:
+        """Whether another window lies within this one."""
+        return (
+            self.left <= other.left
+            and self.top <= other.top
+            and self.left + self.width >= other.left + other.width
+            and self.top + self.height >= other.top + other.height
+        )
+
+    def common(self, other: "Window") -> "Window | None":
+        """What lies in both; None if nothing does."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right = min(self.left + self.width, other.left + other.width)
+        bottom = min(self.top + self.height, other.top + other.height)
+        return Window(left, top, right - left, bottom - top) if left < right and top < bottom else None
+
+    def inside(self, outer: "Window") -> "Window":
+        """This window as a part of one that holds it."""
+        return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
+
+    def reduced(self, factor: int) -> "Window":
+        """This part of an image that is so many times smaller."""
+        return Window(self.left // factor, self.top // factor, self.width // factor, self.height // factor)
+
+    def of(self, image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch {self.height} {self.width}"]:
+        """This part of an image."""
+        return image[..., self.top : self.top + self.height, self.left : self.left + self.width]
+
+    def paste(self, part: Float[Tensor, "*batch h w"], whole: Float[Tensor, "*batch H W"]) -> Tensor:
+        """`whole` with this part of it replaced, in place."""
+        self.of(whole)[...] = part
+        return whole
 
 
 def stacked_images(
@@ -99,7 +162,7 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
 def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]:
     """The mean around each pixel, over what a square of an odd side [px] has in common with the image."""
     if image.device.type != "cpu":
-        return avg_pool2d(image, side, stride=1, padding=side // 2, count_include_pad=False)
+        return functional.avg_pool2d(image, side, stride=1, padding=side // 2, count_include_pad=False)
     sums, counts = (
         cv2.boxFilter(values, cv2.CV_32F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
         for values in (image[0].contiguous().numpy(), np.ones(image.shape[1:], np.float32))
@@ -110,3 +173,17 @@ def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]
 def kernel_radius(deviation: float) -> int:
     """How far a blur of that deviation [px] reaches [px]."""
     return math.ceil(2.5 * deviation)
+
+
+def attention(silhouette: Float[Tensor, "*batch h w"], radius: int) -> Float[Tensor, "*batch h w"]:
+    """Att of the paper: the silhouette dilated by `radius` [px], without gradient."""
+    flat = silhouette.detach().reshape(-1, *silhouette.shape[-2:])
+    size = 2 * radius + 1
+    if flat.device.type == "cpu":
+        # As fast for a large radius as for a small one.
+        square = np.ones((size, size), np.uint8)
+        flat = torch.from_numpy(np.stack([cv2.dilate(image, square) for image in flat.contiguous().numpy()]))
+    else:
+        flat = functional.max_pool2d(flat, (size, 1), stride=1, padding=(radius, 0))
+        flat = functional.max_pool2d(flat, (1, size), stride=1, padding=(0, radius))
+    return flat.view(silhouette.shape)
