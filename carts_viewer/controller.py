@@ -1,6 +1,6 @@
-"""Hands every intent to its handler, and goes on with what takes long.
+"""Dispatches intents to handlers and advances what takes long: one controller a tab, one background for all tabs.
 
-Runs on the worker's thread alone, knows neither threads nor widgets.
+Runs on the worker's thread alone; independent of threads and widgets.
 """
 
 import time
@@ -9,26 +9,131 @@ from contextlib import suppress
 from typing import Any
 
 from carts_core.errors import CartsError
-from carts_viewer import intents
-from carts_viewer.background import Background
-from carts_viewer.checks import unknown
-from carts_viewer.context import Context
-from carts_viewer.handlers.annotating import AnnotatingHandler
-from carts_viewer.handlers.browsing import BrowsingHandler
-from carts_viewer.handlers.dragging import DraggingHandler
-from carts_viewer.handlers.exporting import Deliver, shown_mask
-from carts_viewer.handlers.finding import FindingHandler
-from carts_viewer.handlers.importing import ImportingHandler
-from carts_viewer.handlers.live import LiveHandler
-from carts_viewer.handlers.marking import MarkingHandler
-from carts_viewer.handlers.optimizing import OptimizingHandler
-from carts_viewer.handlers.painting import PaintingHandler
-from carts_viewer.handlers.posing import PosingHandler
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.people import LONGEST_NAME
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.actions import intents
+from carts_viewer.actions.browsing import BrowsingHandler
+from carts_viewer.actions.context import Context, unknown
+from carts_viewer.actions.exchange import Deliver, ExportingHandler, ImportingHandler, shown_mask
+from carts_viewer.actions.jobs import Asker, JobsHandler
+from carts_viewer.actions.live import LiveHandler
+from carts_viewer.actions.optimizing import OptimizingHandler
+from carts_viewer.actions.painting import PaintingHandler
+from carts_viewer.actions.posing import DraggingHandler, PosingHandler
+from carts_viewer.actions.reviewing import AnnotatingHandler, FindingHandler
+from carts_viewer.actions.sequence import MarkingHandler, PropagatingHandler
+from carts_viewer.editing import LONGEST_NAME, Person
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+
+
+class NoRun:
+    """In the background, no run of a shown frame is open."""
+
+    def end(self, reason: str | None) -> None:
+        """There is none."""
+
+    def forget(self) -> None:
+        """There is none."""
+
+
+class Background:
+    """Works on jobs bit by bit, whoever has asked for them and whether or not they are still there."""
+
+    def __init__(
+        self,
+        state: ViewState,
+        session: Session,
+        renderer: OverlayRenderer,
+        optimizers: OptimizerFactory,
+        deliver: Deliver,
+    ) -> None:
+        """
+        Args:
+            state: with what jobs of an earlier viewer are done.
+            session: the recording and its project, for nobody else.
+            renderer: renders poses.
+            optimizers: makes optimizers.
+            deliver: sends a file to a tab.
+        """
+        self._context = context = Context(state, session, renderer)
+        self._propagating = PropagatingHandler(context, NoRun(), optimizers)
+        self._exporting = ExportingHandler(context, NoRun(), deliver)
+        self._jobs = JobsHandler(context, NoRun(), optimizers, self._propagating, self._exporting)
+        # What takes long is queued; the rest of its kind is done at once.
+        self._kinds: dict[type[intents.Intent], Callable[[Any, Asker], None]] = {
+            intents.Solve: self._jobs.ask,
+            intents.Export: self._jobs.ask,
+            intents.Jobs: self._jobs.ask,
+            intents.Propagating: lambda intent, _: self._propagating.handle(intent),
+            intents.Exporting: lambda intent, _: self._exporting.handle(intent),
+        }
+
+    @property
+    def state(self) -> ViewState:
+        """Of which `jobs`, `solve` and `export` are for everybody."""
+        return self._context.state
+
+    def takes(self, intent: intents.Intent) -> bool:
+        """Whether an intent is one for the background."""
+        return isinstance(intent, tuple(self._kinds))
+
+    def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
+        """Do what somebody's intent asks for.
+
+        Args:
+            intent: what.
+            person: who.
+            state: what they see and have chosen.
+
+        Raises:
+            CartsError: with a text for people.
+        """
+        self._context.refresh()
+        handle = next((handle for kind, handle in self._kinds.items() if isinstance(intent, kind)), None)
+        if handle is None:
+            raise unknown(intent)
+        handle(intent, Asker(person, state))
+        self._jobs.settle()
+
+    def wait_time(self) -> float | None:
+        """How long nothing needs to be done unless somebody asks [s]; None for ever."""
+        handlers = (self._propagating, self._exporting, self._jobs)
+        return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
+
+    def advance(self) -> None:
+        """Do one bit of what is going on: a frame to be solved or exported, a step of a job.
+
+        Raises:
+            CartsError: it failed, and so did its job.
+        """
+        try:
+            self._propagating.advance()
+            self._exporting.advance()
+        except Exception as error:
+            self._jobs.fail(str(error))
+            raise
+        self._jobs.advance()
+
+    def fail(self, text: str) -> None:
+        """Stop whatever is going on, because of an error of it."""
+        # What is solved is not lost to an error of something else; its own errors have saved it already.
+        with suppress(CartsError):
+            self._propagating.finish()
+        self._exporting.cancel()
+        self._jobs.fail(text)
+
+    def close(self) -> None:
+        """Save what is under way; exports are abandoned.
+
+        Raises:
+            CartsError: it could not be saved.
+        """
+        self._exporting.cancel()
+        self._propagating.finish()
+        self._jobs.close()
+        self._context.save()
+
 
 _BEGINNING = (
     intents.Solve,

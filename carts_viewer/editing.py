@@ -1,10 +1,197 @@
-"""Edits on their way into the project: what is still under somebody's hand, and what is saved."""
+"""Edits by several users: drafts, steps of undo, and who owns a step.
+
+A single tab goes back and forth in the history as it is. With several tabs, undo reverts the tab's own last step, or
+one from before the viewer started that belongs to no other user, by a new step that leaves the steps of others in
+place.
+"""
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from carts_core.errors import CartsError, ProjectError
 from carts_core.project import Change, Edits, Figures, Project, ProjectState, Step
-from carts_viewer.people import People, Person
+
+LONGEST_NAME = 30
+"""Characters of a person's name."""
+
+
+@dataclass(eq=False)
+class Person:
+    """Somebody who works in one tab."""
+
+    number: int
+    """From 1, in the order in which they came."""
+    chosen: str = ""
+    """The name that they have chosen; empty if none."""
+    present: bool = True
+    """Whether their tab is open."""
+    index: int = 0
+    """Of the frame that they are on."""
+    undone: list[int] = field(default_factory=list)
+    """Steps by which they took back others, which redo takes back in turn, the newest last."""
+
+    @property
+    def name(self) -> str:
+        """What others call them."""
+        return self.chosen or f"Tab {self.number}"
+
+
+class People:
+    """Everybody who works on a project, and their way into its history. Used on the worker's thread alone.
+
+    Attributes:
+        project: the project.
+        persons: in the order in which they came.
+    """
+
+    def __init__(self, project: Project) -> None:
+        self.project = project
+        self.persons: list[Person] = []
+        self._makers: dict[int, Person] = {}
+        """By number of step, as far as it was made since the viewer started."""
+        self._reverted: set[int] = set()
+        """Steps that were taken back by a later one, and those later ones."""
+
+    def join(self) -> Person:
+        """Somebody new."""
+        person = Person(max((person.number for person in self.persons), default=0) + 1)
+        self.persons.append(person)
+        return person
+
+    def leave(self, person: Person) -> None:
+        """Forget somebody; their steps are nobody's then."""
+        self.persons.remove(person)
+        self._makers = {number: maker for number, maker in self._makers.items() if maker is not person}
+
+    @property
+    def several(self) -> bool:
+        """Whether more than one is at work."""
+        return sum(person.present for person in self.persons) > 1
+
+    def apply(
+        self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
+    ) -> Change | None:
+        """Save a step of somebody's, with their name where they have one or are not alone; errors as `Project.apply`.
+
+        Args:
+            person: who.
+            name: of the step.
+            edits: what changes.
+            figures: of frames with these edits.
+        """
+        person.undone.clear()
+        return self._apply(person, name, edits, figures)
+
+    def claim(self, person: Person) -> None:
+        """The newest step, which was saved in no other name, is this person's."""
+        self._makers[self.project.state.position] = person
+
+    def can_undo(self, person: Person) -> bool:
+        """Whether there may be something that this person can take back."""
+        return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
+
+    def can_redo(self, person: Person) -> bool:
+        """Whether there is something that this person can do again."""
+        return bool(person.undone) or self._next_is_free(person)
+
+    def undo(self, person: Person) -> Change | None:
+        """Take back a person's last step, or one that has no owner; None if there is neither.
+
+        Raises:
+            CartsError: a later step has changed the same.
+            ProjectError: it could not be saved.
+        """
+        position, own = self.project.state.position, self._last(person, free=self.several)
+        if not self.several and own in (None, position):
+            return self.project.go_to(max(position - 1, 0))
+        if own is None:
+            return None
+        try:
+            edits, figures = self.project.reverting(own)
+        except ProjectError as error:
+            self._reverted.add(own)
+            raise CartsError(f"{error} Undo again to go on with your step before it.") from error
+        change = self._revert(person, own, "Undo", edits, figures)
+        person.undone.append(self.project.state.position)
+        return change
+
+    def redo(self, person: Person) -> Change | None:
+        """Do again what somebody took back last; None if there is nothing. Errors as `undo`."""
+        if person.undone:
+            number = person.undone[-1]
+            person.undone.pop()
+            change = self._revert(person, number, "Redo", *self.project.reverting(number))
+            # What was done again can be taken back again.
+            self._reverted.discard(self.project.state.position)
+            return change
+        return self.project.go_to(self.project.state.position + 1) if self._next_is_free(person) else None
+
+    def go_to(self, person: Person, position: int) -> Change | None:
+        """Go to a place in the history.
+
+        Raises:
+            CartsError: that would take back what somebody else at work has done.
+            ProjectError: it could not be saved.
+        """
+        project = self.project
+        between = range(min(position, project.state.position) + 1, max(position, project.state.position) + 1)
+        others = [
+            maker.name
+            for number in between
+            if (maker := self._makers.get(number)) is not None and maker is not person and maker.present
+        ]
+        if others:
+            raise CartsError(
+                f"Between here and there are steps of {', '.join(sorted(set(others)))}, who is at work now. Take back "
+                "your own with Undo, or wait until you are alone."
+            )
+        person.undone.clear()
+        return project.go_to(position)
+
+    def _last(self, person: Person, *, free: bool) -> int | None:
+        """The last step that is done, was not taken back and is this person's or, where `free`, of no known person."""
+        owners = (person, None) if free else (person,)
+        done = range(self.project.state.position, 0, -1)
+        return next((n for n in done if n not in self._reverted and self._maker(n) in owners), None)
+
+    def _maker(self, number: int) -> Person | None:
+        """Who made a step; for one from before the viewer started, the person whose name it begins with."""
+        if number in self._makers:
+            return self._makers[number]
+        name = self.project.state.steps[number - 1].name
+        return next((one for one in self.persons if one.chosen and name.startswith(f"{one.chosen}: ")), None)
+
+    def _next_is_free(self, person: Person) -> bool:
+        """Whether the step that was undone last is nobody else's at work."""
+        state = self.project.state
+        if state.position == len(state.steps):
+            return False
+        maker = self._makers.get(state.position + 1)
+        return maker is person or not self.several
+
+    def _revert(
+        self, person: Person, number: int, verb: str, edits: Edits, figures: Mapping[int, Figures]
+    ) -> Change | None:
+        name = self.project.state.steps[number - 1].name
+        for known in ("Undo: ", "Redo: ", f"{person.name}: "):
+            name = name.replace(known, "")
+        change = self._apply(person, f"{verb}: {name}", edits, figures)
+        self._reverted |= {number, self.project.state.position}
+        return change
+
+    def _apply(self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None) -> Change | None:
+        named = f"{person.name}: {name}" if person.chosen or self.several else name
+        change = self.project.apply(named, edits, figures)
+        if change is not None and change.step is not None:
+            number = change.step.number
+            if max(self._makers, default=0) >= number:
+                # Steps that were undone are gone now.
+                self._makers = {known: maker for known, maker in self._makers.items() if known < number}
+                self._reverted = {known for known in self._reverted if known < number}
+            self._makers[number] = person
+        return change
+
 
 LONGEST_DRAFT = 5.0
 """After this long without a change, an edit counts as finished even if nobody said so [s]."""

@@ -1,24 +1,30 @@
-"""`carts view`: serves the viewer of a sequence until somebody ends it."""
+"""`carts view`: serves the viewer or the start page until a signal ends it."""
 
+import html
 import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO, TypeVar
+from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
+from carts_core.files import write_text
 from carts_core.segmentation import Segmenter
 from carts_core.settings.optimization import Inference
 from carts_viewer.app import ViewerApp
-from carts_viewer.ending import EndRequest
-from carts_viewer.opening import opened_in_browser
 from carts_viewer.transport.guard import check_address
 
 if TYPE_CHECKING:
     from carts_viewer.start.site import Site
+
 
 Served = TypeVar("Served", ViewerApp, "Site")
 
@@ -191,3 +197,75 @@ def _say(text: str, to: TextIO | None = None) -> None:
         with suppress(OSError, ValueError):
             # Python flushes once more at the end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+_SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+
+
+class EndRequest:
+    """While entered, these signals end `wait`; until `ready` they do as before, or raise `KeyboardInterrupt`.
+
+    After that they do nothing else, so what is being saved is saved. A signal that is ignored (`nohup`) stays so.
+    """
+
+    def __init__(self) -> None:
+        self._former: dict[int, Any] = {}
+        self._ready = False
+        # A handler may run between any two instructions, where it must not wait for a lock; writing a byte it may.
+        self._asked, self._ask = os.pipe()
+        os.set_blocking(self._ask, False)
+
+    def __enter__(self) -> "EndRequest":
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._former[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        os.close(self._asked)
+        os.close(self._ask)
+
+    def ready(self) -> None:
+        """From now on a signal is no exception."""
+        self._ready = True
+
+    def wait(self) -> None:
+        """Until one of the signals comes, or has come since `ready`."""
+        os.read(self._asked, 1)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if not self._ready:
+            former = self._former[number]
+            if not callable(former):
+                raise KeyboardInterrupt
+            former(number, frame)
+            return
+        try:
+            os.write(self._ask, b"x")
+        except BlockingIOError:
+            return  # It was asked often enough.
+
+
+_PAGE = '<!DOCTYPE html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={url}"><title>CaRTS</title>'
+
+
+@contextmanager
+def opened_in_browser(url: str) -> Iterator[None]:
+    """Open a page; until the block ends, the file that leads there is kept.
+
+    The command line of a browser can be read by everybody on this computer. So a url with a token is not put there but
+    into a file in a folder that this user alone may look into, and the browser is given that file.
+    """
+    if "token=" not in url:
+        webbrowser.open(url)
+        yield
+        return
+    with TemporaryDirectory(prefix="carts-") as folder:
+        page = Path(folder) / "open.html"
+        write_text(page, _PAGE.format(url=html.escape(url)))
+        page.chmod(0o600)
+        webbrowser.open(page.as_uri())
+        yield

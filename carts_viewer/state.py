@@ -1,9 +1,10 @@
-"""The one immutable state of the app: what is shown, what is being done. The worker replaces it, panels read it."""
+"""The immutable state of a tab: what is shown and what is under way. The worker replaces it, panels read it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -11,16 +12,57 @@ from carts_core.model.scene import SceneState
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings
 from carts_core.optimization.keypoints import Pin
 from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, PartLabels, ProjectState, Review, Source
+from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import Frame
 from carts_core.settings import Direction, SolverName
-from carts_viewer.compare import Compare
-from carts_viewer.finding import FrameFilter
-from carts_viewer.jobs import Job
-from carts_viewer.joint_range import Reach
-from carts_viewer.layers import Layer
-from carts_viewer.observing import Observed
-from carts_viewer.solve_state import SolveState
-from carts_viewer.strokes import Brush
+from carts_viewer.actions.frame_filter import FrameFilter
+from carts_viewer.choices import Compare, Observed, Reach
+from carts_viewer.jobs.job_list import Job
+from carts_viewer.picture.layers import Layer
+from carts_viewer.picture.strokes import Brush
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """A frame that somebody should look at after many were solved together."""
+
+    index: int
+    reason: str
+    """For people."""
+    taken: bool
+    """Whether what was solved is in the project; otherwise the frame is as it was, until somebody takes it."""
+
+
+@dataclass(frozen=True)
+class SolveState:
+    """Solving many frames together, or how it ended."""
+
+    frames: range
+    """From the first to the last one, kept frames included."""
+    done: int = 0
+    """Frames that were visited."""
+    compared: int = 0
+    """Frames that were compared with how they were, which comes after that."""
+    running: bool = True
+    text: str = ""
+    """How it goes, for people."""
+    listed: tuple[ListedFrame, ...] = ()
+    """Frames whose fit became worse, or is doubtful."""
+    base_frame_gain: float | None = None
+    """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
+    calibration: Any = None
+    """The project's calibration that this is about."""
+
+    def suspicion(self, project: ProjectState) -> float | None:
+        """`base_frame_gain`, as long as nothing runs and the project's calibration is the same."""
+        same = project.records.get(WHOLE_PROJECT) is self.calibration
+        return self.base_frame_gain if same and not self.running else None
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Steps that are done, and all of them: every frame is visited, and then compared."""
+        return self.done + self.compared, 2 * len(self.frames)
+
 
 Frames = range
 """Neighbouring frames, by index; `ViewState` has a field called `range`."""

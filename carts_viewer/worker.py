@@ -9,10 +9,8 @@ from queue import SimpleQueue
 
 from carts_core.errors import CartsError
 from carts_core.process import return_memory
-from carts_viewer import intents
-from carts_viewer.intent_queue import Asked, IntentQueue
-from carts_viewer.tab import Tab
-from carts_viewer.tabs import Tabs
+from carts_viewer.actions import intents
+from carts_viewer.tabs import Asked, IntentQueue, Tab, Tabs
 
 _log = logging.getLogger(__name__)
 

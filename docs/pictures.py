@@ -19,11 +19,11 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 from carts_core.model.keypoints import project_keypoints
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.marks import labelled_keypoints
+from carts_viewer.picture.overlay import labelled_keypoints
+from carts_viewer.picture.strokes import Stroke, Target
 from carts_viewer.state import Phase
-from carts_viewer.strokes import Stroke, Target
 
 IMAGES = Path(__file__).parent / "images"
 WINDOW: ViewportSize = {"width": 1280, "height": 800}

@@ -161,7 +161,7 @@ TRAINING = (
 PARENTS = {
     "training": f"""
 import sys, time
-from carts_viewer.adapting import _Training
+from carts_viewer.jobs.work import _Training
 training = _Training([sys.argv[1], *"{TRAINING}".split()])
 time.sleep(600)
 """,

@@ -18,9 +18,9 @@ import numpy as np
 
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.scene_view import OVERLAY
+from carts_viewer.picture.scene_view import OVERLAY
 from tools.bench_start import print_starts
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab

@@ -21,9 +21,9 @@ import numpy as np
 from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.scene_view import OVERLAY
-from carts_viewer.tab import Tab, View
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.picture.scene_view import OVERLAY
+from carts_viewer.tabs import Tab, View
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 

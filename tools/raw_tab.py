@@ -14,7 +14,7 @@ import zstandard
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from carts_viewer.scene_view import OVERLAY
+from carts_viewer.picture.scene_view import OVERLAY
 
 _CAMERA = {
     "type": "ViewerCameraMessage",

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import viser
 
 from carts_core.console import visible
-from carts_viewer.intents import Intent, Refresh
+from carts_viewer.actions.intents import Intent, Refresh
 from carts_viewer.state import ViewState
 from carts_viewer.transport.viser_private import on_sent
 

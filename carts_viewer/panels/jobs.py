@@ -5,12 +5,11 @@ import time
 import viser
 
 from carts_core.wording import spoken_time
-from carts_viewer import intents
-from carts_viewer.jobs import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
-from carts_viewer.networks import STARTED
-from carts_viewer.panels.calibration_hint import newest_calibration
+from carts_viewer.actions import intents
+from carts_viewer.jobs.job_list import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
+from carts_viewer.jobs.networks import STARTED
 from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
-from carts_viewer.panels.keyframes import whole_label
+from carts_viewer.panels.sequence import newest_calibration, whole_label
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 

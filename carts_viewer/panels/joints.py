@@ -1,14 +1,16 @@
-"""Joint positions by hand: a slider with a number field per joint, in degrees and millimetres, and what undoes them."""
+"""Panels of joint positions: sliders, a table of values, and keypoints."""
 
 import math
 from collections.abc import Callable
 
 import viser
 
-from carts_viewer import intents
-from carts_viewer.handlers.posing import LARGEST_PERTURBATION
-from carts_viewer.joint_range import JointRange, Reach
-from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
+from carts_core.settings import SurfaceSolver
+from carts_viewer.actions import intents
+from carts_viewer.actions.posing import LARGEST_PERTURBATION
+from carts_viewer.choices import JointRange, Reach
+from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, valid, write
+from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
@@ -155,3 +157,110 @@ def from_shown(limits: JointRange, shown: float) -> float:
 
 def _tidy(value: float) -> float:
     return round(value) if math.isfinite(value) else value
+
+
+_UNSURE = 1.0
+"""Standard deviation from which a joint's value is a guess [deg] and [mm]: less than half of what arms are off by."""
+_EXPECTED = SurfaceSolver()
+_UNUSUAL = (
+    2.0 * _EXPECTED.prior_deg,
+    2e3 * math.radians(_EXPECTED.prior_deg) * _EXPECTED.length_scale,
+)
+"""Corrections that are rare, twice the deviation that the solver expects of measured joints [deg] and [mm]."""
+_EXPLAINED = (
+    f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
+    "hardly show this joint. Its value is a guess; the mask hardly depends on it.<br>"
+    f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm, which is "
+    "rare in real arms. Smaller changes are usual."
+)
+
+
+class ValuesPanel:
+    """By how much every joint of the shown frame was corrected."""
+
+    def __init__(self, gui: viser.GuiApi, session: Session) -> None:
+        self._session = session
+        self._table = gui.add_html("")
+
+    def show(self, state: ViewState) -> None:
+        """Bring the table up to date."""
+        shown = self._session.joints(state.pose.scene)
+        truth = state.frame.truth or {}
+        known = {arm: value.standard_deviations for arm, value in state.project.joints(state.index).items()}
+        columns = ["", "Measured", "Now", "Change", "±", *(["Error"] if truth else [])]
+        rows = ["".join(f"<th>{name}</th>" for name in columns)]
+        for arm in self._session.scene.arms:
+            rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
+            ranges = [limits for limits in self._session.ranges if limits.arm == arm.name]
+            for joint, limits in enumerate(ranges):
+                measured = to_shown(limits, float(state.frame.measured[arm.name][joint]))
+                now = to_shown(limits, float(shown[arm.name][joint]))
+                cells = [
+                    f"{measured:.2f}",
+                    f"{now:.2f}",
+                    _marked(_signed(now - measured), abs(now - measured) > _UNUSUAL[0 if limits.revolute else 1]),
+                    _deviation(limits, known.get(arm.name), joint),
+                ]
+                if arm.name in truth:
+                    cells.append(_signed(now - to_shown(limits, float(truth[arm.name][joint]))))
+                unit = "°" if limits.revolute else "mm"
+                name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
+                rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        self._table.content = f'<table class="carts-values">{body}</table><p class="carts-caption">{_EXPLAINED}</p>'
+
+
+def _signed(difference: float) -> str:
+    """With its sign, unless it is nothing to speak of."""
+    return f"{difference:+.2f}" if abs(difference) >= 0.005 else "0.00"
+
+
+def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
+    """Standard deviation of a joint as people read it; nothing where it is not known."""
+    value = known[joint] if known else None
+    if value is None:
+        return ""
+    shown = to_shown(limits, value)
+    return _marked(f"{shown:.2f}", shown > _UNSURE)
+
+
+def _marked(text: str, on: bool) -> str:
+    return f'<span class="carts-unsure">{text}</span>' if on else text
+
+
+_NEAREST = "Nearest to the pointer"
+
+
+class KeypointsPanel:
+    """The keypoint to place by a click or a drag, and the residuals of those that were placed."""
+
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
+        self._labels = {point: label for label, point in labelled_keypoints(session.scene).items()}
+        with gui.add_folder("Keypoints"):
+            gui.add_html(
+                '<p class="carts-caption"><b>Shift+click</b> on the picture: the chosen keypoint is there. '
+                "<b>Shift+drag</b> takes it along. The arm follows at once; a run starts there, and the clicks do not "
+                "pull on it.</p>"
+            )
+            options = [_NEAREST, *self._labels.values()]
+            self._chosen = gui.add_dropdown("Keypoint", options)
+            self._shown = gui.add_checkbox("Show keypoints", False)
+            self._residuals = gui.add_html("")
+            self._forget = gui.add_button("Forget the clicks", icon=viser.Icon.X, color="gray", visible=False)
+        on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label), emit)
+        on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)), emit)
+        on_click(self._forget, lambda _: intents.ForgetPins(), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        keypoints = state.keypoints
+        write(self._chosen, keypoints.chosen or _NEAREST)
+        write(self._shown, keypoints.shown)
+        self._forget.visible = bool(keypoints.pins)
+        rows = [
+            f"<tr><td>{escaped(self._labels[pin.keypoint])} <small>({escaped(pin.camera)})</small></td>"
+            f"<td>{residual:.1f} px off</td></tr>"
+            for pin, residual in zip(keypoints.pins, keypoints.residuals, strict=True)
+        ]
+        self._residuals.content = f'<table class="carts-values">{"".join(rows)}</table>'

@@ -4,12 +4,12 @@ import viser
 
 from carts_core.model.parts import part_classes
 from carts_core.settings import DescentSolver
-from carts_viewer import intents
-from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, label_color
+from carts_viewer.actions import intents
 from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write
+from carts_viewer.picture.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, label_color
+from carts_viewer.picture.strokes import DIAMETERS, Target, Tool
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.strokes import DIAMETERS, Target, Tool
 from carts_viewer.transport.tab_page import TabPage
 
 _ICONS = {

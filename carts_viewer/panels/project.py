@@ -1,12 +1,13 @@
-"""Where everything is saved, whether it is, undo and redo, and the history to go to any step."""
+"""Panels of the project: saving, undo, history, users, and errors."""
 
 import viser
 
-from carts_viewer import intents
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.actions import intents
+from carts_viewer.editing import LONGEST_NAME
+from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write
 from carts_viewer.panels.jobs import jobs_question, network_question
+from carts_viewer.session import Storage
 from carts_viewer.state import ViewState
-from carts_viewer.storage import Storage
 from carts_viewer.transport.tab_page import TabPage
 
 _LISTED = 60
@@ -76,3 +77,67 @@ class HistoryPanel:
             self._positions = positions
             self._steps.options = tuple(positions)
         write(self._steps, next(label for label, number in positions.items() if number == project.position))
+
+
+class PeoplePanel:
+    """One's own name, everybody else with the frame that they are on, and a button that copies the link."""
+
+    def __init__(self, page: TabPage, state: ViewState, emit: Emit, waits: Waits) -> None:
+        gui = page.gui
+        self._waits = waits
+        with gui.add_folder("People"):
+            self._name = gui.add_text(
+                "Your name",
+                state.name,
+                hint=f"Stands in the history before what you do, up to {LONGEST_NAME} characters",
+            )
+            page.columns([self._name], 1, narrow_labels=True)
+            self._others = gui.add_html("")
+            link = gui.add_button(
+                "Copy link", icon=viser.Icon.LINK, color="gray", hint="Opens this frame, camera and domain"
+            )
+        on_input(self._name, lambda name: intents.SetName(str(name)), emit)
+
+        @link.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            page.call("copyLink")
+
+    def show(self, state: ViewState) -> None:
+        """Bring name and list up to date."""
+        if not self._waits(intents.SetName):
+            write(self._name, state.name)
+        ids = state.project.identity.frame_ids
+        rows = [
+            f'<a href="#" data-frame="{index}">{escaped(name)}</a> on frame {escaped(ids[index])}'
+            + (" <b>(this one)</b>" if index == state.index else "")
+            for name, index in state.others
+        ]
+        text = "<br>".join(rows) if rows else "Nobody else is at work."
+        self._others.content = f'<p class="carts-caption">{text}</p>'
+
+
+class MessagePanel:
+    """The newest error, until it is dismissed or something else works."""
+
+    def __init__(self, page: TabPage, emit: Emit) -> None:
+        self._page = page
+        self._shown: str | None = None
+        self._notes: list[viser.NotificationHandle] = []
+        self._text = page.gui.add_html("", visible=False)
+        self._dismiss = page.gui.add_button("Dismiss", icon=viser.Icon.X, color="red", visible=False)
+        on_click(self._dismiss, lambda _: intents.DismissError(), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the message up to date."""
+        if state.error == self._shown:
+            return
+        self._shown = state.error
+        while self._notes:
+            self._notes.pop().remove()
+        self._text.visible = self._dismiss.visible = state.error is not None
+        self._text.content = f'<p class="carts-error" role="alert">{escaped(state.error or "")}</p>'
+        if state.error is not None:
+            note = self._page.client.add_notification(
+                "That did not work", state.error, color="red", auto_close_seconds=12.0
+            )
+            self._notes = [note]

@@ -15,16 +15,15 @@ from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
 from carts_core.segmentation import Segmenter
 from carts_core.settings.optimization import Inference
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.batch_page import BatchPage
 from carts_viewer.start.host import Place
-from carts_viewer.start.recent import remember
 from carts_viewer.start.roots import Roots
-from carts_viewer.start.start_page import StartPage
+from carts_viewer.start.start_page import StartPage, remember
 from carts_viewer.transport.document import Document, escaped
 from carts_viewer.transport.page import Page
+from carts_viewer.wizard.wizard import RecordingPlace
 
 _log = logging.getLogger(__name__)
 

@@ -1,21 +1,23 @@
-"""Who may talk to the viewer: this computer alone, or others who have the token; never another site's page.
+"""Access to the viewer: which requests are answered, and which messages of a tab are accepted."""
 
-The toolkit below us checks neither `Host` nor `Origin`, so any page the user visits could open a websocket to the
-viewer and drive it. Three rules close that: `Host` names this computer (no DNS rebinding); an `Origin`, which every
-browser sends with a websocket, is the origin that the page itself was loaded from; and `Sec-Fetch-Site`, which browsers
-send with every request to this computer, names no other site, except for the page itself when a link leads there.
-
-Where other computers can reach the viewer, a fourth rule holds: every request, the websocket's included, carries the
-token that was printed when the viewer started, or the cookie that a browser got for it.
-"""
-
+import contextlib
+import http
 import ipaddress
+import logging
+import math
 import secrets
 import socket
-from collections.abc import Iterable
+import threading
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import msgspec
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.typing import Data
 
 from carts_core.errors import SettingsError
 
@@ -176,3 +178,144 @@ def _hostname(host: str) -> str | None:
     except ValueError:
         return None
     return parts.hostname if parts.netloc == host and parts.username is None else None
+
+
+LARGEST_MESSAGE = 1 << 20
+"""[bytes]; a larger one ends the connection."""
+_LARGEST_NUMBER = float(1 << 53)
+"""Up to here a float holds every integer."""
+_Point = tuple[float, float, float]
+
+
+class _Value(msgspec.Struct, forbid_unknown_fields=True):
+    value: bool | int | float | str
+
+
+class GuiUpdateMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
+    """A widget has a new value."""
+
+    uuid: str
+    updates: _Value
+
+
+class CommandTriggerMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
+    """A key was pressed, or a command chosen."""
+
+    uuid: str
+
+
+class ViewerCameraMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
+    """The tab's camera; the first one says that the tab is ready."""
+
+    wxyz: tuple[float, float, float, float]
+    position: _Point
+    fov: float
+    near: float
+    far: float
+    image_height: int
+    image_width: int
+    look_at: _Point
+    up_direction: _Point
+
+
+_DECODER = msgspec.msgpack.Decoder(GuiUpdateMessage | CommandTriggerMessage | ViewerCameraMessage)
+
+
+def refusal(data: object, value_of: Callable[[str], Any]) -> str | None:
+    """Why a message must not be acted upon; None when it may.
+
+    Args:
+        data: What came over the websocket.
+        value_of: The present value of the widget with this id; None when there is no such widget.
+    """
+    if not isinstance(data, bytes):
+        return "it is text"
+    try:
+        message = _DECODER.decode(data)
+    # The latter two are what it raises for text that is no UTF-8 and for depth without end.
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return str(error)
+    if isinstance(message, GuiUpdateMessage):
+        return _value_refusal(message.updates.value, value_of(message.uuid))
+    return None
+
+
+def _value_refusal(value: bool | int | float | str, present: Any) -> str | None:
+    if isinstance(present, int | float) and not isinstance(present, bool):
+        if isinstance(value, bool | str):
+            return f"{type(value).__name__} for a number"
+        if not (math.isfinite(value) and abs(value) <= _LARGEST_NUMBER):
+            return "a number out of all range"
+    elif type(present) is not type(value) or not isinstance(present, bool | str):
+        return f"{type(value).__name__} for {'no widget' if present is None else type(present).__name__}"
+    return None
+
+
+_log = logging.getLogger(__name__)
+_SERVER_CONSTRUCTION = threading.Lock()
+
+
+@contextlib.contextmanager
+def gated(
+    respond: Callable[[Request], Response | Awaitable[Response] | None], refuse: Callable[[object], str | None]
+) -> Iterator[None]:
+    """While active, a websocket server that is started gets a gate.
+
+    Args:
+        respond: Answers a request; None leaves that to the server.
+        refuse: Says why a message must not reach the server; None when it may.
+    """
+    original = websockets.asyncio.server.serve
+
+    class Connection(ServerConnection):
+        """Swallows the messages that are refused."""
+
+        async def recv(self, decode: bool | None = None) -> Data:  # pyright: ignore[reportIncompatibleMethodOverride]
+            """The next message that is not refused."""
+            while True:
+                data = await super().recv(decode)
+                reason = refuse(data)
+                if reason is None:
+                    return data
+                if not getattr(self, "warned", False):
+                    self.warned = True
+                    _log.warning("A tab sent a message that the viewer does not take: %.200r", reason)
+
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def guarded(connection: Any, request: Request) -> Any:
+            answer = respond(request)
+            if answer is not None or process_request is None:
+                return answer
+            return process_request(connection, request)
+
+        options = {**options, "max_size": LARGEST_MESSAGE, "create_connection": Connection}
+        return original(*arguments, process_request=guarded, **options)
+
+    with _SERVER_CONSTRUCTION:
+        websockets.asyncio.server.serve = serve  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = original
+
+
+def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
+    """An answer that no browser guesses about, keeps, or shows inside another site.
+
+    Args:
+        status: HTTP status.
+        kind: Content type.
+        body: Content.
+        more: Further headers, with `_` for `-`.
+    """
+    headers = Headers()
+    headers["Content-Type"] = kind
+    headers["Content-Length"] = str(len(body))
+    headers["Cache-Control"] = "no-cache"
+    headers["X-Content-Type-Options"] = "nosniff"
+    headers["X-Frame-Options"] = "DENY"
+    headers["Cross-Origin-Resource-Policy"] = "same-origin"
+    headers["Referrer-Policy"] = "no-referrer"
+    for name, value in more.items():
+        headers[name.replace("_", "-")] = value
+    return Response(status.value, status.phrase, headers, body)

@@ -1,35 +1,127 @@
-"""The page: a viser server that is guarded, our script and style in it, and what the two say to one another.
+"""The page: a guarded viser server, the scripts and styles in it, and the messages of its tabs.
 
-- The server is guarded (`guard.py`, `incoming.py`), and serves `static/` and our script and style.
-- Calls into one client's page (`call`), and the page's word that it has drawn an overlay (`on_drawn`).
-- Buttons side by side, which viser's panels do not know.
-
-The browser tests drive all of this end to end.
+- The server is guarded (`guard.py`), and serves `static/` and pictures. - A tab writes what happened there into
+invisible fields, behind its own name and a counter (`_FIELDS`).
 """
 
 import contextlib
+import functools
+import hashlib
 import html
 import http
 import io
 import json
+import math
 import mimetypes
 import secrets
+import threading
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import viser
 from websockets.http11 import Request, Response
 
+from carts_core.errors import CartsError
 from carts_core.resources import static_dir
-from carts_viewer.transport import incoming
-from carts_viewer.transport.fields import on_numbers, on_text, said
-from carts_viewer.transport.gate import gated, response
-from carts_viewer.transport.guard import PAGES, Guard, check_address
-from carts_viewer.transport.index import index_of_viser
-from carts_viewer.transport.media import MEDIA, Media
-from carts_viewer.transport.outgoing import queue_safely
+from carts_viewer.transport.guard import PAGES, Guard, check_address, gated, refusal, response
 from carts_viewer.transport.tab_page import call
-from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, value_of
+from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, queue_safely, value_of
+
+
+def on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:
+    """Call back with a tab's number and the finite numbers that it has written behind its own name and a counter."""
+
+    @field.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        try:
+            numbers = [float(part) for part in str(field.value).split()[2:]]
+        except ValueError:
+            return
+        if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
+            callback(event.client_id, *numbers)
+
+
+def said(value: Any) -> str:
+    """What a tab has written behind its own name and a counter."""
+    parts = str(value).split(maxsplit=2)
+    return parts[2] if len(parts) == 3 else ""
+
+
+def on_text(field: viser.GuiTextHandle, callback: Callable[[int, str], None]) -> None:
+    """Call back with the tab's number and what it has written into a field behind its own name and a counter."""
+
+    @field.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        parts = str(field.value).split(maxsplit=2)
+        if event.client_id is not None and len(parts) == 3:
+            callback(event.client_id, parts[2])
+
+
+_TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="module";'
+"""What is replaced in it: its title, the script that unpacks the client, and there the client's own element."""
+
+
+def index_of_viser(head: str, nonce: str) -> str:
+    """HTML of viser's page.
+
+    Args:
+        head: HTML in place of its title.
+        nonce: Of the `Content-Security-Policy`, for its inline scripts.
+
+    Raises:
+        CartsError: another version of viser is installed.
+    """
+    before, after = _parts()
+    return before + head + after.replace(_LOADER, f'<script nonce="{nonce}" data-p=', 1)
+
+
+@functools.cache
+def _parts() -> tuple[str, str]:
+    """Of the page, before and after its title."""
+    index = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    text = index.read_text(encoding="utf-8")
+    if any(text.count(part) != 1 for part in (_TITLE, _LOADER, _CLIENT)):
+        raise CartsError(
+            f"{index} is not the page of viser 1.1. Install the pinned version: pip install 'viser~=1.1.1'"
+        )
+    # The client's own script element gets the nonce of the one that unpacks it.
+    text = text.replace(_CLIENT, f'{_CLIENT}e.nonce=document.querySelector("script[data-p]").nonce;')
+    before, _, after = text.partition(_TITLE)
+    return before, after
+
+
+MEDIA = "/media/"
+_MOST = 256
+"""How many are kept; the oldest go first."""
+
+
+class Media:
+    """Pictures by names that follow from their content."""
+
+    def __init__(self) -> None:
+        self._contents: OrderedDict[str, bytes] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def publish(self, jpeg: bytes) -> str:
+        """Serve a JPEG file from now on; gives its address."""
+        name = f"{hashlib.sha256(jpeg).hexdigest()[:24]}.jpg"
+        with self._lock:
+            self._contents[name] = jpeg
+            self._contents.move_to_end(name)
+            while len(self._contents) > _MOST:
+                self._contents.popitem(last=False)
+        return MEDIA + name
+
+    def answer(self, name: str) -> Response:
+        """The picture of a name, or that there is none."""
+        with self._lock:
+            content = self._contents.get(name)
+        if content is None:
+            return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such picture.")
+        return response(http.HTTPStatus.OK, "image/jpeg", content)
+
 
 OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
@@ -243,7 +335,7 @@ class Page:
 
     def _refuse(self, data: object) -> str | None:
         """Why a tab's message must not reach viser; None when it may."""
-        return incoming.refusal(data, self._value_of)
+        return refusal(data, self._value_of)
 
     def _value_of(self, element: str) -> Any:
         # A tab may be there before the server's constructor has returned.

@@ -1,10 +1,13 @@
-"""The private parts of viser's widgets, scene nodes and tabs that the viewer uses.
+"""Private parts of viser that the viewer uses.
 
-Nothing else reaches into them but `outgoing.py`, which replaces viser's message queue. viser is pinned to one minor
-version, tests/viewer/test_transport.py names every attribute that is used, and the browser tests drive them all.
+Nothing else reaches into them. viser is pinned to one minor version, tests/viewer/test_transport.py names every
+attribute that is used, and the browser tests drive them all.
 """
 
+import asyncio
+import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 from zipfile import ZipFile
@@ -13,6 +16,8 @@ import viser
 from viser import _gui_api, _gui_handles
 from viser._icons import ICONS_DIR
 from viser._messages import RunJavascriptMessage
+from viser.infra import _infra
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 
 def list_icons_once() -> None:
@@ -87,3 +92,35 @@ def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
         callback(updates["value"])
 
     impl.sync_cb = sent
+
+
+class LoopEvent(asyncio.Event):
+    """An event of one event loop; calls from elsewhere are left to the one that follows on the loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._own_loop = loop
+
+    def set(self) -> None:
+        """Wake all who wait, if this runs on the event loop."""
+        try:
+            running = asyncio.get_running_loop()
+        except RuntimeError:
+            return
+        if running is self._own_loop:
+            super().set()
+
+
+@dataclasses.dataclass
+class MessageBuffer(AsyncMessageBuffer):
+    """The toolkit's queue with such an event."""
+
+    def __post_init__(self) -> None:
+        self.message_event = LoopEvent(self.event_loop)
+
+
+def queue_safely() -> None:
+    """Have every server that starts from now on, and every tab that joins it, use such queues."""
+    # A tab that has just gone is normal, and what was on its way to it is no loss.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+    _infra.AsyncMessageBuffer = MessageBuffer  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]

@@ -30,7 +30,7 @@ OWN_METHODS = {
 """Names that functions of ours have, too: a plain call `write_text(...)`, or a method without arguments, is ours."""
 ALLOWED = {
     "carts_core/project": "SQLite writes the project by itself; tests/project attacks its path, its lock and its log",
-    "carts_viewer/opening.py": "chmod of a page in a temporary folder that this user alone may look into",
+    "carts_viewer/serving.py": "chmod of a page in a temporary folder that this user alone may look into",
 }
 
 

@@ -19,9 +19,9 @@ from carts_core.networks.weights import save_weights
 from carts_core.project import Project
 from carts_core.recording import Sequence
 from carts_core.settings import Architecture
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.jobs.optimizers import OptimizerFactory
 
 FLAGS = (
     "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "

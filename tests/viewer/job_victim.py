@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from carts_core.project import ReviewState
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import ViewState
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from carts_viewer.app import ViewerApp
-from carts_viewer.tab import Tab, View
+from carts_viewer.tabs import Tab, View
 from tools.raw_tab import RawTab
 
 

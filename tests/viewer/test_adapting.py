@@ -18,12 +18,13 @@ from carts_core.errors import CartsError
 from carts_core.project import Project
 from carts_core.recording import Sequence
 from carts_core.resources import shipped_weights
-from carts_viewer import adapting, intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.companions import Decisions
-from carts_viewer.jobs import AdaptOptions, Job, JobState
-from carts_viewer.networks import STARTED, Networks
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.jobs import work as adapting
+from carts_viewer.jobs.companions import Decisions
+from carts_viewer.jobs.job_list import AdaptOptions, Job, JobState
+from carts_viewer.jobs.networks import STARTED, Networks
+from carts_viewer.jobs.optimizers import OptimizerFactory
 
 SMALL = (
     "--steps 2 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "

@@ -9,8 +9,8 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import project_keypoints
 from carts_core.project import Figures, Project, ReviewState, Source
-from carts_viewer import intents
-from carts_viewer.marks import keypoints_in_image, labelled_keypoints
+from carts_viewer.actions import intents
+from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
 
 
 def _drag(desk: Desk, *values: float, joint: int = 0) -> None:

@@ -29,17 +29,17 @@ from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
 from carts_core.recording.sequence import ByteCache
 from carts_core.resources import sample_sequence
-from carts_viewer import editing, intents, worker
-from carts_viewer import tab as tabs
+from carts_viewer import editing, tabs, worker
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.layers import Layer, mask
-from carts_viewer.overlay import OverlayRenderer
 from carts_viewer.panels.browse import BrowsePanel
 from carts_viewer.panels.project import SavedPanel
-from carts_viewer.scene_view import FRAME, OVERLAY
+from carts_viewer.picture.layers import Layer, mask
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.picture.scene_view import FRAME, OVERLAY
 from carts_viewer.serving import serve
+from carts_viewer.session import open_storage
 from carts_viewer.state import Phase
-from carts_viewer.storage import open_storage
 from tools.raw_tab import RawTab
 
 
@@ -425,7 +425,10 @@ def test_a_second_viewer_of_the_same_project_saves_nothing_and_says_so(open_view
     assert not app.project.state.steps
 
 
-def test_the_shipped_sequence_has_its_project_among_the_users_data(tmp_path: Path) -> None:
+def test_the_shipped_sequence_has_its_project_among_the_users_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "data"))
     storage = open_storage(Sequence.open(sample_sequence()))
     storage.close()
     assert storage.notice is None and storage.project.path.parent == tmp_path / "data"

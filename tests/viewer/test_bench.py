@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.scene_view import FRAME, OVERLAY, SceneView
+from carts_viewer.picture.scene_view import FRAME, OVERLAY, SceneView
 from tools.bench_viewer import frame_latency, memory_while_optimizing, slider_latency
 from tools.freshness import Soaking
 

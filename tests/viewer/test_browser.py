@@ -14,9 +14,9 @@ from viewer_canvas import decoded, eventually
 from viewer_tab import Tab
 from waiting import wait_in
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser

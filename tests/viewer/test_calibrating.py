@@ -18,11 +18,11 @@ from carts_core.model.scene import Scene
 from carts_core.optimization import CalibrationOptimizer, StopReason
 from carts_core.optimization.hand_eye import PoseDeviation
 from carts_core.recording import Sequence
-from carts_viewer.recording import calibrating, hand_eye_step
-from carts_viewer.recording.calibrating import CalibrationJob
-from carts_viewer.recording.draft import Draft, DraftFile, Step
-from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.site import Site
+from carts_viewer.wizard import calibration, hand_eye
+from carts_viewer.wizard.calibration import CalibrationJob
+from carts_viewer.wizard.draft import Draft, DraftFile, Step
+from carts_viewer.wizard.wizard import RecordingPlace
 
 CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 
@@ -57,8 +57,8 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
         begun.append(CalibrationJob(*arguments, **options))
         return begun[-1]
 
-    monkeypatch.setattr(hand_eye_step, "CalibrationJob", begin)
-    monkeypatch.setattr(calibrating, "CalibrationOptimizer", OneStep)
+    monkeypatch.setattr(hand_eye, "CalibrationJob", begin)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", OneStep)
     return begun
 
 
@@ -143,8 +143,8 @@ def test_a_calibration_is_stopped_at_any_moment(
             return super().result()
 
     if moment == "images are read":
-        monkeypatch.setattr(calibrating, "spread", spread)
-    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Stopped)
+        monkeypatch.setattr(calibration, "spread", spread)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Stopped)
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
 
@@ -161,7 +161,7 @@ def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkey
                 shown.append(site.document.content)
             return super().step()
 
-    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Slow)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Slow)
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
     (content,) = shown
@@ -197,7 +197,7 @@ def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
                 replace(scene, arms=tuple(replace(a, T_world_base=turn @ a.T_world_base) for a in scene.arms))
             )
 
-    monkeypatch.setattr(calibrating, "CalibrationOptimizer", Moved)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
     place = place_of(site)
     site.post(lambda: place.choose(*CALIBRATE))
     offer = ended(site, "Calibration not kept")

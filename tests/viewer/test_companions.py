@@ -23,11 +23,11 @@ from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.identity import data_dir
 from carts_core.settings.interchange import ImportOptions
-from carts_viewer.jobs import JobState
-from carts_viewer.networks import STARTED
-from carts_viewer.recording.draft import Draft, Step
-from carts_viewer.start.recent import RecentProject
+from carts_viewer.jobs.job_list import JobState
+from carts_viewer.jobs.networks import STARTED
 from carts_viewer.start.site import Site
+from carts_viewer.start.start_page import RecentProject
+from carts_viewer.wizard.draft import Draft, Step
 from tools.raw_tab import RawTab
 
 DEEP: Any = []

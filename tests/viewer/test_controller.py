@@ -8,8 +8,8 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError, SettingsError
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.project import Source
-from carts_viewer import intents
-from carts_viewer.layers import Layer
+from carts_viewer.actions import intents
+from carts_viewer.picture.layers import Layer
 from carts_viewer.state import Phase
 
 ENDING_A_RUN = (

@@ -12,9 +12,9 @@ from viewer_tab import Tab
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import Keypoint, project_keypoints
 from carts_core.model.scene import Scene
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import ViewState
 
 

@@ -3,8 +3,8 @@
 from viewer_desk import Desk
 
 from carts_core.project import FitVerdict, Key, ReviewState
-from carts_viewer import intents
-from carts_viewer.export_warnings import export_warnings
+from carts_viewer.actions import intents
+from carts_viewer.actions.exchange import export_warnings
 
 
 def test_frames_that_failed_or_were_fitted_to_one_camera_are_named_before_an_export(desk: Desk) -> None:

@@ -24,8 +24,8 @@ from carts_core.project import (
     ReviewState,
     Source,
 )
-from carts_viewer import archive, intents
-from carts_viewer.handlers import exporting
+from carts_viewer.actions import exchange as exporting
+from carts_viewer.actions import intents
 
 
 def exported(desk: Desk, intent: intents.Export) -> Path:
@@ -219,7 +219,7 @@ def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.Mon
     table = exported(desk, intents.Export("csv", "All"))
     desk.do(intents.Download(4))
     assert desk.delivered[-1] == (4, "kinematics.csv", table.read_bytes())
-    monkeypatch.setattr(archive, "LARGEST", 10)
+    monkeypatch.setattr(exporting, "LARGEST", 10)
     with pytest.raises(CartsError, match="Copy it from there"):
         desk.do(intents.Download(4))
     table.unlink()

@@ -6,9 +6,9 @@ from viewer_desk import Desk
 
 from carts_core.errors import CartsError
 from carts_core.project import Figures, FitVerdict, Key, Review, ReviewState
-from carts_viewer import intents
-from carts_viewer.compare import Against, Compare, composed, other_pose
-from carts_viewer.finding import BY_HAND, NOT_CHECKED, FrameFilter, found
+from carts_viewer.actions import intents
+from carts_viewer.actions.frame_filter import BY_HAND, NOT_CHECKED, FrameFilter, found
+from carts_viewer.choices import Against, Compare, composed, other_pose
 
 
 @pytest.fixture

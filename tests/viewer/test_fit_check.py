@@ -4,12 +4,11 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.project import Figures, FitVerdict, ReviewState, Source, by_hand
-from carts_viewer import intents
-from carts_viewer.fit_check import Fit
-from carts_viewer.layers import Layer
-from carts_viewer.panels.curves import note
+from carts_viewer.actions import intents
+from carts_viewer.jobs.comparison import Fit
 from carts_viewer.panels.fit import fit_text
-from carts_viewer.panels.optimize import undetermined_lines
+from carts_viewer.panels.optimize import note, undetermined_lines
+from carts_viewer.picture.layers import Layer
 from carts_viewer.state import Curves
 
 GOOD, DOUBTFUL = FitVerdict("good", "", "", 0.02), FitVerdict("doubtful", "In part.", "Look.", 0.2)

@@ -9,9 +9,9 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_core.model.keypoints import project_keypoints
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.marks import labelled_keypoints
+from carts_viewer.picture.overlay import labelled_keypoints
 
 KEYPOINTS = ("jaw 1 tip", "wrist pitch joint")
 

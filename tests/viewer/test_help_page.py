@@ -8,7 +8,7 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_viewer.app import ViewerApp
-from carts_viewer.panels.hints import HINTS, explain
+from carts_viewer.panels.help import HINTS, explain
 
 pytestmark = pytest.mark.browser
 

@@ -15,9 +15,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.scene_view import OVERLAY
+from carts_viewer.picture.scene_view import OVERLAY
 from carts_viewer.transport.page import Page
 from tools.raw_tab import RawTab
 

@@ -11,9 +11,9 @@ from viewer_desk import Desk
 
 from carts_core.errors import CartsError
 from carts_core.recording import Sequence
-from carts_viewer import intents
-from carts_viewer.running import OptimizerFactory
-from carts_viewer.storage import open_storage
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.session import open_storage
 
 OUTPUTS = ("sequence.carts", "sequence.carts.lock", "sequence_exports", "sequence_jobs.json")
 

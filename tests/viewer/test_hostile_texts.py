@@ -28,9 +28,9 @@ from carts_core.files import output_path
 from carts_core.project import FitVerdict, JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
 from carts_core.resources import shipped_robot
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs import AdaptOptions, CalibrateOptions, Job, JobState, SolveOptions
+from carts_viewer.jobs.job_list import AdaptOptions, CalibrateOptions, Job, JobState, SolveOptions
 from carts_viewer.start.site import Site
 
 pytestmark = pytest.mark.browser

@@ -14,12 +14,12 @@ from carts_core.errors import CartsError
 from carts_core.evaluation.evaluate import dice
 from carts_core.project import Key, MaskCorrection, Project
 from carts_core.recording import Sequence
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.imported import with_imported
-from carts_viewer.layers import Layer, imported, label_color
-from carts_viewer.people import People
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.editing import People
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.layers import Layer, imported, label_color
+from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
 
 

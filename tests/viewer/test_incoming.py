@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from viser import _messages as messages
 
-from carts_viewer.transport.incoming import refusal
+from carts_viewer.transport.guard import refusal
 
 WIDGETS = {"slider": 1.5, "frame": 3, "box": True, "text": "a", "colour": (1, 2, 3)}
 

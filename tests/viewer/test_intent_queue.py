@@ -3,8 +3,8 @@
 import threading
 import time
 
-from carts_viewer.intent_queue import IntentQueue
-from carts_viewer.intents import Intent, MoveFrame, SetJoint, SetOpacity, ShowFrame
+from carts_viewer.actions.intents import Intent, MoveFrame, SetJoint, SetOpacity, ShowFrame
+from carts_viewer.tabs import IntentQueue
 
 TAB = "one"
 

@@ -13,8 +13,8 @@ import viewer_victim
 
 from carts_core.project import Project, SequenceIdentity
 from carts_core.recording import Sequence
-from carts_viewer.companions import Decisions
-from carts_viewer.jobs import JobList, JobState
+from carts_viewer.jobs.companions import Decisions
+from carts_viewer.jobs.job_list import JobList, JobState
 
 FRAMES = 4
 OVER = ("done", "failed", "cancelled")

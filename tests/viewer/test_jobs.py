@@ -14,10 +14,10 @@ from viewer_tab import Tab
 
 from carts_core.errors import CartsError
 from carts_core.project import ReviewState, Source
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.companions import Decisions
-from carts_viewer.jobs import (
+from carts_viewer.jobs.companions import Decisions
+from carts_viewer.jobs.job_list import (
     AdaptOptions,
     CalibrateOptions,
     Job,

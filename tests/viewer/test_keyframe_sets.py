@@ -12,8 +12,8 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError
 from carts_core.project import Project, ReviewState
 from carts_core.recording import Sequence
-from carts_viewer import intents
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory
 
 FRAMES = 5
 WORSE = 0.005

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from carts_viewer.keys import key_table, shortcuts, with_keys
+from carts_viewer.panels.help import key_table, shortcuts, with_keys
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "keys.md"
 

@@ -12,7 +12,7 @@ from viewer_tab import Tab
 
 from carts_core.project import ReviewState
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs import JobState
+from carts_viewer.jobs.job_list import JobState
 from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser

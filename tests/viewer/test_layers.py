@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carts_viewer import layers
+from carts_viewer.picture import layers
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from viewer_tab import Tab
 from carts_core.live import FrameMessage, ImageMessage, packed
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 
 SECONDS = 120.0

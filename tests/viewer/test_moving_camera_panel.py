@@ -12,8 +12,8 @@ from viewer_desk import Desk
 from carts_core.evaluation.evaluate import dice
 from carts_core.project import CorrectedTransform, Key, Project, Provenance, Source
 from carts_core.recording import Sequence
-from carts_viewer import intents
-from carts_viewer.running import OptimizerFactory, scene_at
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
 
 FRAMES = 4
 

@@ -31,10 +31,10 @@ from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationOptimizer, ImagePredictor
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_viewer.recording.calibrating import CalibrationJob
-from carts_viewer.recording.draft import Draft, DraftFile, Step
-from carts_viewer.recording.place import RecordingPlace
 from carts_viewer.start.site import Site
+from carts_viewer.wizard.calibration import CalibrationJob
+from carts_viewer.wizard.draft import Draft, DraftFile, Step
+from carts_viewer.wizard.wizard import RecordingPlace
 
 pytestmark = pytest.mark.browser
 SHIFT = np.array([[0.0, 0.0, HALF_PIXEL], [0.0, 0.0, HALF_PIXEL], [0.0, 0.0, 0.0]])

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.optimization.observability import Uncertainty
-from carts_viewer.panels.calibration_hint import calibration_line
 from carts_viewer.panels.optimize import undetermined_lines
+from carts_viewer.panels.sequence import calibration_line
 from carts_viewer.session import JointRange
 from carts_viewer.state import Maps, Phase, RunState
 

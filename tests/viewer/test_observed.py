@@ -27,9 +27,9 @@ from carts_core.project import (
 )
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.jobs.optimizers import OptimizerFactory
 
 SIZE = {"width": 160, "height": 128}
 

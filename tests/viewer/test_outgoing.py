@@ -8,7 +8,7 @@ from viser._messages import GuiUpdateMessage
 from viser.infra import _infra
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 
-from carts_viewer.transport.outgoing import LoopEvent, MessageBuffer, queue_safely
+from carts_viewer.transport.viser_private import LoopEvent, MessageBuffer, queue_safely
 
 
 @pytest.fixture

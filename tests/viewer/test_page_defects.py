@@ -13,7 +13,7 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 from waiting import wait_in
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import Phase
 

@@ -12,9 +12,9 @@ from waiting import wait_for, wait_in
 
 from carts_core.optimization import SequenceOptimizer
 from carts_core.project import ReviewState
-from carts_viewer import intents
+from carts_viewer.actions import intents
+from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.app import ViewerApp
-from carts_viewer.handlers.propagating import PropagatingHandler
 from carts_viewer.state import Phase
 
 pytestmark = pytest.mark.browser

@@ -7,7 +7,7 @@ from cut_off import cut_off
 from viewer_canvas import eventually
 from viewer_tab import Tab
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 
 pytestmark = pytest.mark.browser

@@ -15,11 +15,11 @@ from viewer_tab import Tab
 from carts_core.errors import CartsError
 from carts_core.model.parts import part_classes
 from carts_core.project import Key
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.layers import Layer, label_color
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.strokes import Stroke, Target, Tool
+from carts_viewer.picture.layers import Layer, label_color
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.picture.strokes import Stroke, Target, Tool
 
 CORNERS = ((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0))
 

@@ -14,12 +14,12 @@ from viewer_canvas import eventually
 from viewer_tab import Tab
 
 from carts_core.project import Key
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.layers import IGNORED_COLOR
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.running import OptimizerFactory
-from carts_viewer.strokes import Tool
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.layers import IGNORED_COLOR
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.picture.strokes import Tool
 from tools.raw_tab import RawTab
 
 Open = Callable[..., ViewerApp]

@@ -10,9 +10,9 @@ from viewer_desk import Desk
 from carts_core.evaluation.evaluate import dice
 from carts_core.optimization import SurfaceSolver
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
-from carts_viewer import intents
-from carts_viewer.running import OptimizerFactory
-from carts_viewer.strokes import Stroke, Target, Tool
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.strokes import Stroke, Target, Tool
 
 CORNERS = ((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0))
 

@@ -7,7 +7,7 @@ import pytest
 from carts_core.errors import CartsError
 from carts_core.project import Key, Project, Review, ReviewState
 from carts_core.recording import Sequence
-from carts_viewer.people import People
+from carts_viewer.editing import People
 
 ACCEPTED, REJECTED = Review(ReviewState.ACCEPTED), Review(ReviewState.REJECTED)
 

@@ -14,10 +14,10 @@ from carts_core.evaluation.evaluate import dice
 from carts_core.project import Key, Project
 from carts_core.recording import Sequence
 from carts_core.segmentation import Prompt
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.running import OptimizerFactory
-from carts_viewer.strokes import Stroke, Target, Tool
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.strokes import Stroke, Target, Tool
 
 RADIUS = 9.0
 

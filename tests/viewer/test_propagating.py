@@ -23,9 +23,9 @@ from carts_core.project import (
     Source,
 )
 from carts_core.recording import Sequence
-from carts_viewer import intents
-from carts_viewer.panels.calibration_hint import calibration_line
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.panels.sequence import calibration_line
 
 FRAMES = 5
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from carts_viewer.rate_limit import LONGEST_WAIT, RateLimit
+from carts_viewer.picture.display import LONGEST_WAIT, RateLimit
 
 
 class Clock:

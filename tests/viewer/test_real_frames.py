@@ -14,7 +14,7 @@ from viewer_tab import Tab
 from carts_core.evaluation import dice
 from carts_core.project import ReviewState
 from carts_viewer.app import ViewerApp
-from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
 SEQUENCE = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from carts_core.model.psm_kinematics import JOINT_NAMES
-from carts_viewer.recording.changes import changed
-from carts_viewer.recording.draft import Draft
-from carts_viewer.recording.form import check_form
-from carts_viewer.recording.guess import Guess, guess
+from carts_viewer.wizard.check import Guess, check_form, guess
+from carts_viewer.wizard.draft import Draft, changed
 
 FRAMES = 6
 JOINTS = np.array([0.1, 0.05, 0.12, 0.5, 0.1, -0.2])

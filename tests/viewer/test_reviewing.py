@@ -7,10 +7,10 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.project import ReviewState
-from carts_viewer import intents
-from carts_viewer.finding import BY_HAND, SOLVED, UNJUDGED, FrameFilter, copied, found, review_name
-from carts_viewer.handlers.exporting import FRAME_CHOICES
-from carts_viewer.strokes import Stroke, Target
+from carts_viewer.actions import intents
+from carts_viewer.actions.exchange import FRAME_CHOICES
+from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, UNJUDGED, FrameFilter, copied, found, review_name
+from carts_viewer.picture.strokes import Stroke, Target
 
 CORNERS = np.array(((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0)))
 ACCEPT = intents.SetReview(ReviewState.ACCEPTED)

@@ -11,7 +11,7 @@ import torch
 from carts_core.errors import CartsError
 from carts_core.project import Key, Kind, Project, Provenance, Source
 from carts_core.recording import Sequence
-from carts_viewer.people import People
+from carts_viewer.editing import People
 from carts_viewer.session import Session
 from carts_viewer.state import Pose
 

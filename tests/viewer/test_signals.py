@@ -15,9 +15,8 @@ from viewer_client import Client
 
 from carts_core.project import Project
 from carts_core.recording import Sequence
-from carts_viewer import opening
 from carts_viewer.app import ViewerApp
-from carts_viewer.serving import serve
+from carts_viewer.serving import opened_in_browser, serve, webbrowser
 from tools.raw_tab import RawTab
 
 FRAMES = 6
@@ -140,13 +139,13 @@ def test_a_note_that_nobody_has_left_yet_is_saved(
 
 def test_a_token_is_not_on_the_command_line_of_the_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(opening.webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", opened.append)
     url = "http://192.168.0.7:8080/?token=secret&more"
-    with opening.opened_in_browser(url):
+    with opened_in_browser(url):
         (given,) = opened
         page = Path(given.removeprefix("file://"))
         assert "secret" not in given and "url=http://192.168.0.7:8080/?token=secret&amp;more" in page.read_text()
         assert page.stat().st_mode & 0o777 == 0o600 and page.parent.stat().st_mode & 0o777 == 0o700
     assert not page.parent.exists()
-    with opening.opened_in_browser("http://127.0.0.1:8080"):
+    with opened_in_browser("http://127.0.0.1:8080"):
         assert opened[1:] == ["http://127.0.0.1:8080"]

@@ -11,14 +11,13 @@ from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
 from carts_core.settings.interchange import ImportOptions
-from carts_viewer import intents
-from carts_viewer.recording.draft import Draft, DraftFile, Step, delete_draft, drafts
-from carts_viewer.recording.place import RecordingPlace
-from carts_viewer.start.recent import forget, recent_projects, thumbnail
+from carts_viewer.actions import intents
 from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
-from carts_viewer.start.start_page import StartPage
+from carts_viewer.start.start_page import StartPage, forget, recent_projects, thumbnail
 from carts_viewer.transport.document import button, choices, escaped
+from carts_viewer.wizard.draft import Draft, DraftFile, Step, delete_draft, drafts
+from carts_viewer.wizard.wizard import RecordingPlace
 
 
 @pytest.fixture

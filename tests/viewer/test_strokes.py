@@ -10,8 +10,8 @@ import pytest
 from carts_core.errors import SettingsError
 from carts_core.model.camera import Camera
 from carts_core.project import IgnoreRegion, MaskCorrection
-from carts_viewer.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, nothing, paint_over
-from carts_viewer.strokes import LONGEST_STROKE, Stroke, Target, corrected, ignored, read_stroke
+from carts_viewer.picture.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, nothing, paint_over
+from carts_viewer.picture.strokes import LONGEST_STROKE, Stroke, Target, corrected, ignored, read_stroke
 
 CAMERA = Camera("left", 64, 48, (60.0, 60.0, 32.0, 24.0), np.eye(4))
 GOOD: dict[str, Any] = {

@@ -13,7 +13,7 @@ from viewer_run import run_without_end
 from viewer_tab import Tab
 from waiting import wait_in
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import Phase
 

@@ -10,8 +10,8 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError
 from carts_core.project import Key, Project, TimeOffset
 from carts_core.recording import Sequence
-from carts_viewer import intents
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.actions import intents
+from carts_viewer.jobs.optimizers import OptimizerFactory
 
 
 @pytest.fixture

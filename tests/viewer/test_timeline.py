@@ -13,11 +13,9 @@ from viewer_tab import Tab
 from waiting import wait_in
 
 from carts_core.project import Figures, Key, Review, ReviewState
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.thumbnails import HEIGHT
-from carts_viewer.timeline_data import code
-from carts_viewer.traces import Traces
+from carts_viewer.panels.timeline import HEIGHT, Traces, code
 
 # ---- Curves --------------------------------------------------------------------------------------------------------
 

@@ -5,8 +5,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import carts_viewer
 from carts_core.resources import static_dir
 
@@ -23,14 +21,18 @@ USED = {
         "_command_handle_from_uuid",
         "_data",
         "_websock_connection",
+        "viser.infra._infra",
+        "viser.infra._async_message_buffer",
     },
-    "transport/outgoing.py": {"viser.infra._infra", "viser.infra._async_message_buffer"},
 }
 """Every private name of theirs, by the module that uses it. Look at each when viser is updated."""
 REPLACED = {
-    "transport/outgoing.py": {"_infra.AsyncMessageBuffer"},
-    "transport/viser_private.py": {"_gui_api.svg_from_icon", "_gui_handles.svg_from_icon"},
-    "transport/gate.py": {"websockets.asyncio.server.serve"},
+    "transport/viser_private.py": {
+        "_infra.AsyncMessageBuffer",
+        "_gui_api.svg_from_icon",
+        "_gui_handles.svg_from_icon",
+    },
+    "transport/guard.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
 SCRIPTS = ("page.js", "paint.js", "marks.js", "loupe.js", "drag.js", "timeline.js", "shell.js", "document.js")
@@ -89,22 +91,3 @@ def test_what_our_scripts_use_of_the_page_of_viser_is_in_the_list() -> None:
     texts = {path.name: path.read_text(encoding="utf-8") for path in static_dir().glob("*.js")}
     found = {name: set(re.findall(r"__viser\w*", text)) for name, text in texts.items()}
     assert {name: names for name, names in found.items() if names} == IN_THE_PAGE
-
-
-@pytest.mark.parametrize(
-    ("line", "name"),
-    [
-        ("import viser._messages", "viser._messages"),
-        ("from viser._messages import Message", "viser._messages"),
-        ("from viser.infra import _infra", "viser.infra._infra"),
-        ("handle._impl.uuid", "_impl"),
-        ("self.planes[name]._data", "_data"),
-        ("x = page.server.gui._handles", "_handles"),
-    ],
-)
-def test_a_private_name_is_found(line: str, name: str) -> None:
-    assert list(private_names(ast.parse(line))) == [name]
-
-
-def test_own_private_attributes_and_double_underscores_are_not_taken_for_theirs() -> None:
-    assert not list(private_names(ast.parse("self._page = page; viser.__version__; from . import _own")))

@@ -10,9 +10,9 @@ import pytest
 from places import place_of
 
 from carts_core.project import ReviewState
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.tab import Tab
+from carts_viewer.tabs import Tab
 from tools.raw_tab import RawTab
 
 FRAMES = 8

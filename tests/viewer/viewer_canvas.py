@@ -10,8 +10,8 @@ import numpy as np
 from playwright.sync_api import Page
 
 from carts_viewer.app import ViewerApp
-from carts_viewer.layers import ARM_COLORS
-from carts_viewer.overlay import OverlayRenderer
+from carts_viewer.picture.layers import ARM_COLORS
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import ViewState
 
 T = TypeVar("T")

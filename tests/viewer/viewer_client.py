@@ -16,7 +16,7 @@ from viewer_victim import Widgets
 from websockets.exceptions import ConnectionClosed
 
 from carts_core.project import Key, ProjectState, ReviewState
-from carts_viewer.strokes import Target
+from carts_viewer.picture.strokes import Target
 from tools.raw_tab import RawTab
 
 T = TypeVar("T")

@@ -7,13 +7,12 @@ from carts_core.project import Project, ProjectState
 from carts_core.recording import Sequence
 from carts_core.settings import SolverName
 from carts_core.settings.stages import FirstOrder
-from carts_viewer import intents
-from carts_viewer.background import Background
-from carts_viewer.controller import Controller
-from carts_viewer.layers import Layer
-from carts_viewer.overlay import OverlayRenderer
-from carts_viewer.people import People, Person
-from carts_viewer.running import OptimizerFactory
+from carts_viewer.actions import intents
+from carts_viewer.controller import Background, Controller
+from carts_viewer.editing import People, Person
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.picture.layers import Layer
+from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 

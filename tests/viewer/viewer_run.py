@@ -1,6 +1,6 @@
 """A run that is still going on as long as a test needs it."""
 
-from carts_viewer import intents
+from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 
 # The default solver converges on a tiny frame within seconds, whatever the other settings say.

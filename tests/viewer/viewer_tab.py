@@ -9,7 +9,7 @@ from waiting import wait_in
 
 from carts_viewer.app import ViewerApp
 from carts_viewer.state import ViewState
-from carts_viewer.tab import Tab as Place
+from carts_viewer.tabs import Tab as Place
 
 
 @dataclass

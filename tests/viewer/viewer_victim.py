@@ -13,7 +13,7 @@ from waiting import wait_for
 
 from carts_core.files import MARKER
 from carts_viewer.app import ViewerApp
-from carts_viewer.panels.export import ExportPanel
+from carts_viewer.panels.exchange import ExportPanel
 from carts_viewer.panels.project import SavedPanel
 
 FORMATS = ("PNG masks", "COCO", "Kinematics, CSV")

@@ -17,10 +17,8 @@ from carts_core.errors import CartsError
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.importer import find
 from carts_core.settings.interchange import ImportOptions
-from carts_viewer.recording.changes import changed
-from carts_viewer.recording.draft import Draft
-from carts_viewer.recording.form import check_form
-from carts_viewer.recording.guess import guess
+from carts_viewer.wizard.check import check_form, guess
+from carts_viewer.wizard.draft import Draft, changed
 
 SIZE = 640, 480
 K = np.array([[700.0, 0, 330], [0, 705, 235], [0, 0, 1]])

@@ -1,0 +1,1 @@
+"""Actions of a user: intents, and the handlers that carry them out."""

@@ -1,0 +1,175 @@
+"""What intents about the picture do: which frame, domain, camera and layer are shown, and playing."""
+
+import logging
+import time
+from dataclasses import replace
+from functools import singledispatchmethod
+from typing import Any
+
+from carts_core.errors import SequenceError
+from carts_core.project import Key, TimeOffset
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, clamped, finite, one_of, unknown
+from carts_viewer.choices import Against, Reach
+from carts_viewer.state import RunState
+
+_log = logging.getLogger(__name__)
+SPEEDS = (0.5, 60.0)
+"""Slowest and fastest playing [frames/s]."""
+
+
+class BrowsingHandler:
+    """The handler that chooses what is shown."""
+
+    def __init__(self, context: Context, run: OpenRun) -> None:
+        self._context = context
+        self._open_run = run
+        self._session = context.session
+        self._next_frame_at = 0.0
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Browsing) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def wait_time(self) -> float | None:
+        """How long until the next frame is due [s]; None when nothing plays."""
+        return max(0.0, self._next_frame_at - time.monotonic()) if self._context.state.playing else None
+
+    def advance(self) -> None:
+        """Show the next frame, if it is due."""
+        if self.wait_time() == 0.0:
+            state = self._context.state
+            self._next_frame_at = time.monotonic() + 1.0 / state.fps
+            first, last = state.range or (0, len(self._session.sequence) - 1)
+            self.show(index=state.index + 1 if first <= state.index < last else first)
+
+    def show(
+        self, *, index: int | None = None, domain: str | None = None, camera: str | None = None, again: bool = False
+    ) -> None:
+        """Go to another frame, domain or camera; out of range is clamped, an unknown name is refused.
+
+        Args:
+            index: of the frame.
+            domain: its name.
+            camera: its name.
+            again: also if nothing of these changes.
+
+        Raises:
+            CartsError: a name is unknown, the image is not usable, or an unfinished edit could not be saved.
+        """
+        context, state, sequence = self._context, self._context.state, self._session.sequence
+        index = state.index if index is None else min(max(int(index), 0), len(sequence) - 1)
+        domain = one_of(domain, state.domain, sequence.domains, "domain")
+        camera = one_of(camera, state.camera, [own.name for own in sequence.scene.cameras], "camera")
+        if not again and (index, domain, camera) == (state.index, state.domain, state.camera):
+            return
+        if (index, domain) != (state.index, state.domain) or (camera != state.camera and not state.every_camera):
+            self._open_run.end("Stopped: another image is shown")
+        frame = self._session.frame(index, domain, camera)
+        if index != state.index:
+            context.leave_frame()
+            self._open_run.forget()
+            keypoints = replace(context.state.keypoints, pins=(), residuals=())
+            context.change(run=RunState(), keypoints=keypoints)
+        context.change(index=index, domain=domain, camera=camera, frame=frame, scores=None, maps=None)
+        context.change(error=None, notice=None)
+        context.refresh()
+
+    @handle.register
+    def _(self, intent: intents.ShowFrame) -> None:
+        self._context.change(playing=False)
+        self.show(index=intent.index)
+
+    @handle.register
+    def _(self, intent: intents.MoveFrame) -> None:
+        self._context.change(playing=False)
+        self.show(index=self._context.state.index + intent.by)
+
+    @handle.register
+    def _(self, intent: intents.Play) -> None:
+        on = not self._context.state.playing if intent.on is None else intent.on
+        self._next_frame_at = time.monotonic()
+        self._context.change(playing=on)
+
+    @handle.register
+    def _(self, intent: intents.SetSpeed) -> None:
+        self._context.change(fps=clamped(intent.fps, *SPEEDS))
+
+    @handle.register
+    def _(self, intent: intents.SetTimeOffset) -> None:
+        seconds, sequence = finite(intent.seconds), self._session.sequence
+        try:
+            sequence.with_time_offset(seconds)
+        except SequenceError as error:
+            if sequence.matching is None:
+                raise
+            # Half-typed numbers are often far off, so there is no alarm before the field is left.
+            now = f"{sequence.matching.time_offset:g} s"
+            text = f"With {seconds:g} s there are no joint positions near some frames in time, so it stays at {now}."
+            _log.info("%s %s", text, error)
+            self._context.change(time_error=text)
+            return
+        self._open_run.end("Stopped: the time offset was changed")
+        self._context.change(time_error=None)
+        gesture = intents.SetTimeOffset
+        self._context.edit("Time offset", {Key.time_offset(): TimeOffset(seconds)}, gesture=gesture)
+
+    @handle.register
+    def _(self, intent: intents.ShowDomain) -> None:
+        self.show(domain=intent.domain)
+
+    @handle.register
+    def _(self, intent: intents.ShowCamera) -> None:
+        self.show(camera=intent.camera)
+
+    @handle.register
+    def _(self, intent: intents.ShowBeside) -> None:
+        self._context.change(beside=not self._context.state.beside if intent.on is None else intent.on)
+
+    @handle.register
+    def _(self, intent: intents.SetReach) -> None:
+        self._context.change(reach=Reach(intent.reach))
+
+    @handle.register
+    def _(self, intent: intents.SetRange) -> None:
+        end = len(self._session.sequence) - 1
+        first, last = sorted(min(max(int(one), 0), end) for one in intent.frames or (0, end))
+        self._context.change(range=None if (first, last) == (0, end) else (first, last))
+
+    @handle.register
+    def _(self, intent: intents.MarkRange) -> None:
+        index, end = self._context.state.index, len(self._session.sequence) - 1
+        first, last = self._context.state.range or (0, end)
+        # An end before the beginning begins anew there, with the rest of the sequence.
+        if intent.end:
+            self.handle(intents.SetRange((first if first <= index else 0, index)))
+        else:
+            self.handle(intents.SetRange((index, last if last >= index else end)))
+
+    @handle.register
+    def _(self, intent: intents.CompareWith) -> None:
+        self._compare(against=None if intent.against is None else Against(intent.against))
+
+    @handle.register
+    def _(self, intent: intents.SetSwipe) -> None:
+        self._compare(swipe=clamped(intent.share, 0.0, 1.0))
+
+    @handle.register
+    def _(self, intent: intents.Peek) -> None:
+        self._compare(peek=bool(intent.on))
+
+    def _compare(self, **changes: Any) -> None:
+        self._context.change(compare=replace(self._context.state.compare, **changes))
+
+    @handle.register
+    def _(self, intent: intents.ShowLayer) -> None:
+        self._context.change(layer=intent.layer)
+
+    @handle.register
+    def _(self, intent: intents.SetOpacity) -> None:
+        self._context.change(opacity=clamped(intent.opacity, 0.0, 1.0))

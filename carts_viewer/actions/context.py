@@ -1,0 +1,230 @@
+"""Shared state of the handlers: view state, recording and project, and checks of values from a browser."""
+
+import math
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any, Protocol
+
+from carts_core.errors import CartsError
+from carts_core.model.keypoints import project_keypoints
+from carts_core.model.scene import SceneState
+from carts_core.project import Edits, Figures, Kind, Provenance, Source
+from carts_core.project.values import WHOLE_PROJECT
+from carts_viewer.actions.intents import Intent
+from carts_viewer.picture.overlay import OverlayRenderer, with_imported
+from carts_viewer.session import Session
+from carts_viewer.state import Maps, ViewState
+
+
+class OpenRun(Protocol):
+    """The run of the optimizer on the shown frame, as far as other handlers have to do with it."""
+
+    def end(self, reason: str | None) -> None:
+        """End the run, if there is one, and save where it is.
+
+        Args:
+            reason: for people; None if they need none.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+
+    def forget(self) -> None:
+        """Another frame is shown, where there is no run to go back to the start of."""
+
+
+class Context:
+    """The state, which handlers replace, and the edits that they make; used on the worker's thread alone.
+
+    Attributes:
+        state: what the page shows.
+        session: the recording and its project.
+        renderer: renders poses.
+    """
+
+    def __init__(self, state: ViewState, session: Session, renderer: OverlayRenderer) -> None:
+        self.state = state
+        self.session = session
+        self.renderer = renderer
+        self._editor = session.editor
+        self._loss: float | None = None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that a run uses."""
+        names = tuple(camera.name for camera in self.session.scene.cameras)
+        return names if self.state.every_camera else (self.state.camera,)
+
+    def change(self, **changes: Any) -> None:
+        """Replace fields of the state."""
+        self.state = replace(self.state, **changes)
+
+    def set_pose(
+        self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
+    ) -> None:
+        """Give the shown frame another pose; no run may be open.
+
+        Args:
+            name: of the step in the history.
+            scene: the pose.
+            gesture: edits of the same gesture are one step, saved when it ends; None: this is the whole gesture.
+            source: who made it.
+            pins: whether the pose is what pins say; otherwise they are forgotten.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if not pins:
+            self.forget_pins()
+        self.edit(name, self.session.edits(self.state.frame, scene, Provenance(source)), gesture=gesture)
+
+    def edit(
+        self,
+        name: str,
+        edits: Edits,
+        *,
+        gesture: object = None,
+        loss: float | None = None,
+        maps: Maps | None = None,
+    ) -> None:
+        """Change the project; arguments and errors as `set_pose`, for any edits.
+
+        Args:
+            name: of the step in the history.
+            edits: what changes.
+            gesture: see `set_pose`.
+            loss: the optimizer's, at the new pose.
+            maps: what the optimizer saw there.
+        """
+        if self._editor.gesture != gesture:
+            self.save()
+        self._loss = loss
+        frames = sorted({key.frame for key in edits} - {WHOLE_PROJECT})
+        where = "".join(f", frame {self.session.sequence.frame_ids[index]}" for index in frames)
+        self._editor.draft(f"{name}{where}", edits, gesture or object())
+        self.refresh(maps)
+        if gesture is None:
+            self.save()
+
+    def save(self) -> None:
+        """Save the gesture under way as one step, as far as there is one.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if not self._editor.unsaved:
+            return
+        index, figures = self.state.index, {}
+        if self._editor.view.figures(index) is None:
+            self.score()
+            found = Figures(self._loss, self.state.scores.dice if self.state.scores else None)
+            figures = {} if found == Figures() else {index: found}
+        self._editor.save(figures)
+        self._follow()
+
+    def _follow(self) -> None:
+        """Bring what is said of the project up to date."""
+        editor = self._editor
+        self.change(project=editor.view, unsaved=editor.unsaved, can_undo=editor.can_undo, can_redo=editor.can_redo)
+
+    def leave_frame(self) -> None:
+        """Save the shown frame before another one is shown. Errors as `save`."""
+        self.save()
+        # A project that takes no edits cannot save it.
+        self._editor.drop()
+        self._loss = None
+
+    def refresh(self, maps: Maps | None = None) -> None:
+        """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
+        before = self.state
+        if not self.session.matched(self.state.frame):
+            frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
+            self.change(frame=frame, scores=None, maps=None)
+        pose = self.session.pose(self.state.frame)
+        if not pose.equals(self.state.pose):
+            self.change(pose=pose, scores=None, maps=None)
+            self._measure_pins()
+        self.change(maps=maps or self.state.maps)
+        self._follow()
+        if self._truths(self.state) != self._truths(before):
+            self.change(scores=None)
+        if self.state.ignore_region != before.ignore_region:
+            self.change(maps=None)
+
+    @staticmethod
+    def _truths(state: ViewState) -> tuple[object, ...]:
+        """What scores depend on besides the pose: the corrected mask, and masks of others."""
+        record = state.project.records.get(state.index)
+        entries = {} if record is None else record.entries
+        others = [entry.value for key, entry in entries.items() if key.kind is Kind.IMPORTED_MASK]
+        return state.mask_correction, *others
+
+    def score(self) -> None:
+        """Compare the pose with the truth, if that was not done yet; the project keeps the first figures it gets."""
+        state = self.state
+        if state.scores is not None:
+            return
+        if state.streaming:
+            self.change(scores=self.renderer.scores(state.pose.scene, state.frame, state.camera))
+            return
+        frame = with_imported(state.frame, self.session.scene, self._editor.view)
+        scores = self.renderer.scores(state.pose.scene, frame, state.camera, state.mask_correction)
+        self.change(scores=scores)
+        project = self._editor.project
+        known = scores.dice is None or state.unsaved or project.state.figures(state.index) is not None
+        if project.writable and not known and not state.playing:
+            project.record_figures({state.index: Figures(dice=scores.dice)}, project.state)
+            self.change(project=self._editor.view)
+
+    def _measure_pins(self) -> None:
+        """Say anew how far the pins are from their keypoints."""
+        keypoints = self.state.keypoints
+        if keypoints.pins:
+            distances = []
+            for pin in keypoints.pins:
+                at = project_keypoints(self.session.scene, self.state.pose.scene, [pin.keypoint], pin.camera)[0]
+                distances.append(math.dist(at.tolist(), pin.pixel))
+            self.change(keypoints=replace(keypoints, residuals=tuple(distances)))
+
+    def forget_pins(self) -> None:
+        """Drop what was said about where keypoints are."""
+        if self.state.keypoints.pins:
+            self.change(keypoints=replace(self.state.keypoints, pins=(), residuals=()))
+
+
+def finite(value: float) -> float:
+    """The number.
+
+    Raises:
+        CartsError: it is not finite.
+    """
+    if not math.isfinite(value):
+        raise CartsError(f"{value} is not a number that a control can be set to.")
+    return float(value)
+
+
+def clamped(value: float, low: float, high: float) -> float:
+    """The number, or the end of the range that it is beyond.
+
+    Raises:
+        CartsError: it is not finite.
+    """
+    return min(max(finite(value), low), high)
+
+
+def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> str:
+    """The name that is asked for, by default the present one.
+
+    Raises:
+        CartsError: there is no such thing.
+    """
+    if asked is None:
+        return now
+    if asked not in known:
+        raise CartsError(f"There is no {what} called {asked!r}; this sequence has: {', '.join(known)}.")
+    return asked
+
+
+def unknown(intent: Intent) -> CartsError:
+    """The error for an intent that nothing handles."""
+    return CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")

@@ -1,0 +1,374 @@
+"""Exports, downloads, and imported masks."""
+
+import io
+import json
+import os
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import lru_cache, singledispatchmethod
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.export import FORMATS, Dataset, Monitor, Parts, export, mask_png, project_frame
+from carts_core.files import OutputPath, file_name, output_path
+from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
+from carts_core.project.calibrated import calibrated_scene
+from carts_core.project.values import UNREVIEWED
+from carts_core.recording.annotations import read_annotations
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.picture.layers import Layer
+from carts_viewer.state import ExportState
+
+FRAME_CHOICES = {
+    "All": frozenset(ReviewState),
+    "All but rejected": frozenset(ReviewState) - {ReviewState.REJECTED},
+    "Accepted": frozenset({ReviewState.ACCEPTED}),
+    "Accepted or optimized": frozenset({ReviewState.ACCEPTED, ReviewState.OPTIMIZED}),
+    "Needs work": frozenset({ReviewState.NEEDS_WORK}),
+    "Unreviewed": UNREVIEWED,
+}
+"""What people can choose: review states of the frames that are exported."""
+PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
+"""What may get a category of its own."""
+_STEMS = {
+    "csv": "kinematics",
+    "npz": "kinematics",
+    "json": "kinematics",
+    "dvrk": "base_frames",
+    "dvrk-2.3": "base_frames",
+    "dvrk-suj": "suj",
+}
+"""How a file is called where the format's own name would say nothing."""
+_BIT = 0.05
+"""How long the page waits for an export at a time [s]; a step that takes longer is finished."""
+
+
+Deliver = Callable[[int, str, bytes], None]
+"""Sends a file to a tab: client id, file name, content."""
+
+
+class ExportingHandler:
+    """The handler that makes files."""
+
+    def __init__(self, context: Context, run: OpenRun, deliver: Deliver) -> None:
+        self._context = context
+        self._open_run = run
+        self._deliver = deliver
+        self._session = context.session
+        self._job: Stepped[Path] | None = None
+        self._intent: intents.Export | None = None
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Exporting) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def wait_time(self) -> float | None:
+        """0 while there is something to write; None when there is not."""
+        return None if self._job is None else 0.0
+
+    def advance(self) -> None:
+        """Write on for a moment, if there is something to write.
+
+        Raises:
+            CartsError: it cannot be written; nothing of it is left.
+        """
+        if self._job is None or self._intent is None:
+            return
+        job, intent = self._job, self._intent
+        try:
+            path = job.advance(_BIT)
+        except Exception as error:
+            self.cancel()
+            if not isinstance(error, ImportError):
+                raise
+            raise CartsError(
+                f"{FORMATS[intent.format].label} needs the package {error.name}, which is not installed. "
+                f"Install it (pip install {error.name}), then export again."
+            ) from error
+        self._report(done=job.done, total=job.total)
+        if path is not None:
+            self._job = None
+            self._report(path=path)
+            self._log(intent, path)
+
+    def cancel(self) -> None:
+        """Stop the export that is going on, if there is one; nothing of it is left."""
+        if self._job is not None:
+            job, self._job = self._job, None
+            job.cancel()
+            self._context.change(export=None)
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.Export) -> None:
+        if self._job is not None:
+            raise CartsError("Something is being exported already. Wait, or cancel that first.")
+        if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
+            raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
+        self._open_run.end("Stopped: frames are exported")
+        self._context.save()
+        make, count = self._dataset(intent)
+        target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
+        self._intent = intent
+        self._job = Stepped(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
+        self._context.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
+
+    @handle.register
+    def _(self, intent: intents.CancelExport) -> None:
+        self.cancel()
+
+    @handle.register
+    def _(self, intent: intents.Download) -> None:
+        export_state = self._context.state.export
+        if export_state is None or export_state.path is None:
+            raise CartsError("Nothing has been exported yet.")
+        self._deliver(intent.client_id, *zipped(export_state.path))
+
+    # ---- The export ------------------------------------------------------------------------------------------------
+
+    def _dataset(self, intent: intents.Export) -> tuple[Callable[[Monitor], Dataset], int]:
+        """What makes the dataset as the project is now, frame by frame, and how many frames it will have."""
+        state, session = self._context.state, self._session
+        view = session.editor.view
+        chosen = frames_within(view, intent.frames, intent.range)
+        if not chosen:
+            where = "" if intent.range is None else ", in the timeline's range"
+            raise SettingsError(
+                f"No frame is in this choice ({intent.frames.lower()}{where}). Review frames, or choose others."
+            )
+        cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
+        scene = calibrated_scene(session.scene, view).with_cameras(cameras)
+        renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
+
+        def make(monitor: Monitor) -> Dataset:
+            indices = Monitor(cancelled=monitor.cancelled).track(chosen)
+            frames = tuple(project_frame(sequence, view, index, cameras, renderer.mask) for index in indices)
+            return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
+
+        return make, len(chosen)
+
+    def _log(self, intent: intents.Export, path: Path) -> None:
+        project, export_state = self._session.editor.project, self._context.state.export
+        if project.writable and export_state is not None:
+            settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images}
+            if intent.range is not None:
+                settings["range"] = list(intent.range)
+            project.log_export(intent.format, path, export_state.frames, settings)
+            self._context.change(project=self._session.editor.view)
+
+    def _report(self, **changes: object) -> None:
+        if self._context.state.export is not None:
+            self._context.change(export=replace(self._context.state.export, **changes))
+
+
+def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:
+    """Indices of the frames of one of `FRAME_CHOICES`, of a range with both its ends or of the whole sequence."""
+    first, last = part or (0, len(project.identity.frame_ids) - 1)
+    return [index for index in frames_in(project, FRAME_CHOICES[frames]) if first <= index <= last]
+
+
+def shown_mask(context: Context) -> tuple[str, bytes]:
+    """The mask of the shown frame and camera as it was corrected: name and content of a PNG file."""
+    state, sequence = context.state, context.session.sequence
+    name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
+    mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)
+    painted = state.part_labels_of(state.camera)
+    if painted is not None:
+        mask = mask | (painted.labels() > 0)
+    return name, mask_png(mask)
+
+
+def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:
+    """Where an export goes: into a folder beside the project, under a name that nothing has yet."""
+    folder, suffix = output_path(project.parent, f"{project.stem}_exports"), FORMATS[intent.format].suffix
+    number, path = 1, folder / f"{stem}{suffix}"
+    while os.path.lexists(path):
+        number += 1
+        path = folder / f"{stem}-{number}{suffix}"
+    return path
+
+
+LARGEST = 512 * 2**20
+"""What may pass through the page's memory [bytes]."""
+_COMPRESSED = {".png", ".jpg", ".mp4", ".npz"}
+
+
+def zipped(path: Path) -> tuple[str, bytes]:
+    """Name and content of a download: a file as it is, a folder as a zip with the folder in it.
+
+    Raises:
+        CartsError: it is gone, or too large for a browser.
+    """
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    if not files:
+        raise CartsError(f"{path} is not there any more. Export again.")
+    size = sum(file.stat().st_size for file in files)
+    if size > LARGEST:
+        raise CartsError(
+            f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST // 2**20} MiB that can be downloaded. "
+            "Copy it from there."
+        )
+    if path.is_file():
+        return path.name, path.read_bytes()
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            kind = zipfile.ZIP_STORED if file.suffix in _COMPRESSED else zipfile.ZIP_DEFLATED
+            archive.write(file, Path(path.name) / file.relative_to(path), kind)
+    return f"{path.name}.zip", content.getvalue()
+
+
+_NAMED = 6
+"""Frames that are named."""
+
+
+def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
+    """Warnings for people, none where there is nothing to say.
+
+    Args:
+        project: as it is exported.
+        frames: indices of those that are exported.
+        cameras: whose images and masks are exported.
+    """
+    found: list[str] = []
+    # An hour has 100,000 frames, of which few have a record.
+    recorded = [index for index in frames if index in project.records]
+    accepted = sum(project.review(index).state is ReviewState.ACCEPTED for index in recorded)
+    open_ones = len(frames) - accepted
+    if open_ones:
+        found.append(f"{open_ones} of {len(frames)} frames {'is' if open_ones == 1 else 'are'} not accepted")
+    for verdict, text in (("failed", "failed"), ("doubtful", "are doubtful")):
+        those = [i for i in recorded if (known := project.verdict(i)) is not None and known.verdict == verdict]
+        found += _line(project, those, f"of these frames {text}")
+    partly = [i for i in recorded if not _seen_by_all(project, i, cameras)]
+    return found + _line(project, partly, "of these frames were fitted to fewer cameras than are exported")
+
+
+def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:
+    """Whether all exported cameras took part in fitting a frame; where nobody knows, they did."""
+    used = [_cameras(correction.provenance.settings) for correction in project.joints(frame).values()]
+    return all(names is None or set(cameras) <= names for names in used)
+
+
+@lru_cache(maxsize=256)
+def _cameras(settings: str | None) -> frozenset[str] | None:
+    """The cameras that an optimizer has used, as its settings say; None where they do not."""
+    names = json.loads(settings).get("cameras") if settings else None
+    return None if names is None else frozenset(map(str, names))
+
+
+def _line(project: ProjectState, frames: Sequence[int], text: str) -> list[str]:
+    if not frames:
+        return []
+    named = ", ".join(project.identity.frame_ids[index] for index in frames[:_NAMED])
+    more = " …" if len(frames) > _NAMED else ""
+    return [f"{len(frames)} {text}: {named}{more}"]
+
+
+T = TypeVar("T")
+
+
+class Stepped(Generic[T]):
+    """A function that asks a `Monitor` whether to go on, between two of its steps.
+
+    It runs on a thread of its own, but only while `advance` waits for it. So nothing happens at the same time, and what
+    it uses needs no lock.
+
+    Attributes:
+        done: steps that are done.
+        total: all steps; 0 until the first is done.
+    """
+
+    def __init__(self, function: Callable[[Monitor], T]) -> None:
+        self.done, self.total = 0, 0
+        self._function = function
+        self._go, self._back = threading.Semaphore(0), threading.Semaphore(0)
+        self._pause_at = 0.0
+        self._cancelled = False
+        self._result: T | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="carts-stepped", daemon=True)
+
+    def advance(self, seconds: float) -> T | None:
+        """Go on for about so long [s]; the function's result once there is one.
+
+        Raises:
+            Exception: what the function raised.
+        """
+        if self._thread.ident is None:
+            self._thread.start()
+        self._pause_at = time.monotonic() + seconds
+        self._go.release()
+        self._back.acquire()
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+    def cancel(self) -> None:
+        """Have the function stop, and wait until it has cleaned up."""
+        self._cancelled = True
+        if self._thread.is_alive():
+            self._go.release()
+            self._thread.join()
+
+    def _work(self) -> None:
+        self._go.acquire()
+        try:
+            self._result = self._function(Monitor(self._report, self._stop))
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._back.release()
+
+    def _report(self, done: int, total: int) -> None:
+        self.done, self.total = done, total
+
+    def _stop(self) -> bool:
+        if not self._cancelled and time.monotonic() >= self._pause_at:
+            self._back.release()
+            self._go.acquire()
+        return self._cancelled
+
+
+_LONGEST = 4096
+
+
+class ImportingHandler:
+    """The handler that brings in what others marked."""
+
+    def __init__(self, context: Context, run: OpenRun) -> None:
+        self._context = context
+        self._open_run = run
+        self._session = context.session
+
+    def handle(self, intent: intents.ImportMasks) -> None:
+        """Import, show it, and say what it was.
+
+        Raises:
+            CartsError: it is outside of the allowed folders, cannot be read, or would replace something; nothing is
+                changed then.
+        """
+        session = self._session
+        place = intent.place.strip()[:_LONGEST]
+        if not place:
+            raise CartsError("Type where the masks are: a COCO or CVAT file, or a folder of PNG masks.")
+        # As the folder is known by itself, whatever links lead to it.
+        path = session.roots.checked(session.sequence.path.parent.resolve() / Path(place))
+        found = read_annotations(path, session.sequence, intent.camera, confined=True)
+        self._open_run.end("Stopped: masks were imported")
+        self._context.save()
+        report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)
+        session.editor.claim()
+        self._context.refresh()
+        self._context.change(layer=Layer.IMPORTED, imported=report.sentence(), error=None)

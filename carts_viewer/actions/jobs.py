@@ -1,0 +1,349 @@
+"""What intents about jobs do: one after the other is started, followed, stopped and remembered."""
+
+import time
+from collections.abc import Generator
+from dataclasses import asdict, dataclass, replace
+from functools import singledispatchmethod
+from typing import Any
+
+from carts_core.errors import CartsError
+from carts_core.project import frames_in
+from carts_core.project.state import UNREVIEWED
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.actions.exchange import ExportingHandler
+from carts_viewer.actions.frame_filter import found
+from carts_viewer.actions.sequence import PropagatingHandler
+from carts_viewer.editing import Person
+from carts_viewer.jobs.companions import Decisions
+from carts_viewer.jobs.comparison import Comparison
+from carts_viewer.jobs.job_list import (
+    AdaptOptions,
+    CalibrateOptions,
+    Job,
+    JobList,
+    JobState,
+    OptimizeOptions,
+    Options,
+    SolveOptions,
+)
+from carts_viewer.jobs.networks import Networks
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.work import Progress, adapt, calibrate, optimize_frames
+from carts_viewer.state import ViewState
+
+_SAVE_EVERY = 5.0
+"""How often it is written down how far a job is [s]."""
+_CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
+"""Fields of a tab's state that a job depends on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asker:
+    """Person who has asked for a job, and the state of their tab then."""
+
+    person: Person
+    state: ViewState
+
+    def choose(self, context: Context) -> None:
+        """Have a job run with these choices, in this person's name."""
+        context.session.editor.person = self.person
+        context.change(**{name: getattr(self.state, name) for name in _CHOICES})
+
+
+class JobsHandler:
+    """The handler of what takes long; everything else goes on meanwhile."""
+
+    def __init__(
+        self,
+        context: Context,
+        run: OpenRun,
+        optimizers: OptimizerFactory,
+        propagating: PropagatingHandler,
+        exporting: ExportingHandler,
+    ) -> None:
+        self._context = context
+        self._open_run = run
+        self._optimizers = optimizers
+        self._propagating, self._exporting = propagating, exporting
+        self._comparison = Comparison(context.session, context.renderer, optimizers)
+        project = context.session.editor.project
+        decisions, identity = Decisions(), project.state.identity
+        self._list = JobList(
+            project.path,
+            kept=project.writable,
+            frame_ids=identity.frame_ids,
+            recording=identity.kinematics_sha256,
+            decisions=decisions,
+        )
+        self._asker: Asker | None = None
+        """Who asks for what is queued now."""
+        self._asked: dict[int, Asker] = {}
+        """By number of job; a job of an earlier viewer has none."""
+        self._work: Generator[Progress] | None = None
+        self._wait = 0.0
+        self._saved_at = 0.0
+        self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers, decisions=decisions)
+        self._publish()
+
+    def ask(self, intent: intents.Intent, asker: Asker) -> None:
+        """Do what somebody's intent asks for, with what they have chosen; errors as `handle`."""
+        self._asker = asker
+        self.handle(intent)
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Intent) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def wait_time(self) -> float | None:
+        """0 while there is something to do; None when there is not."""
+        active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
+        return self._wait if active else None
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.Solve) -> None:
+        state = self._choices
+        self._queue("solve", {**asdict(intent), "at": state.index, "range": state.range})
+
+    @handle.register
+    def _(self, intent: intents.Export) -> None:
+        self._queue("export", asdict(intent))
+
+    @handle.register
+    def _(self, intent: intents.OptimizeFrames) -> None:
+        self._queue("optimize", {"frames": self._frames(intent.frames)})
+
+    @handle.register
+    def _(self, intent: intents.Calibrate) -> None:
+        self._queue("calibrate", asdict(intent))
+
+    @handle.register
+    def _(self, intent: intents.Adapt) -> None:
+        if not self._context.session.editor.project.writable:
+            raise CartsError("The project is read-only here, so no network can be kept beside it.")
+        self._queue("adapt", {**asdict(intent), "folder": self._networks.next_number()})
+
+    @handle.register
+    def _(self, intent: intents.UseNetwork) -> None:
+        self._networks.use(intent.name)
+        self._publish()
+
+    @handle.register
+    def _(self, intent: intents.AnswerNetwork) -> None:
+        try:
+            self._networks.answer(intent.accepted)
+        finally:
+            self._publish()
+
+    @handle.register
+    def _(self, intent: intents.AnswerJobs) -> None:
+        for job in self._list.jobs:
+            if job.state is JobState.ASKED and intent.accepted:
+                self._list.accept(job.number, self._safe_options(job))
+            elif job.state is JobState.ASKED:
+                self._end(job, JobState.CANCELLED, "Discarded; it did not run.")
+        self._publish()
+
+    @handle.register
+    def _(self, intent: intents.CancelJob) -> None:
+        job = self._list.find(intent.number)
+        if job.state is JobState.RUNNING:
+            self._stop(job)
+        if not job.over:
+            self._end(job, JobState.CANCELLED, "Cancelled; what was saved is kept.")
+
+    @handle.register
+    def _(self, intent: intents.RepeatJob) -> None:
+        job = self._list.find(intent.number)
+        if not job.over:
+            raise CartsError("This job has not ended yet.")
+        options = self._safe_options(job)
+        if isinstance(options, OptimizeOptions):
+            options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
+        self._queue(job.kind, asdict(options))
+
+    @handle.register
+    def _(self, intent: intents.ForgetJobs) -> None:
+        self._list.forget()
+        self._publish()
+
+    # ---- The queue -------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Begin the next job, or follow the one that runs.
+
+        Raises:
+            CartsError: the job could not be done; it is said to have failed, and the next one is begun later.
+        """
+        job = self._running()
+        if job is None:
+            job = next((job for job in self._list.jobs if job.state is JobState.WAITING), None)
+            if job is None:
+                return
+            self._begin(job)
+        else:
+            self._follow(job)
+
+    def settle(self) -> None:
+        """Notice that what runs was stopped by somebody who did not ask for the job."""
+        job = self._running()
+        if job is not None and job.kind in ("solve", "export"):
+            self._follow(job)
+
+    def fail(self, text: str) -> None:
+        """Say of the job that runs, if there is one, that it has failed."""
+        job = self._running()
+        if job is not None:
+            self._end(job, JobState.FAILED, text)
+
+    def close(self) -> None:
+        """Write down how far everything is; the viewer ends, and so does what runs in another process."""
+        if self._work is not None:
+            self._work.close()
+        self._list.save()
+
+    def _queue(self, kind: str, values: dict[str, Any]) -> None:
+        job = self._list.add(kind, values)
+        if self._asker is not None:
+            self._asked[job.number] = self._asker
+        if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
+            # At once, so that an error of what was asked for is shown now.
+            self._begin(job)
+        self._publish()
+
+    def _safe_options(self, job: Job) -> Options:
+        """Options to run a job again: a training goes on only in a folder of this user's own that is not finished."""
+        own = self._list.is_own(job) and job.state is not JobState.DONE
+        if isinstance(job.options, AdaptOptions) and not own:
+            return replace(job.options, folder=self._networks.next_number())
+        return job.options
+
+    def _begin(self, job: Job) -> None:
+        self._list.change(job.number, "begun", state=JobState.RUNNING, began=time.time())
+        asker = self._asked.pop(job.number, None)
+        if asker is not None:
+            asker.choose(self._context)
+        try:
+            match job.options:
+                case SolveOptions() as options:
+                    self._propagating.solve(options.whole, options.at, job.frames)
+                case intents.Export() as export:
+                    self._exporting.handle(export)
+                case _:
+                    self._open_run.end("Stopped: a job was started")
+                    self._work = self._own(job.options)
+        except Exception as error:
+            self._end(job, JobState.FAILED, str(error))
+            raise
+        self._publish()
+
+    def _own(self, options: OptimizeOptions | CalibrateOptions | AdaptOptions) -> Generator[Progress]:
+        match options:
+            case OptimizeOptions():
+                return optimize_frames(self._context, self._comparison, options.frames, options.first)
+            case CalibrateOptions():
+                return calibrate(self._context, self._optimizers, options.frames)
+            case AdaptOptions():
+                folder = self._networks.folder(options.folder)
+                return adapt(self._context.session.sequence.path, folder, options.minutes)
+
+    def _follow(self, job: Job) -> None:
+        state = self._context.state
+        if job.kind == "solve":
+            solve = state.solve
+            if solve is None or not solve.running:
+                self._end(job, JobState.DONE, solve.text if solve else "")
+            else:
+                self._report(job, Progress(solve.progress[0] // 2, len(solve.frames), solve.text))
+        elif job.kind == "export":
+            export = state.export
+            if export is None:
+                self._end(job, JobState.CANCELLED, "Cancelled; nothing of it is left.")
+            elif export.path is not None:
+                self._end(job, JobState.DONE, f"{export.frames} frames in {export.path}")
+            else:
+                self._report(job, Progress(export.done, export.total, export.format))
+        else:
+            self._step(job)
+
+    def _step(self, job: Job) -> None:
+        try:
+            progress = None if self._work is None else next(self._work, None)
+        except Exception as error:
+            self._work = None
+            self._end(job, JobState.FAILED, str(error))
+            raise
+        if progress is None:
+            self._work = None
+            self._end(job, JobState.DONE, self._list.find(job.number).text)
+        else:
+            self._report(job, progress)
+
+    def _report(self, job: Job, progress: Progress) -> None:
+        now, self._wait = self._list.find(job.number), progress.wait
+        if (now.done, now.total, now.text) == (progress.done, progress.total, progress.text) and progress.line is None:
+            return
+        self._list.change(job.number, progress.line, done=progress.done, total=progress.total, text=progress.text)
+        if time.monotonic() - self._saved_at > _SAVE_EVERY:
+            self._saved_at = time.monotonic()
+            self._list.save()
+        self._publish()
+
+    def _stop(self, job: Job) -> None:
+        if job.kind == "solve":
+            self._propagating.finish()
+        elif job.kind == "export":
+            self._exporting.cancel()
+        if self._work is not None:
+            self._work.close()
+        self._work = None
+
+    def _end(self, job: Job, state: JobState, text: str) -> None:
+        self._wait = 0.0
+        self._asked.pop(job.number, None)
+        self._networks.look()
+        if isinstance(job.options, AdaptOptions) and job.state is JobState.RUNNING:
+            self._networks.trained(job.options.folder)
+        done = {"done": job.total} if state is JobState.DONE and job.total else {}
+        self._list.change(job.number, f"{state}: {text}", state=state, text=text, ended=time.time(), **done)
+        self._context.change(busy=None)
+        self._publish()
+
+    def _running(self) -> Job | None:
+        return next((job for job in self._list.jobs if job.state is JobState.RUNNING), None)
+
+    def _frames(self, which: str) -> list[int]:
+        view = self._context.session.editor.view
+        if which == "found":
+            frames = found(view, self._choices.filter)
+        elif which == "range":
+            first, last = self._choices.range or (0, len(self._context.session.sequence) - 1)
+            frames = list(range(first, last + 1))
+        elif which == "all":
+            frames = list(range(len(self._context.session.sequence)))
+        else:
+            frames = frames_in(view, UNREVIEWED)
+        if not frames:
+            raise CartsError("There is no such frame. Choose others.")
+        return frames
+
+    @property
+    def _choices(self) -> ViewState:
+        return self._context.state if self._asker is None else self._asker.state
+
+    def _publish(self) -> None:
+        networks = self._networks
+        self._context.change(
+            jobs=self._list.jobs,
+            networks=networks.names,
+            network=networks.used,
+            asked_network=networks.asked,
+            problems=tuple(filter(None, (self._list.problem, networks.problem))),
+        )

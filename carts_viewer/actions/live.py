@@ -1,0 +1,271 @@
+"""Live streams: starting and stopping one, and showing its newest result."""
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+from carts_core.errors import CartsError
+from carts_core.live import LiveStatistics, LiveTracker, OpenStream, Recorder, Results, Tracked, follow, open_stream
+from carts_core.live.messages import mounts_of
+from carts_core.optimization import Backgrounds
+from carts_core.project import Provenance, Source
+from carts_core.settings.live import StreamAddress, StreamKind
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
+from carts_viewer.state import LiveState, Pose
+
+
+class LiveRun:
+    """A stream that is being followed.
+
+    Args:
+        stream: where frames come from, and results go besides.
+        tracker: of the arms.
+        results: makes messages for the stream's clients.
+        recorder: keeps what is seen; None: nothing does.
+
+    Attributes:
+        statistics: how it goes.
+        error: what ended it; None if it goes on, or ended by itself.
+    """
+
+    def __init__(self, stream: OpenStream, tracker: LiveTracker, results: Results, recorder: Recorder | None) -> None:
+        self.statistics = LiveStatistics()
+        self.error: Exception | None = None
+        self.recorder = recorder
+        self._stream, self._tracker, self._results = stream, tracker, results
+        self._newest: Tracked | None = None
+        self._changing = threading.Lock()
+        self._thread = threading.Thread(target=self._follow, name="carts-live-tracker", daemon=True)
+        self._thread.start()
+
+    @property
+    def over(self) -> bool:
+        """Whether no more results come."""
+        return not self._thread.is_alive()
+
+    @property
+    def port(self) -> int | None:
+        """Where joints, or frames, may be sent to; None where nothing may be."""
+        return None if self._stream.server is None else self._stream.server.port
+
+    def take(self) -> Tracked | None:
+        """The newest result that was not taken yet."""
+        with self._changing:
+            newest, self._newest = self._newest, None
+        return newest
+
+    def close(self) -> None:
+        """End it, and wait for its thread; what was recorded is not finished by this."""
+        self._stream.close()
+        self._thread.join(10.0)
+
+    def _follow(self) -> None:
+        sinks = [self._show, *([self.recorder] if self.recorder is not None else [])]
+        try:
+            follow(self._stream.source, self._tracker, sinks, self.statistics)
+        except Exception as error:  # The worker shows it.
+            self.error = error
+        finally:
+            self._stream.close()
+            self._tracker.close()
+
+    def _show(self, tracked: Tracked) -> None:
+        with self._changing:
+            self._newest = tracked
+        if self._stream.clients:
+            message = self._results.message(tracked)
+            for send in self._stream.clients:
+                send(message)
+
+
+_LOOK_EVERY = 0.01
+"""How often a new result is looked for [s]."""
+_TELL_EVERY = 0.5
+"""How often it is said how the stream goes [s]."""
+_FOR_EVER = 1_000_000
+ALLOWED = (
+    intents.Live,
+    intents.ShowLayer,
+    intents.SetOpacity,
+    intents.ShowBeside,
+    intents.CompareWith,
+    intents.SetSwipe,
+    intents.Peek,
+    intents.Refresh,
+    intents.Drawn,
+    intents.Released,
+    intents.SetName,
+    intents.DismissError,
+    intents.CancelJob,
+)
+"""Intents that make sense while a stream is shown."""
+
+
+class Show(Protocol):
+    """Shows the recording again."""
+
+    def __call__(self, *, again: bool) -> None:
+        """As `BrowsingHandler.show`."""
+
+
+class LiveHandler:
+    """The handler that follows a stream in the place of the recording."""
+
+    def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory, show: Show) -> None:
+        self._context, self._open_run, self._optimizers, self._show = context, run, optimizers, show
+        self._session = context.session
+        self._live: LiveRun | None = None
+        self._tell_at = 0.0
+
+    @property
+    def active(self) -> bool:
+        """Whether a stream is shown."""
+        return self._live is not None
+
+    def handle(self, intent: intents.Live) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: the stream cannot be opened, or what was recorded not be written.
+        """
+        match intent:
+            case intents.StartLive():
+                self._start(intent)
+            case intents.StopLive():
+                self.stop("Stopped.")
+            case _:
+                raise unknown(intent)
+
+    def takes(self, intent: intents.Intent) -> bool:
+        """Whether an intent is dealt with here because a stream is shown.
+
+        Raises:
+            CartsError: it cannot be done meanwhile.
+        """
+        if not self.active or isinstance(intent, ALLOWED):
+            return False
+        state = self._context.state
+        if isinstance(intent, intents.ShowCamera) and intent.camera in state.frame.images:
+            self._context.change(camera=intent.camera, scores=None)
+            return True
+        if isinstance(intent, intents.Play) and intent.on is False:
+            return True
+        raise CartsError("A live stream is shown, which cannot be edited. Press Stop (Live) first.")
+
+    def wait_time(self) -> float | None:
+        """How long until a result is looked for [s]; None while no stream is shown."""
+        return _LOOK_EVERY if self.active else None
+
+    def advance(self) -> None:
+        """Show the newest result, if there is one; end where the stream has ended.
+
+        Raises:
+            CartsError: what ended it.
+        """
+        run = self._live
+        if run is None:
+            return
+        over = run.over
+        tracked = run.take()
+        if tracked is not None:
+            self._show_result(run, tracked)
+        elif over:
+            error = run.error
+            self.stop("The stream has ended." if error is None else "Ended by an error.")
+            if error is not None:
+                raise error
+
+    def stop(self, why: str) -> None:
+        """Show the recording again, and finish what was recorded.
+
+        Raises:
+            CartsError: it could not be written.
+        """
+        run, self._live = self._live, None
+        if run is None:
+            return
+        run.close()
+        state = self._context.state.live
+        assert state is not None
+        text = f"{why} {run.statistics}."
+        try:
+            self._show(again=True)
+        finally:
+            # After the frame: nobody may see a frame of the stream as one of the recording.
+            self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
+        if run.recorder is not None:
+            self._context.change(live=replace(state, on=False, text=f"{text} {_written(run.recorder.close())}"))
+
+    def _start(self, intent: intents.StartLive) -> None:
+        context, session = self._context, self._session
+        address = StreamAddress.parse(intent.source, intent.joints_port)
+        if address.kind in (StreamKind.VIDEO, StreamKind.FOLDER):
+            raise CartsError(f"{address.kind} is followed by the command line: carts live SEQUENCE --source {address}")
+        self.stop("Stopped.")
+        self._open_run.end("Stopped: a live stream was started")
+        context.save()
+        context.change(playing=False, error=None)
+        extractor = self._optimizers.prepare()
+        state, sequence, cameras = context.state, session.sequence, context.cameras
+        folder = self._folder() if intent.record else None
+        loops = _FOR_EVER if intent.repeat else 1
+        stream = open_stream(address, sequence, cameras, state.domain, rate=intent.rate, loops=loops)
+        try:
+            replayed = address.kind is StreamKind.REPLAY
+            known = Backgrounds.of(sequence, cameras, state.domain) if replayed else None
+            free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
+            scene = scene_at(session.scene, session.measured(state.frame))
+            tracker = LiveTracker(scene, extractor, free=free, backgrounds=known, cameras=cameras, concurrent=True)
+            made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
+            recorder = None if folder is None else Recorder(sequence, cameras, folder, made_by)
+        except BaseException:
+            stream.close()
+            raise
+        self._live = LiveRun(stream, tracker, Results(scene.with_cameras(cameras)), recorder)
+        self._tell_at = 0.0
+        waits = "Waiting for the first frame." if self._live.port is None else _waits(self._live.port)
+        context.change(live=LiveState(source=str(address), text=waits, busy=True), scores=None, maps=None, busy=None)
+
+    def _folder(self) -> Path:
+        """A new folder beside the project.
+
+        Raises:
+            CartsError: the project ends with the viewer, and what is beside it would, too.
+        """
+        project = self._session.editor.project
+        if not project.writable:
+            raise CartsError("This project cannot be written, so nothing is recorded beside it. Untick Record.")
+        return project.path.with_name(f"{project.path.stem}_live_{time.strftime('%Y%m%d_%H%M%S')}")
+
+    def _show_result(self, run: LiveRun, tracked: Tracked) -> None:
+        context, estimate, live = self._context, tracked.estimate, self._context.state.live
+        assert live is not None
+        mounts = mounts_of(self._session.scene, tracked.moment.frame, tracked.moment.camera_poses)
+        frame = replace(tracked.moment.frame, mounts=mounts)
+        measured = self._session.measured(frame)
+        scene = self._session.with_joints(measured, dict(estimate.joint_positions))
+        camera = context.state.camera if context.state.camera in frame.images else next(iter(frame.images))
+        text = live.text
+        if time.monotonic() >= self._tell_at:
+            self._tell_at = time.monotonic() + _TELL_EVERY
+            text = str(run.statistics)
+        context.change(
+            frame=frame,
+            camera=camera,
+            pose=Pose(scene, Source.OPTIMIZER),
+            live=replace(live, verdict=estimate.verdict.value, age=tracked.age, text=text, busy=False),
+            scores=None,
+            maps=None,
+        )
+
+
+def _waits(port: int) -> str:
+    return f"Waiting for messages on port {port} of 127.0.0.1."
+
+
+def _written(path: Path | None) -> str:
+    return "Nothing was recorded." if path is None else f"Recorded: carts view {path}"

@@ -1,0 +1,296 @@
+"""What intents about the optimizer do: a run on the shown frame, its settings, and what it may move."""
+
+from dataclasses import replace
+from functools import singledispatchmethod
+from typing import Any
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.optimization import Iterate
+from carts_core.project import Edits, FitVerdict, Key
+from carts_core.settings import SolverName, SurfaceSolver
+from carts_core.settings import solver as named_solver
+from carts_core.settings.serialization import changed
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, unknown
+from carts_viewer.choices import NETWORK, PRESETS, Observed
+from carts_viewer.jobs.comparison import FitCheck
+from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, scene_at
+from carts_viewer.picture.layers import Layer
+from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
+
+_REASONS = {
+    "iterations": "Done: the best iteration is the result",
+    "not optimized": "Evaluated only, as the solver says",
+    "converged": "Ended: no step lowers the loss any more",
+    "failed": "Ended: the image contradicts what was found",
+    "start kept": "The start is kept: what was found fits hardly better",
+    "cancelled": "Cancelled",
+}
+
+
+class OptimizingHandler:
+    """The handler that drives the optimizer, an iteration at a time."""
+
+    def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
+        self._context = context
+        self._session = context.session
+        self._optimizers = optimizers
+        self._check = FitCheck(context.session, optimizers)
+        self._run: ActiveRun | None = None
+        self._target = NETWORK
+        """What the last run fits."""
+        self._before: Edits | None = None
+        """What brings the frame back to where the last run began."""
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Optimizing) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    @property
+    def active(self) -> bool:
+        """Whether there is a run, paused or not."""
+        return self._run is not None
+
+    def wait_time(self) -> float | None:
+        """0 while iterations are due; None when there are none."""
+        return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
+
+    def advance(self) -> None:
+        """Do an iteration, if one is due."""
+        if self._context.state.run.phase is Phase.RUNNING:
+            self._iterate()
+
+    def end(self, reason: str | None, *, save: bool = True) -> None:
+        """Drop the optimizer and save where it is; its curves stay until the next run.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if self._context.state.run.base_frame_gain is not None:
+            self._set(base_frame_gain=None)
+        if self._run is not None:
+            self._run = None
+            self._set(phase=Phase.IDLE, reason=reason)
+            if save:
+                self._context.save()
+
+    def forget(self) -> None:
+        """Another frame is shown, where there is no run to go back to the start of."""
+        self._before = None
+
+    def map(self) -> None:
+        """Compute what the chosen layer shows beyond the pose, if that is not there yet.
+
+        Raises:
+            CartsError: it cannot be computed.
+        """
+        state = self._context.state
+        if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
+            return
+        if state.maps is not None and state.camera in state.maps.cameras:
+            return
+        try:
+            run = self._make((state.camera,))
+            iterate = run.step()
+        except CartsError:
+            # Without weights, say, there is nothing to show, and trying again with every picture would not help.
+            self._context.change(layer=Layer.MASK)
+            raise
+        self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.Run) -> None:
+        if self._run is None:
+            self._start()
+        self._set(phase=Phase.RUNNING, reason=None)
+
+    @handle.register
+    def _(self, intent: intents.Pause) -> None:
+        if self._context.state.run.phase is Phase.RUNNING:
+            self._set(phase=Phase.PAUSED)
+
+    @handle.register
+    def _(self, intent: intents.RunOrPause) -> None:
+        self.handle(intents.Pause() if self._context.state.run.phase is Phase.RUNNING else intents.Run())
+
+    @handle.register
+    def _(self, intent: intents.Step) -> None:
+        if self._run is None:
+            self._start()
+            self._iterate()
+        self._set(phase=Phase.PAUSED, reason=None)
+        self._iterate()
+
+    @handle.register
+    def _(self, intent: intents.Reset) -> None:
+        if self._run is not None:
+            # Nothing of the run was saved yet, so there is nothing to take back.
+            self._session.editor.drop()
+        self.end(None)
+        self._context.change(run=RunState())
+        if self._before is not None:
+            self._context.edit("Reset to the start of the run", self._before)
+
+    @handle.register
+    def _(self, intent: intents.SetSetting) -> None:
+        state = self._context.state
+        settings, solver = state.settings, state.solver
+        try:
+            if intent.name == "solver":
+                settings, solver = named_solver(intent.value), SolverName(intent.value)
+            else:
+                settings = changed(settings, {intent.name: intent.value}, "the solver")
+        except SettingsError as error:
+            # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
+            self._context.change(settings_error=str(error), settings_field=intent.name)
+            return
+        self.end("Settings changed; Run starts anew from here")
+        self._context.change(settings=settings, solver=solver, settings_error=None, settings_field=None, maps=None)
+
+    @handle.register
+    def _(self, intent: intents.ResetSettings) -> None:
+        preset = PRESETS.get(intent.preset)
+        if preset is None:
+            raise SettingsError(f"There is no preset {intent.preset!r}; there are: {', '.join(PRESETS)}.")
+        state = self._context.state
+        settings = named_solver(state.solver)
+        if isinstance(settings, SurfaceSolver):
+            settings = replace(settings, **preset.changes(settings))
+        self.end("Settings changed; Run starts anew from here")
+        self._context.change(settings=settings, settings_error=None, settings_field=None, maps=None)
+
+    @handle.register
+    def _(self, intent: intents.SetFreeJoint) -> None:
+        name = f"{intent.arm}/{intent.joint}"
+        locked = {*self._context.state.free.locked_joints} - {name}
+        self._set_free(locked_joints=tuple(sorted(locked if intent.on else {*locked, name})))
+
+    @handle.register
+    def _(self, intent: intents.SetFreeGroup) -> None:
+        if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
+            raise SettingsError(f"There is no group of parameters called {intent.group!r}.")
+        self._set_free(**{intent.group: intent.on})
+
+    @handle.register
+    def _(self, intent: intents.SetCameras) -> None:
+        self.end("Cameras changed; Run starts anew from here")
+        self._context.change(every_camera=intent.every)
+
+    @handle.register
+    def _(self, intent: intents.SetObserved) -> None:
+        observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
+        self.end("What is fitted was changed; Run starts anew from here")
+        self._context.change(observed=observed, maps=None)
+
+    # ---- The run ---------------------------------------------------------------------------------------------------
+
+    def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
+        state = self._context.state
+        sequence, self._target = self._session.sequence, self._session.target(state.observed)
+        ignore = self._session.ignored(state.index, cameras, self._target)
+        optimizer = self._optimizers.make(
+            sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, self._target, ignore
+        )
+        provenance = self._optimizers.provenance(cameras, state.settings, state.free, self._target)
+        return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance, state.free)
+
+    def _start(self) -> None:
+        if self._context.state.settings_error is not None:
+            raise SettingsError(self._context.state.settings_error)
+        if self._context.state.solving:
+            raise CartsError("Many frames are being solved. Wait, or stop that first.")
+        self._run = self._make(self._context.cameras)
+        self._context.save()
+        self._before = self._session.saved(self._context.state.index)
+        run = RunState(Phase.RUNNING, start=self._context.state.pose.scene)
+        self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._doubts())
+
+    def _doubts(self) -> tuple[str, ...]:
+        """What speaks against the network that the run relies on."""
+        state = self._context.state
+        if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
+            return ()
+        scene = scene_at(self._session.scene, state.pose.scene)
+        return self._optimizers.unfamiliar(
+            self._session.sequence, scene, state.index, state.domain, self._context.cameras
+        )
+
+    def _iterate(self) -> None:
+        run = self._run
+        if run is None:
+            return
+        iterate = run.step()
+        if iterate is None:
+            best, reason = run.best(), run.stop_reason
+            if best is not None:
+                self._accept(run, best, self._verdict(run, best))
+                curves = self._context.state.run.curves
+                self._set(curves=replace(curves, loss=run.comparable_losses(), comparable=True))
+            self.end(_REASONS.get(reason or "", reason))
+            self._set(base_frame_gain=run.base_frame_gain())
+            return
+        self._accept(run, iterate)
+        self._context.score()
+        curves, best = self._context.state.run.curves, run.best()
+        self._set(
+            curves=Curves(
+                (*curves.loss, float(iterate.loss)),
+                run.stages,
+                False,
+                (*curves.scores, self._context.state.scores or Scores()),
+                (*curves.seconds, float(iterate.seconds)),
+                best.index if best else 0,
+            )
+        )
+
+    def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
+        """On the end of a run: what its own cameras say, and where there are several, what each of all says alone."""
+        own = run.verdict()
+        if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
+            return own
+        state = self._context.state
+        try:
+            found = self._check.fit(state.index, state.domain, run.pose(end), state.settings, self._target).verdict
+        except CartsError:
+            # A solver that needs no surface network has run without one.
+            return own
+        return found
+
+    @handle.register
+    def _(self, intent: intents.Assess) -> None:
+        self.end("Stopped: the fit was checked")
+        self._optimizers.report("comparing with the images")
+        state = self._context.state
+        target = self._session.target(state.observed)
+        found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
+        if self._session.editor.project.writable:
+            # It says something about the frame and changes nothing, so there is nothing to undo.
+            self._context.save()
+            self._session.editor.project.record_verdict(state.index, found.verdict)
+            self._context.refresh()
+        else:
+            self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
+        self._context.change(busy=None)
+
+    def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:
+        """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
+        state = self._context.state
+        edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
+        # An earlier verdict was on another pose.
+        edits[Key.verdict(state.index)] = verdict
+        maps = Maps(iterate, run.cameras)
+        self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
+
+    def _set_free(self, **changes: Any) -> None:
+        self.end("Free parameters changed; Run starts anew from here")
+        self._context.change(free=replace(self._context.state.free, **changes), maps=None)
+
+    def _set(self, **changes: Any) -> None:
+        self._context.change(run=replace(self._context.state.run, **changes))

@@ -1,0 +1,151 @@
+"""Moving arms by hand: sliders, nudges, perturbations, and dragging a link in the picture."""
+
+import math
+from functools import singledispatchmethod
+
+from carts_core.errors import CartsError
+from carts_core.model.keypoints import Keypoint, project_keypoints
+from carts_core.model.scene import SceneState
+from carts_core.optimization.keypoints import Pin, fit_keypoints
+from carts_core.project import Key
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, clamped, finite, unknown
+
+LARGEST_PERTURBATION = 30.0
+"""[deg and mm]."""
+
+
+class PosingHandler:
+    """The handler that moves joints by hand."""
+
+    def __init__(self, context: Context, run: OpenRun) -> None:
+        self._context = context
+        self._open_run = run
+        self._session = context.session
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Posing) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    @handle.register
+    def _(self, intent: intents.SetJoint) -> None:
+        value = finite(intent.value)
+        scene = self._session.with_joint(self._context.state.pose.scene, intent.arm, intent.joint, value)
+        self._context.change(joint=(intent.arm, intent.joint))
+        # All events of one joint until it is let go of are one step of undo.
+        gesture = (intents.SetJoint, intent.arm, intent.joint)
+        self._set_pose(f"Move {self._joint_name()}", scene, gesture=gesture)
+
+    @handle.register
+    def _(self, intent: intents.ChooseJoint) -> None:
+        joints = [(arm.name, joint) for arm in self._session.scene.arms for joint in range(len(arm.robot.joint_names))]
+        following = joints[(joints.index(self._joint()) + 1) % len(joints)]
+        chosen = intent.joint or following
+        if chosen not in joints:
+            raise CartsError(f"There is no joint {chosen!r}.")
+        self._context.change(joint=chosen)
+
+    @handle.register
+    def _(self, intent: intents.Nudge) -> None:
+        arm, joint = self._joint()
+        pose = self._context.state.pose.scene
+        by = clamped(intent.by, -LARGEST_PERTURBATION, LARGEST_PERTURBATION)
+        step = math.radians(by) if self._session.joint_range(arm, joint).revolute else by / 1e3
+        now = self._session.joints(pose)[arm][joint]
+        self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step))
+
+    @handle.register
+    def _(self, intent: intents.BackToMeasured) -> None:
+        self._open_run.end("Stopped: the pose was changed by hand")
+        names = [arm.name for arm in self._session.scene.arms] if intent.arm is None else [intent.arm]
+        index = self._context.state.index
+        self._context.edit("Back to measured", {Key.joints(index, name): None for name in names})
+
+    @handle.register
+    def _(self, intent: intents.Perturb) -> None:
+        degrees = clamped(intent.degrees, 0.0, LARGEST_PERTURBATION)
+        state = self._context.state
+        scene = self._session.perturbed(state.pose.scene, state.index, degrees, intent.seed)
+        self._set_pose(f"Perturb by {degrees:g}°", scene)
+
+    def _set_pose(self, name: str, scene: SceneState, gesture: object = None) -> None:
+        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.set_pose(name, scene, gesture=gesture)
+
+    def _joint(self) -> tuple[str, int]:
+        return self._context.state.joint or (self._session.scene.arms[0].name, 0)
+
+    def _joint_name(self) -> str:
+        arm, joint = self._joint()
+        name = self._session.joint_range(arm, joint).joint
+        return f"{arm} {name.removesuffix('_joint').replace('_', ' ')}"
+
+
+_REACH = 15.0
+"""How far from the arm a link can be taken [px]."""
+_LEAST = 0.5
+"""A pointer that has moved less was only pressed [px]."""
+
+
+class DraggingHandler:
+    """The handler that moves a link to where the pointer drags it.
+
+    Every place of a gesture starts from the pose in which the link was taken, so that the way there does not matter and
+    dragging it back undoes it.
+    """
+
+    def __init__(self, context: Context, run: OpenRun) -> None:
+        self._context = context
+        self._open_run = run
+        self._gesture: float | None = None
+        self._frame = 0
+        self._start: SceneState | None = None
+        self._point: Keypoint | None = None
+        """What is dragged; None where nothing was under the pointer."""
+
+    def handle(self, intent: intents.DragLink) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        if not all(map(math.isfinite, (*intent.start, *intent.end))):
+            raise CartsError(f"{intent.start} to {intent.end} are no places in the image.")
+        if intent.gesture != self._gesture:
+            self._take(intent)
+        moved = intent.end[0] - intent.start[0], intent.end[1] - intent.start[1]
+        point, start, context = self._point, self._start, self._context
+        gesture = (intents.DragLink, intent.gesture)
+        under_way = context.session.editor.gesture == gesture
+        if point is None or start is None or context.state.index != self._frame:
+            return
+        if math.hypot(*moved) < _LEAST and not under_way:
+            return
+        scene, camera = context.session.scene, context.session.scene.camera(intent.camera)
+        u, v = project_keypoints(scene, start, [point], camera.name)[0].tolist()
+        # Not the point but what the pointer has done to it, or a link that was taken beside its outline would jump.
+        pixel = _within(u + moved[0], camera.width), _within(v + moved[1], camera.height)
+        fit = fit_keypoints(scene, start, [Pin(point, camera.name, pixel)])
+        self._open_run.end("Stopped: the pose was changed by hand")
+        link = point.name.removesuffix("_link").replace("_", " ")
+        context.set_pose(f"Drag {point.arm} {link}", fit.state, gesture=gesture)
+
+    def _take(self, intent: intents.DragLink) -> None:
+        """Take hold of what is under the pointer."""
+        state = self._context.state
+        self._gesture, self._frame, self._start, self._point = intent.gesture, state.index, state.pose.scene, None
+        self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _REACH)
+        if self._point is None:
+            raise CartsError(
+                "There is no arm under the pointer. Press where the overlay shows a link, hold Ctrl, and drag it."
+            )
+
+
+def _within(value: float, size: int) -> float:
+    """A place at most one image beyond the image."""
+    return min(max(value, -float(size)), 2.0 * size)

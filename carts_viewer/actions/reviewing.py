@@ -1,0 +1,294 @@
+"""History, review, corrections copied between frames, keypoints, and actions on filtered frames."""
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import singledispatchmethod
+from typing import Any
+
+import torch
+
+from carts_core.errors import CartsError
+from carts_core.model.keypoints import project_keypoints
+from carts_core.model.scene import SceneState
+from carts_core.optimization.keypoints import Pin, fit_keypoints
+from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
+from carts_core.project.values import LONGEST_NOTE
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, clamped, unknown
+from carts_viewer.actions.frame_filter import FrameFilter, found
+from carts_viewer.picture.overlay import labelled_keypoints
+
+_SETTLED = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
+_REVIEW_STEPS = {
+    ReviewState.UNTOUCHED: "Clear the review",
+    ReviewState.OPTIMIZED: "Mark as optimized",
+    ReviewState.NEEDS_WORK: "Mark as needing work",
+    ReviewState.ACCEPTED: "Accept",
+    ReviewState.REJECTED: "Reject",
+}
+
+
+class AnnotatingHandler:
+    """The handler that the project is about."""
+
+    def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
+        """
+        Args:
+            context: the state, and the way into the project.
+            run: ends when the frame is edited.
+            show: `BrowsingHandler.show`.
+        """
+        self._context = context
+        self._open_run = run
+        self._show = show
+        self._session = context.session
+        self._keypoints = labelled_keypoints(context.session.scene)
+        self._held: str | None = None
+        """The keypoint under somebody's pointer."""
+        self._pinned_from: SceneState | None = None
+        """The pose before the first of the present pins."""
+        self._fitted: SceneState | None = None
+        """The pose that the present pins have led to."""
+        self._worst: int | None = None
+        """The frame that `ShowWorse` went to last; None after anything else has shown another one."""
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Annotation) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def released(self) -> None:
+        """The pointer was let go of."""
+        self._held = None
+
+    # ---- History ---------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.Undo) -> None:
+        self._finish("Stopped by undo")
+        self._changed(self._session.editor.undo())
+
+    @handle.register
+    def _(self, intent: intents.Redo) -> None:
+        self._finish("Stopped by redo")
+        self._changed(self._session.editor.redo())
+
+    @handle.register
+    def _(self, intent: intents.GoToStep) -> None:
+        self._finish("Stopped by undo")
+        self._changed(self._session.editor.go_to(intent.position))
+
+    def _finish(self, reason: str) -> None:
+        self._open_run.end(reason)
+        self._context.save()
+
+    def _changed(self, change: Change | None) -> None:
+        self._context.forget_pins()
+        frames = () if change is None else change.frames
+        index = self._context.state.index
+        # What changes should be seen, wherever it is.
+        self._show(index=index if index in frames or not frames else frames[0], again=True)
+
+    # ---- Review ----------------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.SetReview) -> None:
+        self._review(intent.state)
+
+    @handle.register
+    def _(self, intent: intents.SetNote) -> None:
+        state = self._context.state
+        review = Review(state.review.state, str(intent.note)[:LONGEST_NOTE])
+        self._mark("Note", review, gesture=(intents.SetNote, state.index))
+
+    @handle.register
+    def _(self, intent: intents.AcceptAndNext) -> None:
+        self._context.change(notice=None)
+        self._review(ReviewState.ACCEPTED)
+        state = self._context.state
+        within = state.part if state.index in state.part else None
+        index = next_unreviewed(state.project, state.index, within=within)
+        if index is not None:
+            self._go(index)
+            return
+        # Whoever accepts the last frame is done, which is no error.
+        where = " of the range" if within is not None and state.range is not None else ""
+        count = len(within or range(len(self._session.sequence)))
+        self._context.change(notice=f"All {count} frames{where} are reviewed.")
+
+    @handle.register
+    def _(self, intent: intents.ShowUnreviewed) -> None:
+        state = self._context.state
+        index = next_unreviewed(state.project, state.index, 1 if intent.step > 0 else -1)
+        if index is None:
+            raise CartsError("Every frame has been reviewed.")
+        self._go(index)
+
+    @handle.register
+    def _(self, intent: intents.ShowWorse) -> None:
+        state = self._context.state
+        project = state.project
+        frames = range(len(project.identity.frame_ids))
+        open_ones = [i for i in frames if i == state.index or project.review(i).state not in _SETTLED]
+        order = worst_first(project, open_ones)
+        if len(order) == 1:
+            raise CartsError("Every other frame is accepted or rejected.")
+        # Who comes from elsewhere begins with the worst one; who is there already, with the one after it.
+        begins = self._worst != state.index and order[0] != state.index
+        place = 0 if begins else (order.index(state.index) + (1 if intent.step > 0 else -1)) % len(order)
+        self._go(order[place])
+        self._worst = order[place]
+
+    def _review(self, state: ReviewState) -> None:
+        note = self._context.state.review.note
+        self._mark(_REVIEW_STEPS[state], Review(state, note))
+
+    def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
+        """Say something about the shown frame, which ends a run."""
+        self._open_run.end("Stopped: the frame was reviewed")
+        # What says nothing is none, so that clearing what is clear is no step.
+        edits = {Key.review(self._context.state.index): None if review == Review() else review}
+        self._context.edit(name, edits, gesture=gesture)
+
+    def _go(self, index: int) -> None:
+        self._context.change(playing=False)
+        self._show(index=index)
+
+    # ---- Corrections -----------------------------------------------------------------------------------------------
+
+    @handle.register
+    def _(self, intent: intents.CopyCorrection) -> None:
+        state = self._context.state
+        index = state.index + (1 if intent.step > 0 else -1)
+        if not 0 <= index < len(self._session.sequence):
+            side = "after" if intent.step > 0 else "before"
+            raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
+        source = self._session.sequence.frame(index, cameras=[])
+        scene = self._session.copied(state.frame, source)
+        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.set_pose(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)
+
+    @handle.register
+    def _(self, intent: intents.ShowKeypoints) -> None:
+        shown = self._context.state.keypoints
+        self._context.change(keypoints=replace(shown, shown=not shown.shown if intent.on is None else intent.on))
+
+    @handle.register
+    def _(self, intent: intents.ChooseKeypoint) -> None:
+        if intent.label is not None and intent.label not in self._keypoints:
+            raise CartsError(f"There is no keypoint {intent.label!r}; there are: {', '.join(self._keypoints)}.")
+        self._context.change(keypoints=replace(self._context.state.keypoints, chosen=intent.label))
+
+    @handle.register
+    def _(self, intent: intents.ForgetPins) -> None:
+        self._context.forget_pins()
+
+    @handle.register
+    def _(self, intent: intents.PointAt) -> None:
+        self._open_run.end("Stopped: the pose was changed by hand")
+        state = self._context.state
+        camera = self._session.scene.camera(intent.camera or state.camera)
+        if not (math.isfinite(intent.u) and math.isfinite(intent.v)):
+            raise CartsError(f"({intent.u}, {intent.v}) is no place in the image.")
+        pixel = min(max(intent.u, 0.0), float(camera.width)), min(max(intent.v, 0.0), float(camera.height))
+        self._held = self._held or state.keypoints.chosen or self._nearest(pixel, camera.name)
+        pin = Pin(self._keypoints[self._held], camera.name, pixel)
+        others = [old for old in state.keypoints.pins if (old.keypoint, old.camera) != (pin.keypoint, pin.camera)]
+        if not state.keypoints.pins or self._pinned_from is None or self._moved_since(state.pose.scene):
+            self._pinned_from = state.pose.scene
+        pins = (*others, pin)
+        fit = fit_keypoints(self._session.scene, self._pinned_from, pins)
+        self._fitted = fit.state
+        placed = replace(state.keypoints, shown=True, pins=pins, residuals=fit.residuals)
+        self._context.change(keypoints=placed)
+        gesture = (intents.PointAt, pin.keypoint, pin.camera)
+        self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
+
+    def _moved_since(self, scene: SceneState) -> bool:
+        """Whether something else, a run, has moved the arms since they were fitted to pins."""
+        if self._fitted is None:
+            return True
+        pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
+        return not all(torch.allclose(one, other, atol=1e-5) for one, other in pairs)
+
+    def _nearest(self, pixel: tuple[float, float], camera: str) -> str:
+        state = self._context.state
+        points = list(self._keypoints.values())
+        shown = project_keypoints(self._session.scene, state.pose.scene, points, camera)
+        distances = (shown - shown.new_tensor(pixel)).norm(dim=-1).nan_to_num(math.inf)
+        return list(self._keypoints)[int(distances.argmin())]
+
+
+_LONGEST = 200
+"""Of a text that is looked for, in characters."""
+_STEPS = {
+    ReviewState.ACCEPTED: "Accept",
+    ReviewState.REJECTED: "Reject",
+    ReviewState.NEEDS_WORK: "Mark as needing work",
+    ReviewState.UNTOUCHED: "Clear the review of",
+    ReviewState.OPTIMIZED: "Mark as optimized",
+}
+
+
+class FindingHandler:
+    """The handler that looks for frames."""
+
+    def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
+        self._context = context
+        self._open_run = run
+        self._show = show
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Finding) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    @handle.register
+    def _(self, intent: intents.SetFilter) -> None:
+        if intent.name not in [field.name for field in fields(FrameFilter)]:
+            raise CartsError(f"Frames cannot be looked for by {intent.name!r}.")
+        value: Any = clamped(intent.value, 0.0, 1.0) if intent.name == "dice" else str(intent.value)[:_LONGEST]
+        self._context.change(filter=replace(self._context.state.filter, **{intent.name: value}))
+
+    @handle.register
+    def _(self, intent: intents.ClearFilter) -> None:
+        self._context.change(filter=FrameFilter())
+
+    @handle.register
+    def _(self, intent: intents.ShowFound) -> None:
+        state = self._context.state
+        frames = self._found()
+        if intent.step > 0:
+            index = next((frame for frame in frames if frame > state.index), frames[0])
+        else:
+            index = next((frame for frame in reversed(frames) if frame < state.index), frames[-1])
+        self._context.change(playing=False)
+        self._show(index=index)
+
+    @handle.register
+    def _(self, intent: intents.ReviewFound) -> None:
+        frames, project = self._found(), self._context.session.editor.view
+        self._open_run.end("Stopped: many frames were reviewed")
+        edits: dict[Key[Any], Any] = {}
+        for index in frames:
+            review = Review(intent.state, project.review(index).note)
+            edits[Key.review(index)] = None if review == Review() else review
+        # All frames in a name would be a long one.
+        self._context.save()
+        self._context.session.editor.apply(f"{_STEPS[intent.state]} {len(frames)} frames", edits)
+        self._context.refresh()
+
+    def _found(self) -> list[int]:
+        frames = found(self._context.session.editor.view, self._context.state.filter)
+        if not frames:
+            raise CartsError("No frame is like that. Loosen a condition, or clear them.")
+        return frames

@@ -1,0 +1,276 @@
+"""Sequence mode: keyframes, and solving many frames together."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import singledispatchmethod
+from typing import Any
+
+import numpy as np
+
+from carts_core.errors import CartsError, ProjectError
+from carts_core.optimization import FrameEstimate
+from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kept
+from carts_core.project.values import WHOLE_PROJECT
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
+from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun
+from carts_viewer.state import ListedFrame, SolveState
+
+
+class PropagatingHandler:
+    """The handler that solves many frames, one at a time."""
+
+    def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory) -> None:
+        self._context = context
+        self._open_run = run
+        self._session = context.session
+        self._optimizers = optimizers
+        self._comparison = Comparison(context.session, context.renderer, optimizers)
+        self._held: dict[int, Outcome] = {}
+        """Frames that would fit worse than before, and are as they were."""
+        self._run: SequenceRun | None = None
+        self._work: Iterator[None] = iter(())
+        self._before: ProjectState = context.session.editor.view
+        """What the project said when the run began."""
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Propagating) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    def wait_time(self) -> float | None:
+        """0 while frames are being solved; None when they are not."""
+        return None if self._run is None else 0.0
+
+    def advance(self) -> None:
+        """Solve the next frame, if there is one.
+
+        Raises:
+            CartsError: a frame is not usable, or the frames could not be saved. What was solved is saved if it can be.
+        """
+        if self._run is not None:
+            next(self._work, None)
+
+    def drop(self, reason: str) -> None:
+        """Forget what is being solved, if anything is."""
+        if self._run is not None:
+            self._run = None
+            self._report(running=False, text=reason)
+
+    def finish(self) -> None:
+        """Stop, and save the frames that are solved. Errors as `advance`."""
+        if self._run is not None:
+            self._run.cancel()
+            for _ in self._work:
+                pass
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    def solve(self, whole: bool, at: int, part: range | None = None) -> None:
+        """Begin to solve all frames, or those between the kept frames around the frame `at`; of a part, if given.
+
+        Raises:
+            CartsError: there is nothing to solve, or it could not be saved.
+        """
+        if self._run is not None:
+            raise CartsError("Frames are being solved already. Wait, or stop that first.")
+        project = self._session.editor.project
+        if not project.writable:
+            raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
+        self._open_run.end("Stopped: many frames are solved together")
+        self._context.save()
+        view = self._session.editor.view
+        everything = range(len(self._session.sequence))
+        if part is not None and (part.start not in everything or part.stop - 1 not in everything or not part):
+            raise CartsError("The chosen range lies outside of the sequence. Choose another one in the timeline.")
+        if part is not None and not whole and at not in part:
+            raise CartsError(
+                "Solving between keyframes keeps to the range in the timeline, and the shown frame lies outside of it. "
+                "Show one of its frames, or choose no range (× in the timeline)."
+            )
+        frames = (part or everything) if whole else between_kept(view, at, part)
+        kept = [frame for frame in view.kept_frames if frame in frames]
+        if not (whole or kept):
+            raise CartsError(
+                "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
+            )
+        if len(kept) == len(frames):
+            raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")
+        self._before = view
+        former = self._context.state.solve
+        self._context.change(playing=False, error=None, solve=SolveState(frames, text="Preparing"))
+        self._optimizers.report("Preparing to solve")
+        try:
+            self._run = self._make(frames, kept)
+        except Exception:
+            self._context.change(solve=former)
+            raise
+        self._work = self._bits(self._run)
+        self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
+
+    @handle.register
+    def _(self, intent: intents.StopSolving) -> None:
+        self.finish()
+
+    # ---- The run ---------------------------------------------------------------------------------------------------
+
+    def _make(self, frames: range, kept: list[int]) -> SequenceRun:
+        state, sequence, cameras = self._context.state, self._session.sequence, self._context.cameras
+        target = self._session.target(state.observed, self._before)
+        poses = {index: self._session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
+        return self._optimizers.make_sequence(
+            sequence,
+            state.pose.scene,
+            frames,
+            state.domain,
+            cameras,
+            state.settings,
+            state.direction,
+            state.free,
+            keyframes={index: self._session.joints(pose.scene) for index, pose in poses.items()},
+            keyframe_std={index: _deviations(self._before, index) for index in kept},
+            target=target,
+            ignore=lambda index: self._session.ignored(index, cameras, target),
+        )
+
+    def _bits(self, run: SequenceRun) -> Iterator[None]:
+        outcomes: dict[int, Outcome] = {}
+        try:
+            while run.step():
+                self._check_calibration()
+                self._report(done=run.done, text=run.status())
+                yield
+            for number, (index, estimate) in enumerate(run.estimates().items(), start=1):
+                if run.cancelled:
+                    break
+                if self._solved(estimate):
+                    outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
+                    self._context.change(busy=None)
+                    self._check_calibration()
+                self._report(compared=number, text=f"Comparing with how it was, frame {number} of {run.done}")
+                yield
+            if outcomes and not run.cancelled:
+                self._report(text="Checking the calibration")
+                yield
+                gain = run.base_frame_gain()
+                self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
+        finally:
+            # An image that is missing in the end does not cost what was solved before it.
+            if self._run is run:
+                self._run = None
+                self._report(running=False, text="")
+                self._report(text=self._save(run, outcomes))
+
+    def _solved(self, estimate: FrameEstimate) -> bool:
+        """Whether an estimate is for the project: what somebody has done to a frame meanwhile counts more."""
+        now, index = self._session.editor.view, estimate.index
+        kept = estimate.start == "keyframe" or index in now.kept_frames
+        return not kept and now.joints(index) == self._before.joints(index)
+
+    def _check_calibration(self) -> None:
+        now = self._session.editor.view
+        if now.records.get(WHOLE_PROJECT) is not self._before.records.get(WHOLE_PROJECT):
+            self.drop("Stopped: the calibration was changed")
+            raise CartsError(
+                "The calibration was changed meanwhile, so the solved frames do not fit. Solve them again."
+            )
+
+    def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
+        """Save the frames that fit no worse than before as one step, list the others, and say so."""
+        self._context.save()
+        edits: dict[Key[Any], Any] = {}
+        figures: dict[int, Figures] = {}
+        listed: list[ListedFrame] = []
+        self._held = {}
+        for index, estimate in run.estimates().items():
+            if not self._solved(estimate):
+                continue
+            outcome = outcomes.get(index) or unchecked(estimate, run)
+            if outcome.held:
+                self._held[index] = outcome
+            else:
+                edits.update(outcome.edits)
+                figures[index] = outcome.figures
+            if outcome.remark is not None:
+                listed.append(ListedFrame(index, outcome.remark, not outcome.held))
+        self._report(listed=tuple(sorted(listed, key=lambda frame: frame.index)))
+        count = len(figures) + len(self._held)
+        if not count:
+            return "Stopped before a frame was solved"
+        if figures:
+            first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
+            self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
+            self._context.refresh()
+        solved = f"{len(figures)} frame{'' if len(figures) == 1 else 's'} solved, one step of undo"
+        text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
+        return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
+
+    @handle.register
+    def _(self, intent: intents.TakeSolved) -> None:
+        now = self._session.editor.view
+        taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
+        taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
+        if not taken:
+            raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list is gone.")
+        self._open_run.end("Stopped: solved frames are taken")
+        self._context.save()
+        edits: dict[Key[Any], Any] = {}
+        for index, outcome in taken.items():
+            edits.update(outcome.edits)
+            del self._held[index]
+        figures = {index: outcome.figures for index, outcome in taken.items()}
+        self._session.editor.apply(f"Take {len(taken)} solved frames", edits, figures)
+        listed = self._context.state.solve.listed if self._context.state.solve else ()
+        self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
+        self._context.refresh()
+
+    @handle.register
+    def _(self, intent: intents.DropSolved) -> None:
+        self._held = {}
+        self._report(listed=())
+
+    def _report(self, **changes: Any) -> None:
+        if self._context.state.solve is not None:
+            self._context.change(solve=replace(self._context.state.solve, **changes))
+
+
+def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
+    """Of a kept frame's joint positions [rad, m], by arm; those that a person set have none."""
+    known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
+    return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
+
+
+class MarkingHandler:
+    """The handler that marks keyframes."""
+
+    def __init__(self, context: Context, run: OpenRun) -> None:
+        self._context = context
+        self._open_run = run
+
+    @singledispatchmethod
+    def handle(self, intent: intents.Marking) -> None:
+        """Do what an intent asks for.
+
+        Raises:
+            CartsError: with a text for people; the state is still a valid one.
+        """
+        raise unknown(intent)
+
+    @handle.register
+    def _(self, intent: intents.HoldKeyframe) -> None:
+        state = self._context.state
+        on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
+        self._open_run.end("Stopped: the frame was marked")
+        name = "Make a keyframe" if on else "Make no keyframe"
+        self._context.edit(name, {Key.keyframe(state.index): Keyframe(on)})
+
+    @handle.register
+    def _(self, intent: intents.SetDirection) -> None:
+        if intent.direction not in ("forward", "backward"):
+            raise CartsError(f"There is no direction {intent.direction!r}.")
+        self._context.change(direction=intent.direction)

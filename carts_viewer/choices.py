@@ -1,0 +1,170 @@
+"""Choices of a user: compared pose, range of sliders, what a run is fitted to, and presets of the solver."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from carts_core.errors import SettingsError
+from carts_core.model.scene import Arm, SceneState
+from carts_core.optimization import GivenMasks
+from carts_core.project import ProjectState
+from carts_core.project.masks import project_masks
+from carts_core.recording import Sequence as Recording
+from carts_core.settings import SurfaceSolver
+from carts_core.settings.stages import reduced
+from carts_viewer.picture.layers import Rgba
+
+
+class Against(StrEnum):
+    """The pose that the present one is compared with; the value is what people read."""
+
+    MEASURED = "Measured"
+    BEFORE_RUN = "Before the run"
+
+
+@dataclass(frozen=True)
+class Compare:
+    """What is compared, and how much of it is seen."""
+
+    against: Against | None = None
+    """None: nothing, but for a key that is held."""
+    swipe: float = 0.5
+    """Share of the picture's width, from its left side, that shows the other pose, 0..1."""
+    peek: bool = False
+    """Whether the other pose is shown all over, as long as a key is held."""
+
+    @property
+    def share(self) -> float:
+        """Of the picture's width that shows the other pose, 0..1."""
+        return 1.0 if self.peek else self.swipe if self.against is not None else 0.0
+
+
+def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | None) -> SceneState:
+    """The pose that is compared with; the measured one where there was no run."""
+    return before_run if compare.against is Against.BEFORE_RUN and before_run is not None else measured
+
+
+def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
+    """The other overlay up to a share of the width, the own one beyond it, and a line between them."""
+    column = round(share * own.shape[1])
+    both = np.concatenate([other[:, :column], own[:, column:]], axis=1)
+    if 0 < column < own.shape[1]:
+        both[:, max(column - 1, 0) : column + 1] = 255
+    return both
+
+
+class Reach(StrEnum):
+    """How far sliders reach from the measured values, as people read it."""
+
+    NEAR = "± 5"
+    FAR = "± 20"
+    FULL = "Full range"
+
+    @property
+    def width(self) -> float:
+        """To either side [deg] or [mm]."""
+        return {Reach.NEAR: 5.0, Reach.FAR: 20.0, Reach.FULL: math.inf}[self]
+
+
+@dataclass(frozen=True)
+class JointRange:
+    """What a joint may be set to."""
+
+    arm: str
+    joint: str
+    revolute: bool
+    lower: float
+    """[rad] or [m]; a joint without limits may turn once round either way."""
+    upper: float
+
+
+def joint_range(arm: Arm, joint: int) -> JointRange:
+    """Of the joint with this index."""
+    lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
+    revolute = arm.robot.joint_types[joint] == "revolute"
+    # A joint without limits gets a slider with ends all the same: once round, or a metre, either way.
+    room = math.pi if revolute else 1.0
+    return JointRange(
+        arm.name,
+        arm.robot.joint_names[joint],
+        revolute,
+        lower if math.isfinite(lower) else -room,
+        upper if math.isfinite(upper) else room,
+    )
+
+
+Observe = Literal["network", "masks", "both"]
+Masks = Literal["recording", "imported", "painted"]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What somebody has chosen to be fitted.
+
+    Raises:
+        SettingsError: a value is none of those that there are.
+    """
+
+    what: Observe = "network"
+    """As `--observe`."""
+    masks: Masks = "recording"
+    """Which masks, where any are fitted; as `--masks`."""
+
+    def __post_init__(self) -> None:
+        for value, allowed in ((self.what, get_args(Observe)), (self.masks, get_args(Masks))):
+            if value not in allowed:
+                raise SettingsError(f"{value!r} cannot be observed. Choose one of: {', '.join(allowed)}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a run fits, as it was when it began: the project's masks of that moment."""
+
+    observed: Observed = Observed()
+    given: GivenMasks | None = None
+    """The masks, where they are not those of the recording."""
+
+    @staticmethod
+    def of(observed: Observed, project: ProjectState, recording: Recording) -> "Target":
+        """What is chosen, with the masks that a project holds now."""
+        if observed.what == "network" or observed.masks == "recording":
+            return Target(observed)
+        return Target(observed, project_masks(observed.masks, project, recording))
+
+    def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
+        """Those of the cameras whose images of a frame can be compared: with masks alone, those that have one."""
+        if self.observed.what != "masks":
+            return list(cameras)
+        if self.given is not None:
+            return [name for name in cameras if self.given.there(index, name)]
+        own = [name for name in cameras if recording.has_masks(name, domain)]
+        there = recording.frame(index, domain, own).masks or {}
+        return [name for name in own if name in there]
+
+
+NETWORK = Target()
+"""What the network sees."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings that belong together."""
+
+    meaning: str
+    """When to take it, for people."""
+    changes: Callable[[SurfaceSolver], dict[str, Any]]
+    """What differs from the default settings of a solver of surface maps; others have no presets but the default."""
+
+
+PRESETS = {
+    "Default": Preset("As the solver ships.", lambda _: {}),
+    "Quick": Preset("Smaller images: sooner, and less exact.", lambda solver: {"stages": reduced(solver.stages, 0.75)}),
+    "Far off": Preset("Measured joints that are wrong by more than 3 degrees.", lambda _: {"prior_deg": 6.0}),
+    "Well calibrated": Preset("Measured joints that are right to about a degree.", lambda _: {"prior_deg": 1.0}),
+    "Smoke and haze": Preset("All haze is taken off before images are compared.", lambda _: {"dehaze": 1.0}),
+}
+"""By their names, the default first."""

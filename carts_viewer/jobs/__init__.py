@@ -1,0 +1,1 @@
+"""Long-running work: jobs, optimizers, networks, and the comparison of results."""

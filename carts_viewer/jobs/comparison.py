@@ -1,0 +1,205 @@
+"""Comparison of a solved pose with the earlier pose of its frame: verdict, loss, Dice, and which result is kept."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from carts_core.optimization import Assessment, FrameEstimate, FreeParameters, SolverSettings
+from carts_core.project import Edits, Figures, FitVerdict, Key, ProjectState, Provenance, Source
+from carts_core.project.values import VERDICTS
+from carts_core.recording import Frame
+from carts_viewer.choices import Target
+from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, SequenceRun
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.session import Session, joint_correction
+from carts_viewer.state import Pose, ViewState
+
+_OUT_OF_VIEW = 5e-4
+"""Share of an image below which no arm is in view of a camera [1]."""
+_WORSE_LOSS, _WORSE_FAILURE, _WORSE_DICE = 1.1, 0.02, 0.005
+"""What counts as worse: a loss by this factor, a probability or Dice by this much [1]."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a pose fits the images of its frame."""
+
+    verdict: FitVerdict
+    loss: float
+    """Mean of the cameras that see an arm [1]."""
+    dice: float | None = None
+    """Overlap with the true mask; None where there is none."""
+
+    def worse_than(self, other: "Fit") -> str | None:
+        """By what this fit is worse than another one of the same frame, for people; None where it is not."""
+        if other.dice is not None and self.dice is not None:
+            # Where the truth is known, nothing else counts.
+            return f"Dice {self.dice:.3f}, was {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
+        if VERDICTS.index(self.verdict.verdict) > VERDICTS.index(other.verdict.verdict):
+            return f"{self.verdict.verdict}, was {other.verdict.verdict}"
+        if self.verdict.failure > other.verdict.failure + _WORSE_FAILURE:
+            return f"probably wrong by {self.verdict.failure:.0%}, was {other.verdict.failure:.0%}"
+        if self.loss > _WORSE_LOSS * other.loss:
+            return f"loss {self.loss:.3g}, was {other.loss:.3g}"
+        return None
+
+
+class FitCheck:
+    """Compares poses with images; nothing moves."""
+
+    def __init__(self, session: Session, optimizers: OptimizerFactory) -> None:
+        self._session = session
+        self._optimizers = optimizers
+
+    def fit(self, index: int, domain: str, pose: Pose, settings: SolverSettings, target: Target) -> Fit:
+        """The fit of a pose in all cameras that can be compared with the target.
+
+        Raises:
+            CartsError: an image, a mask or the weights are not usable.
+        """
+        sequence, cameras = self._session.sequence, [camera.name for camera in self._session.scene.cameras]
+        found: dict[str, tuple[Assessment, float]] = {}
+        for name in target.seen(sequence, index, domain, cameras) or cameras:
+            ignore = self._session.ignored(index, [name], target)
+            found[name] = self._optimizers.assess(sequence, index, domain, [name], pose, settings, target, ignore)
+        # A camera that sees no arm says nothing, unless none sees any.
+        seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
+        loss = sum(loss for _, loss in seeing.values()) / len(seeing)
+        return Fit(of_cameras({name: assessment for name, (assessment, _) in seeing.items()}), loss)
+
+
+def of_cameras(assessed: dict[str, Assessment]) -> FitVerdict:
+    """The verdict on a frame: that of the camera that speaks most against it."""
+    worst = max(assessed, key=lambda name: (VERDICTS.index(assessed[name].verdict.value), assessed[name].probability))
+    found = assessed[worst]
+    verdict = FitVerdict(found.verdict.value, found.reason, found.remedy, found.probability)
+    if len(assessed) == 1:
+        return verdict
+    cameras = tuple((name, one.probability) for name, one in assessed.items())
+    reason = found.reason if found.verdict.value == VERDICTS[0] else f"Camera {worst}: {found.reason}"
+    return replace(verdict, reason=reason, cameras=cameras)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What solving found for one frame."""
+
+    edits: Edits
+    figures: Figures
+    remark: str | None = None
+    """Why somebody should look at it, for people."""
+    held: bool = False
+    """Whether it fits worse than before, so that the frame stays as it was."""
+
+
+class Comparison:
+    """Compares what was solved with how a frame was."""
+
+    def __init__(self, session: Session, renderer: OverlayRenderer, optimizers: OptimizerFactory) -> None:
+        self._session = session
+        self._renderer = renderer
+        self._optimizers = optimizers
+        self._check = FitCheck(session, optimizers)
+
+    def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
+        """The better one of what was solved and a run on the frame alone, or how it was if both are worse.
+
+        The run alone is only made where what was solved is worse than before, or not good.
+
+        Raises:
+            CartsError: an image or the weights are not usable.
+        """
+        frame = self._frame(estimate.index, state)
+        was, target = self._session.pose(frame, before), self._session.target(state.observed, before)
+        pose = Pose(self._session.with_joints(was.scene, estimate.joint_positions), Source.PROPAGATED)
+        earlier, solved = self._fit(frame, was, state, target), self._fit(frame, pose, state, target)
+        found = Outcome(solved_edits(estimate, run), Figures(estimate.loss, solved.dice))
+        worse = solved.worse_than(earlier)
+        if worse is not None or solved.verdict.verdict != "good":
+            alone, edits = self._alone(frame, was, state, target, run.provenance)
+            if alone.worse_than(earlier) is None and alone.worse_than(solved) is None and solved.worse_than(alone):
+                found, solved, worse = Outcome(edits, Figures(alone.loss, alone.dice)), alone, None
+        remark = worse
+        if remark is None and solved.verdict.verdict != "good":
+            remark = f"{solved.verdict.verdict}: {solved.verdict.reason}"
+        verdict = {Key.verdict(estimate.index): solved.verdict}
+        return replace(found, edits={**found.edits, **verdict}, remark=remark, held=worse is not None)
+
+    def _frame(self, index: int, state: ViewState) -> Frame:
+        sequence, domain = self._session.sequence, state.domain
+        cameras = [camera.name for camera in self._session.scene.cameras if sequence.has_masks(camera.name, domain)]
+        return sequence.frame(index, domain, cameras)
+
+    def _fit(self, frame: Frame, pose: Pose, state: ViewState, target: Target) -> Fit:
+        fit = self._check.fit(frame.index, state.domain, pose, state.settings, target)
+        view, dice = self._session.editor.view, []
+        for camera in frame.masks or {}:
+            correction = view.get(Key.mask_correction(frame.index, camera))
+            dice.append(self._renderer.scores(pose.scene, frame, camera, correction).dice)
+        known = [value for value in dice if value is not None]
+        return replace(fit, dice=min(known, default=None))
+
+    def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
+        """A run on one frame alone, from how it is: None after every step, at last its fit, edits and what is worse.
+
+        Raises:
+            CartsError: an image, the weights or a setting is not usable.
+        """
+        frame = self._frame(index, state)
+        was, target = self._session.pose(frame), self._session.target(state.observed)
+        earlier = self._fit(frame, was, state, target)
+        cameras = [camera.name for camera in self._session.scene.cameras]
+        provenance = self._optimizers.provenance(cameras, state.settings, _joints_alone(state), target)
+        for outcome in self._steps(frame, was, state, target, provenance):
+            yield None if outcome is None else (*outcome, outcome[0].worse_than(earlier))
+
+    def _alone(
+        self, frame: Frame, start: Pose, state: ViewState, target: Target, of_many: Provenance
+    ) -> tuple[Fit, Edits]:
+        """The fit of a run on this frame alone, and the edits that take it."""
+        settings = json.dumps({**json.loads(of_many.settings or "{}"), "alone": True})
+        steps = self._steps(frame, start, state, target, replace(of_many, settings=settings))
+        return next(outcome for outcome in steps if outcome is not None)
+
+    def _steps(
+        self, frame: Frame, start: Pose, state: ViewState, target: Target, provenance: Provenance
+    ) -> Iterator[tuple[Fit, Edits] | None]:
+        session, cameras = self._session, [camera.name for camera in self._session.scene.cameras]
+        cameras = target.seen(session.sequence, frame.index, state.domain, cameras) or cameras
+        free, ignore = _joints_alone(state), session.ignored(frame.index, cameras, target)
+        optimizer = self._optimizers.make(
+            session.sequence, frame.index, state.domain, cameras, start, state.settings, free, target, ignore
+        )
+        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance, free)
+        while run.step() is not None:
+            yield None
+        best = run.best()
+        assert best is not None
+        pose = run.pose(best)
+        yield self._fit(frame, pose, state, target), session.edits(frame, pose.scene, provenance, best.joint_std())
+
+
+def _joints_alone(state: ViewState) -> FreeParameters:
+    """What a run on one frame of many may move: the calibration is that of all frames."""
+    return replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
+
+
+def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
+    """What a project must change so that a frame is as it was solved."""
+    edits: dict[Key[Any], Any] = {}
+    for arm, std in estimate.joint_std.items():
+        # An arm that was not free stays as it is.
+        if np.isfinite(std).any():
+            edits[Key.joints(estimate.index, arm)] = joint_correction(
+                estimate.joint_positions[arm], run.provenance, std
+            )
+    return edits
+
+
+def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
+    """What was solved of a frame and not compared, because somebody stopped it."""
+    edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
+    return Outcome(edits, Figures(estimate.loss), "not compared with how it was, because solving was stopped")

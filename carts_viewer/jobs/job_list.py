@@ -1,0 +1,350 @@
+"""Jobs of the viewer, their options, and the list of them in `PROJECT_jobs.json` beside the project."""
+
+import json
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from carts_core.errors import CartsError
+from carts_core.export import FORMATS
+from carts_core.files import output_path, write_text
+from carts_core.files.reading import Kind, parse_json, read_text, typed
+from carts_viewer.actions import intents
+from carts_viewer.jobs.companions import Decisions, damage
+
+_KEPT = 50
+"""Jobs that are remembered when they have ended."""
+_LONGEST_LIST = 1000
+"""Jobs."""
+_LONGEST_LOG = 200
+"""Lines."""
+_LONGEST_TEXT = 2000
+"""Characters of a title, a text or a line."""
+_FILE = Kind("list of jobs", 8 * 2**20)
+LARGEST_CALIBRATION = 500
+"""Most frames of a calibration."""
+LONGEST_TRAINING = 240
+"""Most time for a training [min]."""
+_LARGEST_FOLDER = 999_999
+"""Number of an adapted network."""
+
+
+# ---- Options ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Options of solving frames together."""
+
+    whole: bool = False
+    at: int = 0
+    """Index of the frame between whose keyframes is solved."""
+    range: tuple[int, int] | None = None
+    """First and last frame; None for the whole sequence."""
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """Options of optimizing frames, each alone."""
+
+    frames: tuple[int, ...]
+    """Indices."""
+    first: int = 0
+    """Position in `frames` to begin at."""
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options of a calibration."""
+
+    frames: int
+    """Number of frames."""
+
+
+@dataclass(frozen=True)
+class AdaptOptions:
+    """Options of a training."""
+
+    minutes: int
+    """Most time [min]."""
+    folder: int
+    """Number of the folder of the network."""
+
+
+Options = SolveOptions | OptimizeOptions | CalibrateOptions | AdaptOptions | intents.Export
+_KINDS: dict[str, type[Options]] = {
+    "solve": SolveOptions,
+    "optimize": OptimizeOptions,
+    "calibrate": CalibrateOptions,
+    "adapt": AdaptOptions,
+    "export": intents.Export,
+}
+
+
+def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
+    """Options of a job with checked types, clamped to the ranges of the page, wherever they come from.
+
+    Args:
+        kind: of the job.
+        values: name -> value.
+        frames: number of frames of the sequence.
+
+    Raises:
+        ValueError: there is no such kind of job, or a value is missing or of another type.
+    """
+    if kind not in _KINDS:
+        raise ValueError(f"there is no job of the kind {kind!r}")
+    options, last = typed(values, _KINDS[kind]), frames - 1
+    match options:
+        case SolveOptions():
+            return replace(options, at=_within(options.at, 0, last), range=_range(options.range, last))
+        case OptimizeOptions():
+            indices = tuple(dict.fromkeys(index for index in options.frames if 0 <= index <= last))
+            return OptimizeOptions(indices, _within(options.first, 0, len(indices)))
+        case CalibrateOptions():
+            return CalibrateOptions(_within(options.frames, 1, LARGEST_CALIBRATION))
+        case AdaptOptions():
+            minutes = _within(options.minutes, 1, LONGEST_TRAINING)
+            return AdaptOptions(minutes, _within(options.folder, 1, _LARGEST_FOLDER))
+        case intents.Export():
+            return replace(options, range=_range(options.range, last))
+
+
+def _range(ends: tuple[int, int] | None, last: int) -> tuple[int, int] | None:
+    if ends is None:
+        return None
+    first, second = sorted(_within(end, 0, last) for end in ends)
+    return first, second
+
+
+def _within(value: int, low: int, high: int) -> int:
+    return min(max(value, low), high)
+
+
+def job_title(options: Options, frame_ids: Sequence[str]) -> str:
+    """What a job with these options does, for people."""
+    part = getattr(options, "range", None)
+    between = None if part is None else f"frames {frame_ids[part[0]]} to {frame_ids[part[1]]}"
+    match options:
+        case SolveOptions(whole=True):
+            return f"Solve {between or 'all frames'}"
+        case SolveOptions():
+            return "Solve between keyframes" + (f", {between}" if between else "")
+        case OptimizeOptions(frames=frames):
+            return f"Optimize {len(frames)} frames, each alone"
+        case CalibrateOptions(frames=frames):
+            return f"Calibrate on {frames} frames"
+        case AdaptOptions(minutes=minutes):
+            return f"Adapt the network to this recording, {minutes} minutes of processor time at most"
+        case intents.Export():
+            label = FORMATS[options.format].label if options.format in FORMATS else options.format
+            return f"Export {options.frames.lower()[:40]} as {label}" + (f", {between}" if between else "")
+
+
+# ---- The list --------------------------------------------------------------------------------------------------------
+
+
+class JobState(StrEnum):
+    """Where a job is."""
+
+    ASKED = "asked"
+    """It was not queued by this user on this machine, and waits for their decision."""
+    WAITING = "waiting"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something that takes long."""
+
+    number: Annotated[int, msgspec.Meta(ge=1)]
+    kind: str
+    title: str
+    """For people."""
+    options: Options
+    """With the kind, all that is needed to do it again."""
+    state: JobState = JobState.WAITING
+    done: Annotated[int, msgspec.Meta(ge=0)] = 0
+    total: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Steps; 0 until it is known."""
+    began: float = 0.0
+    """[s since 1970]; 0 before."""
+    ended: float = 0.0
+    text: str = ""
+    """How it goes, or what came of it, for people."""
+    log: tuple[str, ...] = ()
+    token: str = ""
+    """Random; with kind, options and recording it tells this user's jobs from those that another user has queued."""
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self.state in (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
+
+    @property
+    def frames(self) -> range | None:
+        """The part of the sequence that it is about; None for all of it."""
+        ends = getattr(self.options, "range", None)
+        return None if ends is None else range(ends[0], ends[1] + 1)
+
+    def seconds_left(self, now: float) -> float | None:
+        """How long it will go on if it goes on like that [s]; None where nobody knows."""
+        if self.state is not JobState.RUNNING or not self.done or not self.total:
+            return None
+        return max(0.0, (now - self.began) / self.done * (self.total - self.done))
+
+
+@dataclass(frozen=True)
+class _Row(Job):
+    """A job as the file has it."""
+
+    options: dict[str, Any] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+class JobList:
+    """All jobs, oldest first; every change of a state is on disk before the next thing is done.
+
+    Attributes:
+        jobs: the list.
+        problem: that the file was damaged, and where it is kept, for people; empty if it was not.
+    """
+
+    def __init__(
+        self, project: Path, *, kept: bool, frame_ids: Sequence[str], recording: str = "", decisions: Decisions
+    ) -> None:
+        """
+        Args:
+            project: The project's file, beside which the list lies.
+            kept: Whether the list may be written.
+            frame_ids: Of the sequence.
+            recording: Digest of the recording; jobs of this user in the list of another recording are not theirs.
+            decisions: Of this user.
+        """
+        self._path = output_path(project.parent, f"{project.stem}_jobs.json") if kept else None
+        self._frame_ids, self._recording, self._decisions = frame_ids, recording, decisions
+        self.problem = ""
+        self.jobs: tuple[Job, ...] = tuple(map(self._resumed, self._read()))
+
+    def add(self, kind: str, values: Mapping[str, Any]) -> Job:
+        """Queue a job.
+
+        Raises:
+            CartsError: there is no such job, or the list cannot be written.
+        """
+        try:
+            options = read_options(kind, values, len(self._frame_ids))
+        except ValueError as error:
+            raise CartsError(f"This job cannot be queued: {error}. Choose its options again.") from error
+        number = max((job.number for job in self.jobs), default=0) + 1
+        job = self._own(Job(number, kind, job_title(options, self._frame_ids), options))
+        ended = [job for job in self.jobs if job.over]
+        self._drop(ended[: max(len(ended) - _KEPT, 0)])
+        self.jobs = (*self.jobs, job)
+        self._write()
+        return job
+
+    def change(self, number: int, line: str | None = None, **changes: Any) -> None:
+        """Change a job; a line is added to its log."""
+        before = self.jobs
+        self.jobs = tuple(_changed(job, line, changes) if job.number == number else job for job in self.jobs)
+        if [job.state for job in before] != [job.state for job in self.jobs]:
+            self._write()
+
+    def accept(self, number: int, options: Options) -> None:
+        """Have a job wait that another user has queued, with these options; from now on it is this user's."""
+        job = replace(self.find(number), state=JobState.WAITING, options=options)
+        job = self._own(job)
+        self.jobs = tuple(job if each.number == number else each for each in self.jobs)
+        self._write()
+
+    def is_own(self, job: Job) -> bool:
+        """Whether this user has queued or accepted a job on this machine."""
+        return bool(job.token) and self._decisions.find(self._identity(job)) is True
+
+    def save(self) -> None:
+        """Write how far jobs are."""
+        self._write()
+
+    def forget(self) -> None:
+        """Take what is over off the list."""
+        self._drop([job for job in self.jobs if job.over])
+        self._write()
+
+    def find(self, number: int) -> Job:
+        """A job by its number.
+
+        Raises:
+            CartsError: there is none.
+        """
+        job = next((job for job in self.jobs if job.number == number), None)
+        if job is None:
+            raise CartsError(f"There is no job {number} any more.")
+        return job
+
+    def _own(self, job: Job) -> Job:
+        """A job with a new token, which this user's decisions know."""
+        job = replace(job, token=secrets.token_hex(16))
+        self._decisions.make(self._identity(job), True)
+        return job
+
+    def _identity(self, job: Job) -> bytes:
+        return json.dumps([self._recording, job.token, job.kind, asdict(job.options)], sort_keys=True).encode()
+
+    def _drop(self, dropped: Sequence[Job]) -> None:
+        for job in dropped:
+            if job.token:
+                self._decisions.forget(self._identity(job))
+        self.jobs = tuple(job for job in self.jobs if job not in dropped)
+
+    def _write(self) -> None:
+        if self._path is not None:
+            write_text(self._path, json.dumps([asdict(job) for job in self.jobs], indent=1))
+
+    def _read(self) -> list[Job]:
+        """The jobs of the file; a damaged one is set aside and the list begun anew."""
+        if self._path is None:
+            return []
+        try:
+            rows = typed(parse_json(read_text(self._path.path, _FILE)), list[_Row])
+            numbers = [row.number for row in rows]
+            if len(set(numbers)) < len(numbers) or len(numbers) > _LONGEST_LIST:
+                raise ValueError(f"it has more than {_LONGEST_LIST} jobs, or two of one number")
+            return [self._job(row) for row in rows]
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            self.problem = damage(self._path.path, "list of jobs", error, "A new list was begun, and no job of it runs")
+            return []
+
+    def _job(self, row: _Row) -> Job:
+        options = read_options(row.kind, row.options, len(self._frame_ids))
+        texts = {
+            "text": row.text[:_LONGEST_TEXT],
+            "log": tuple(line[:_LONGEST_TEXT] for line in row.log[-_LONGEST_LOG:]),
+        }
+        title = job_title(options, self._frame_ids)
+        return Job(**{**vars(row), **texts, "options": options, "title": title})
+
+    def _resumed(self, job: Job) -> Job:
+        """A job of a viewer that has ended: a waiting one waits or is asked for, one that ran has failed."""
+        if job.state in (JobState.WAITING, JobState.ASKED):
+            return replace(job, state=JobState.WAITING if self.is_own(job) else JobState.ASKED)
+        if job.state is not JobState.RUNNING:
+            return job
+        text = "The viewer ended while it ran. What it had saved is there; start it again for the rest."
+        return _changed(job, text, {"state": JobState.FAILED, "text": text, "ended": time.time()})
+
+
+def _changed(job: Job, line: str | None, changes: Mapping[str, Any]) -> Job:
+    if line is not None:
+        changes = {**changes, "log": (*job.log, f"{time.strftime('%H:%M:%S')} {line}")[-_LONGEST_LOG:]}
+    return replace(job, **changes)

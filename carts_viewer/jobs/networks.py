@@ -1,0 +1,154 @@
+"""The networks that there are for a recording: those that the viewer was started with, and those adapted to it."""
+
+import json
+import re
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from carts_core.errors import CartsError
+from carts_core.files import output_path, write_text
+from carts_core.files.reading import WEIGHTS, Kind, is_regular, parse_json, read_bytes, read_text, typed
+from carts_viewer.jobs.companions import Decisions, damage
+from carts_viewer.jobs.optimizers import OptimizerFactory
+
+STARTED = "As started"
+"""What people read for the network that the viewer was started with: the shipped one, or that of `--weights`."""
+_WEIGHTS_FILE = "surface.safetensors"
+_ADAPTED = "Adapted {}"
+_FILE = Kind("choice of a network", 2**12)
+_LONGEST_NAME = 40
+"""Characters."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Content of the file."""
+
+    network: str
+
+
+class Networks:
+    """Which network runs, for everybody; the choice is kept in `PROJECT_network.json` beside the project.
+
+    Weights that this user has neither trained here nor accepted are not used before they are accepted, once a file.
+
+    Attributes:
+        names: what people can choose from.
+        used: the one that runs.
+        asked: the one that was chosen, and waits to be accepted or refused; empty if there is none.
+        problem: why the remembered choice is not used, for people; empty if it is.
+    """
+
+    def __init__(self, project: Path, *, kept: bool, optimizers: OptimizerFactory, decisions: Decisions) -> None:
+        """
+        Args:
+            project: The project's file, beside which networks lie that were adapted.
+            kept: Whether anything may be written there.
+            optimizers: Run the network.
+            decisions: Of this user.
+        """
+        self._project, self._kept, self._optimizers, self._decisions = project, kept, optimizers, decisions
+        self._file = output_path(project.parent, f"{project.stem}_network.json")
+        self.names: tuple[str, ...] = ()
+        self.used = STARTED
+        self.asked = self.problem = ""
+        self.look()
+        remembered = self._read()
+        try:
+            if remembered != STARTED and not optimizers.given_surface():
+                self._resume(remembered)
+        except (OSError, CartsError) as error:
+            self.problem = f"The network {remembered!r}, which was chosen last, cannot be used: {error}."
+
+    def look(self) -> None:
+        """See which there are."""
+        numbers = [number for number in self._numbers() if is_regular(self.folder(number) / _WEIGHTS_FILE)]
+        self.names = (STARTED, *(_ADAPTED.format(number) for number in numbers))
+
+    def folder(self, number: int) -> Path:
+        """Of a run that adapts, by its number."""
+        return self._project.with_name(f"{self._project.stem}_adapted_{number}")
+
+    def next_number(self) -> int:
+        """Of a run that is begun now."""
+        return max(self._numbers(), default=0) + 1
+
+    def use(self, name: str) -> None:
+        """Have a network run from now on, and remember it; one of another user's weights waits to be accepted.
+
+        Raises:
+            CartsError: there is none of this name, or its weights cannot be used.
+        """
+        self.look()
+        if name not in self.names:
+            raise CartsError(f"There is no network {name!r}. There are: {', '.join(self.names)}.")
+        self.asked = "" if name == STARTED or self._decisions.find(self._weights(name)) else name
+        if not self.asked:
+            self._run(name)
+            if self._kept:
+                write_text(self._file, json.dumps(asdict(_Choice(name))))
+
+    def answer(self, accepted: bool) -> None:
+        """Accept or refuse the weights that were asked for.
+
+        Raises:
+            CartsError: none were, or they cannot be used.
+        """
+        name, self.asked = self.asked, ""
+        if not name:
+            raise CartsError("No network waits to be accepted any more.")
+        self._decisions.make(self._weights(name), accepted)
+        if accepted:
+            self.use(name)
+
+    def trained(self, number: int) -> None:
+        """Accept the weights of a training that this viewer has run, if it has made any."""
+        with suppress(OSError, CartsError):
+            self._decisions.make(self._weights(_ADAPTED.format(number)), True)
+
+    def _resume(self, name: str) -> None:
+        """Run the network that was chosen last, or ask for it."""
+        if name not in self.names:
+            raise CartsError("it is not there any more")
+        accepted = self._decisions.find(self._weights(name))
+        if accepted:
+            self._run(name)
+        elif accepted is None:
+            self.asked = name
+
+    def _run(self, name: str) -> None:
+        self._optimizers.use(None if name == STARTED else self._weights_file(name))
+        self.used, self.problem = name, ""
+
+    def _weights_file(self, name: str) -> Path:
+        return self.folder(int(name.rpartition(" ")[2])) / _WEIGHTS_FILE
+
+    def _weights(self, name: str) -> bytes:
+        """Content of the weights of an adapted network.
+
+        Raises:
+            CartsError: they cannot be read.
+        """
+        path = self._weights_file(name)
+        try:
+            return read_bytes(path, WEIGHTS)
+        except OSError as error:
+            raise CartsError(f"{path} cannot be read ({error}). Adapt the network anew.") from error
+
+    def _numbers(self) -> list[int]:
+        named = re.compile(re.escape(self._project.stem) + r"_adapted_([1-9]\d{0,5})")
+        beside = self._project.parent.iterdir() if self._project.parent.is_dir() else ()
+        found = (named.fullmatch(path.name) for path in beside)
+        return sorted(int(match[1]) for match in found if match is not None)
+
+    def _read(self) -> str:
+        """Name of the network that was chosen last."""
+        try:
+            return typed(parse_json(read_text(self._file.path, _FILE)), _Choice).network[:_LONGEST_NAME]
+        except FileNotFoundError:
+            return STARTED
+        except (OSError, ValueError) as error:
+            effect = "The network that the viewer was started with is used"
+            self.problem = damage(self._file.path, "choice of a network", error, effect, writable=self._kept)
+            return STARTED

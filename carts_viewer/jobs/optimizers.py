@@ -1,0 +1,484 @@
+"""Optimizers of the viewer: networks, runs on single frames, runs on many frames, and assessments of poses."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from carts_core.errors import SettingsError, WeightsError
+from carts_core.model.scene import Scene, SceneState
+from carts_core.networks import FeatureExtractor
+from carts_core.networks.network import SurfaceNetwork
+from carts_core.networks.weights import read_weights
+from carts_core.optimization import (
+    Assessment,
+    Backgrounds,
+    FrameEstimate,
+    FrameOptimizer,
+    FreeParameters,
+    Iterate,
+    MaskPredictor,
+    NetworkPredictor,
+    Progress,
+    SequenceAssessment,
+    SequenceOptimizer,
+    SequenceSettings,
+    SolverSettings,
+    StopReason,
+    SurfaceSolver,
+    check_domain,
+)
+from carts_core.optimization.measurement import Ignore
+from carts_core.project import FitVerdict, Provenance, Source
+from carts_core.recording import Sequence as Recording
+from carts_core.segmentation import NetworkSegmenter, Segmenter
+from carts_core.settings import Direction
+from carts_core.settings.optimization import Inference
+from carts_core.settings.serialization import to_plain
+from carts_core.settings.stages import NONE
+from carts_core.wording import spoken_time
+from carts_viewer.choices import NETWORK, Target
+from carts_viewer.state import Pose
+
+
+class Optimizer(Protocol):
+    """What the viewer needs of an optimizer; `FrameOptimizer` is the one that the app uses."""
+
+    @property
+    def best(self) -> Iterate | None:
+        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Why there are no more iterates, None before."""
+
+    @property
+    def assessment(self) -> Assessment | None:
+        """At the end, how far the result can be relied on; None before, and where it is not assessed."""
+
+    def step(self) -> Iterate | None:
+        """The next iterate, the start itself at first; None when there are no more."""
+
+    def base_frame_gain(self) -> float | None:
+        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
+
+    @property
+    def history(self) -> list[Progress]:
+        """What is kept of every iterate."""
+        ...
+
+    def comparable_losses(self) -> list[float]:
+        """Of all iterates, compared with the last observation, so that they compare."""
+        ...
+
+
+class ActiveRun:
+    """One run on one frame: the optimizer, and where it started."""
+
+    def __init__(
+        self,
+        optimizer: Optimizer,
+        scene: Scene,
+        start: Pose,
+        cameras: tuple[str, ...],
+        provenance: Provenance,
+        free: FreeParameters,
+    ) -> None:
+        self._free = free
+        self.start = start
+        self.provenance = provenance
+        self.cameras = cameras
+        self._optimizer = optimizer
+        self._rows = [[camera.name for camera in scene.cameras].index(name) for name in cameras]
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Why the run ended, None before."""
+        return self._optimizer.stop_reason
+
+    def step(self) -> Iterate | None:
+        """The next iterate; None when there are no more."""
+        return self._optimizer.step()
+
+    def best(self) -> Iterate | None:
+        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
+        return self._optimizer.best
+
+    def verdict(self) -> FitVerdict | None:
+        """At the end, how far the result can be relied on; None where the solver does not assess it."""
+        found = self._optimizer.assessment
+        if found is None:
+            return None
+        kept = " The start was kept." if self.stop_reason in (StopReason.FAILED, StopReason.START_KEPT) else ""
+        return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
+
+    @property
+    def stages(self) -> tuple[int, ...]:
+        """Of each iterate the stage, within which losses compare."""
+        return tuple(progress.stage for progress in self._optimizer.history)
+
+    def comparable_losses(self) -> tuple[float, ...]:
+        """Of all iterates, compared with the last observation, so that they compare."""
+        return tuple(self._optimizer.comparable_losses())
+
+    def base_frame_gain(self) -> float | None:
+        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
+        return self._optimizer.base_frame_gain()
+
+    def pose(self, iterate: Iterate) -> Pose:
+        """An iterate's state, which knows the run's cameras only, as a pose of the whole scene.
+
+        What was not free is exactly as it was: rounding must not count as a new calibration of all frames.
+        """
+        state, start, free = iterate.state.to("cpu"), self.start.scene, self._free
+        extrinsics, intrinsics = start.T_camera_world.clone(), start.intrinsics.clone()
+        if free.extrinsics:
+            extrinsics[self._rows] = state.T_camera_world
+        if free.intrinsics:
+            intrinsics[self._rows] = state.intrinsics
+        bases = state.T_world_base if free.base_frames else start.T_world_base
+        moved = {"T_camera_world": extrinsics, "T_mount_world": start.T_mount_world}
+        scene = replace(state, T_world_base=bases, intrinsics=intrinsics, **moved)
+        return Pose(scene, Source.OPTIMIZER)
+
+
+class SequenceRun:
+    """One run on many frames: the optimizer, and what a project keeps about it."""
+
+    def __init__(self, optimizer: SequenceOptimizer, provenance: Provenance) -> None:
+        self.provenance = provenance
+        self.cancelled = False
+        self._optimizer = optimizer
+
+    @property
+    def done(self) -> int:
+        """Frames that were visited."""
+        return self._optimizer.progress[0]
+
+    def step(self) -> bool:
+        """Visit the next frame; False when there are no more."""
+        return self._optimizer.step() is not None
+
+    def cancel(self) -> None:
+        """Stop; what was reached stays in `estimates`."""
+        self.cancelled = True
+        self._optimizer.cancel()
+
+    def estimates(self) -> dict[int, FrameEstimate]:
+        """Of every frame that was visited, in the light of all of them."""
+        return self._optimizer.estimates
+
+    @property
+    def assessment(self) -> SequenceAssessment | None:
+        """At the end, how far all frames together can be relied on; None before, and of a run that was stopped."""
+        return self._optimizer.assessment
+
+    def base_frame_gain(self) -> float | None:
+        """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
+        return self._optimizer.base_frame_gain()
+
+    def status(self) -> str:
+        """How it goes, for people."""
+        done, total = self._optimizer.progress
+        if done == 0:
+            return "Solving a few frames alone, for a first estimate of the error of all"
+        if done == total:
+            return f"All {total} frames estimated, revising those that disagree and judging the fit"
+        if done < 2 < total:
+            return f"Frame {done} of {total}"  # The first takes longer than others.
+        return f"Frame {done} of {total}, about {spoken_time(self._optimizer.seconds_left)} left"
+
+
+REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
+"""What people can do where the network does not know what it sees."""
+
+
+class NetworkLoader:
+    """Has the networks; they are loaded once, when they are first needed."""
+
+    def __init__(
+        self,
+        *,
+        weights: Sequence[Path] = (),
+        device: str = "cpu",
+        inference: Inference = "auto",
+        segmenter: Segmenter | None = None,
+        report: Callable[[str], None],
+    ) -> None:
+        """
+        Args:
+            weights: Weights files; a network that none is given of is the shipped one.
+            device: Where the networks run.
+            inference: Who runs the surface network.
+            segmenter: Segments what people point at; None for the one that ships.
+            report: Called with a line for people about what takes long.
+        """
+        self._segmenter = segmenter
+        self._own_segmenter: tuple[FeatureExtractor, Segmenter] | None = None
+        self._weights = weights
+        self._device = device
+        self._inference: Inference = inference
+        self.report = report
+        self._surface: Path | None = None
+        self._extractor: FeatureExtractor | None = None
+        self._unfamiliar: dict[tuple[object, ...], tuple[str, ...]] = {}
+
+    def given_surface(self) -> bool:
+        """Whether a surface network is among the weights that were given.
+
+        Raises:
+            WeightsError: weights cannot be read.
+        """
+        return any(read_weights(path).network.kind == SurfaceNetwork.kind for path in self._weights)
+
+    def use(self, surface: Path | None) -> None:
+        """Run another surface network from now on; None: the one of the beginning.
+
+        Raises:
+            WeightsError: the weights cannot be read, or are no surface network's.
+        """
+        if surface is not None and read_weights(surface).network.kind != SurfaceNetwork.kind:
+            raise WeightsError(f"{surface} holds no surface network. Adapt the network anew.")
+        self._surface, self._extractor = surface, None
+
+    def prepare(self) -> FeatureExtractor:
+        """The networks.
+
+        Raises:
+            WeightsError: it cannot be loaded.
+        """
+        if self._extractor is None:
+            self.report("Loading the networks")
+            weights = list(self._weights)
+            if self._surface is not None:
+                others = [path for path in weights if read_weights(path).network.kind != SurfaceNetwork.kind]
+                weights = [self._surface, *others]
+            self._extractor = FeatureExtractor.load(*weights, device=self._device, inference=self._inference)
+        return self._extractor
+
+    def segmenter(self) -> Segmenter:
+        """What segments what people point at.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        if self._segmenter is not None:
+            return self._segmenter
+        extractor = self.prepare()
+        if self._own_segmenter is None or self._own_segmenter[0] is not extractor:
+            self._own_segmenter = extractor, NetworkSegmenter.of(extractor)
+        return self._own_segmenter[1]
+
+    def unfamiliar(
+        self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]
+    ) -> tuple[str, ...]:
+        """What speaks against the network for these arms and images, from one frame; asked once for each network.
+
+        Raises:
+            CartsError: weights or an image is not usable.
+        """
+        extractor = self.prepare()
+        known = extractor.sha256, domain, *cameras
+        if known not in self._unfamiliar:
+            scene = scene.with_cameras(cameras)
+            found = check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
+            background = Backgrounds.of(sequence, cameras, domain).covers(scene)
+            self._unfamiliar[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
+        return self._unfamiliar[known]
+
+
+class OptimizerFactory(NetworkLoader):
+    """Makes optimizers."""
+
+    def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
+        """What says what images show; with masks alone no network is loaded.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        if target.observed.what == "network":
+            return self.prepare()
+        network = None if target.observed.what == "masks" else NetworkPredictor(self.prepare())
+        masks, name = (None, "mask") if target.given is None else (target.given.masks, target.given.origin)
+        return MaskPredictor(network, masks, name)
+
+    def provenance(
+        self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters, target: Target = NETWORK
+    ) -> Provenance:
+        """What a project keeps about a run with these settings.
+
+        Raises:
+            WeightsError: the networks cannot be loaded.
+        """
+        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **self._observed(target)}
+        return Provenance.made_by_optimizer(used, self._weights_hash(target))
+
+    def _weights_hash(self, target: Target) -> str | None:
+        return None if target.observed.what == "masks" else self.prepare().sha256
+
+    @staticmethod
+    def _observed(target: Target) -> dict[str, str]:
+        observed = target.observed
+        return {} if observed.what == "network" else {"observe": observed.what, "masks": observed.masks}
+
+    def make(
+        self,
+        sequence: Recording,
+        index: int,
+        domain: str,
+        cameras: Sequence[str],
+        pose: Pose,
+        settings: SolverSettings,
+        free: FreeParameters,
+        target: Target,
+        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
+    ) -> Optimizer:
+        """An optimizer that starts at the pose and fits the target; `ignore` says which pixels of which camera show an
+        occluder.
+
+        Raises:
+            CartsError: weights, an image, a mask or a setting is not usable.
+        """
+        predictor = self.predictor(target)
+        self.report("Preparing the frame")
+        if target.observed.what != "network" and not isinstance(settings, SurfaceSolver):
+            raise SettingsError(
+                "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "
+                "maps, or fit what the network sees."
+            )
+        return self._frame_optimizer(sequence, index, domain, cameras, pose, settings, free, ignore, predictor)
+
+    def assess(
+        self,
+        sequence: Recording,
+        index: int,
+        domain: str,
+        cameras: Sequence[str],
+        pose: Pose,
+        settings: SolverSettings,
+        target: Target,
+        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
+    ) -> tuple[Assessment, float]:
+        """What the images say of a pose, and its loss; nothing moves. Arguments and errors as in `make`."""
+        surface = settings if isinstance(settings, SurfaceSolver) else SurfaceSolver()
+        optimizer = self._frame_optimizer(
+            sequence,
+            index,
+            domain,
+            cameras,
+            pose,
+            replace(surface, stages=NONE),
+            FreeParameters(),
+            ignore,
+            self.predictor(target),
+        )
+        for _ in optimizer:
+            pass
+        assert optimizer.assessment is not None and optimizer.best is not None
+        return optimizer.assessment, float(optimizer.best.loss)
+
+    @staticmethod
+    def _frame_optimizer(
+        sequence: Recording,
+        index: int,
+        domain: str,
+        cameras: Sequence[str],
+        pose: Pose,
+        settings: SolverSettings,
+        free: FreeParameters,
+        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
+        predictor: FeatureExtractor | MaskPredictor,
+    ) -> FrameOptimizer:
+        frame = sequence.frame(index, domain, list(cameras))
+        backgrounds = Backgrounds.of(sequence, cameras, domain, required=settings.needs_background)
+        scene = scene_at(sequence.scene, pose.scene)
+        start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
+        return FrameOptimizer(
+            scene,
+            frame,
+            backgrounds,
+            predictor,
+            ignore=ignore,
+            start=start,
+            settings=settings,
+            free=free,
+            cameras=list(cameras),
+        )
+
+    def make_sequence(
+        self,
+        sequence: Recording,
+        calibration: SceneState,
+        frames: range,
+        domain: str,
+        cameras: Sequence[str],
+        settings: SolverSettings,
+        direction: Direction,
+        free: FreeParameters,
+        keyframes: Mapping[int, Mapping[str, np.ndarray]],
+        keyframe_std: Mapping[int, Mapping[str, np.ndarray]],
+        target: Target,
+        ignore: Ignore,
+    ) -> SequenceRun:
+        """A run on frames together; joints are free as in a run on one frame, calibration is not.
+
+        Args:
+            sequence: Where joint positions are measured.
+            calibration: Base frames and cameras; its joint positions do not matter.
+            frames: Which ones; of a `domain`, seen by `cameras`.
+            settings: Of the optimizer.
+            direction: Where to begin.
+            free: Which joints may move.
+            keyframes: Frame -> arm -> joint positions [rad, m] that stay; `keyframe_std`: their standard deviations.
+            target: What is fitted.
+            ignore: Frame -> camera -> pixels that show something else.
+
+        Raises:
+            CartsError: weights, an image, a mask or a setting is not usable.
+        """
+        model = SequenceSettings(direction=direction)
+        free = replace(free, base_frames=False, extrinsics=False, intrinsics=False)
+        stamps = sequence.timestamps
+        optimizer = SequenceOptimizer(
+            scene_at(sequence.scene, calibration),
+            lambda index: sequence.frame(index, domain, list(cameras)),
+            {index: None if stamps is None else float(stamps[index]) for index in frames},
+            self.predictor(target),
+            settings=settings,
+            model=model,
+            free=free,
+            keyframes=keyframes,
+            keyframe_std=keyframe_std,
+            ignore=ignore,
+            backgrounds=Backgrounds.of(sequence, cameras, domain),
+            cameras=list(cameras),
+        )
+        used = {
+            **to_plain(settings),
+            "model": to_plain(model),
+            "free": asdict(free),
+            "cameras": list(cameras),
+            "frames": [frames[0], frames[-1]],
+            "keyframes": sorted(keyframes),
+            **self._observed(target),
+        }
+        made = Provenance.made_by_optimizer(used, self._weights_hash(target), Source.PROPAGATED)
+        return SequenceRun(optimizer, made)
+
+
+def scene_at(scene: Scene, state: SceneState) -> Scene:
+    """The scene with base frames, extrinsics and intrinsics of a state in place of the calibrated ones."""
+
+    def array(value: torch.Tensor):
+        return value.numpy().astype("float64")
+
+    arms = [replace(arm, T_world_base=array(T)) for arm, T in zip(scene.arms, state.T_world_base, strict=True)]
+    cameras = [
+        replace(camera, T_camera_world=array(T), intrinsics=tuple(k.tolist()))
+        for camera, T, k in zip(scene.cameras, state.T_camera_world, state.intrinsics, strict=True)
+    ]
+    return replace(scene, arms=tuple(arms), cameras=tuple(cameras))

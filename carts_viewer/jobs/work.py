@@ -1,0 +1,272 @@
+"""Generators that do the work of jobs: optimizing frames, calibrating, and adapting the network."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Container, Generator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from carts_core.errors import CartsError
+from carts_core.evaluation.calibration import moved_frames
+from carts_core.model.scene import Scene
+from carts_core.optimization.calibration import CalibrationOptimizer
+from carts_core.optimization.counterfactual import Backgrounds
+from carts_core.project import (
+    CorrectedIntrinsics,
+    CorrectedTransform,
+    Figures,
+    Key,
+    ProjectState,
+    Provenance,
+    ReviewState,
+    Source,
+)
+from carts_core.recording import spread
+from carts_core.settings import CALIBRATION_SETTINGS
+from carts_core.stopping import PARENT
+from carts_viewer.actions.context import Context
+from carts_viewer.jobs.comparison import Comparison
+from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
+
+_ACCEPTED, _OPTIMIZED = ReviewState.ACCEPTED, ReviewState.OPTIMIZED
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is."""
+
+    done: int
+    total: int
+    text: str
+    line: str | None = None
+    """For the log."""
+    wait: float = 0.0
+    """How long there is nothing to do [s]."""
+
+
+def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
+    """Run on each of these frames alone, from the one at place `first` on; a result that fits worse is not taken.
+
+    Every frame is a step of undo of its own, and is saved before the next one begins.
+    """
+    taken = worse = 0
+    cameras = [camera.name for camera in context.session.scene.cameras]
+    for place, index in enumerate(frames):
+        if place < first:
+            continue
+        name = context.session.sequence.frame_ids[index]
+        session = context.session
+        if index in session.editor.view.kept_frames:
+            yield Progress(place + 1, len(frames), f"{name} is kept as it is", f"{name}: kept, not touched")
+            continue
+        yield Progress(place, len(frames), f"Frame {name}")
+        target = session.target(context.state.observed)
+        if not target.seen(session.sequence, index, context.state.domain, cameras):
+            yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not touched")
+            continue
+        steps = comparison.own_run(index, context.state)
+        while (outcome := next(steps)) is None:
+            yield Progress(place, len(frames), f"Frame {name}")
+        fit, edits, remark = outcome
+        if remark is not None:
+            worse += 1
+            yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: not taken, it would be worse ({remark})")
+            continue
+        context.save()
+        changes = {**edits, Key.verdict(index): fit.verdict}
+        session.editor.apply(f"Optimize, frame {name}", changes, {index: Figures(fit.loss, fit.dice)})
+        context.refresh()
+        taken += 1
+        yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: {fit.verdict.verdict}, loss {fit.loss:.3g}")
+    text = f"{taken} frames optimized" + (f", {worse} not taken because they would be worse" if worse else "")
+    yield Progress(len(frames), len(frames), text)
+
+
+def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress]:
+    """Fit base frames, and cameras where they are free, to frames spread over the sequence; one step of undo."""
+    session, state = context.session, context.state
+    sequence = session.sequence
+    cameras = [camera.name for camera in session.scene.cameras]
+    indices = spread(len(sequence), min(count, len(sequence)))
+    free = replace(
+        state.free, base_frames=state.free.base_frames or not (state.free.extrinsics or state.free.intrinsics)
+    )
+    yield Progress(0, 0, f"Reading {len(indices)} frames")
+    frames = [sequence.frame(index, state.domain, cameras) for index in indices]
+    target = session.target(state.observed)
+    ignored = [session.ignored(index, cameras, target) for index in indices]
+    before = session.editor.view
+    scene = scene_at(session.scene, session.measured(state.frame))
+    optimizer = CalibrationOptimizer(
+        scene,
+        frames,
+        optimizers.predictor(target),
+        free=replace(free, joints=False),
+        ignore=ignored,
+        backgrounds=Backgrounds.of(sequence, cameras, state.domain),
+    )
+    most = CALIBRATION_SETTINGS.iterations
+    while (iterate := optimizer.step()) is not None:
+        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; {most} iterations at most"
+        yield Progress(iterate.index, most, text, text)
+    result = optimizer.result()
+    for change in result.unknowns:
+        unit = "°" if change.unit == "deg" else f" {change.unit}"
+        line = f"{change.name}: {change.change:+.3f} ± {change.standard_deviation:.3f}{unit}"
+        yield Progress(most, most, "Comparing", line)
+    found = result.assessment
+    verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}".strip()
+    provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free, target)
+    edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
+    if not edits:
+        yield Progress(most, most, f"Nothing was changed. {verdict}")
+        return
+    if session.editor.view.records.get(-1) is not before.records.get(-1):
+        raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
+    context.save()
+    accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
+    session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
+    context.refresh()
+    again = " All masks have moved: run or solve again what was fitted before." if solved else ""
+    again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
+    done = f"Calibrated on {len(indices)} frames, one step of undo.{_moved(scene, result.scene)}"
+    yield Progress(most, most, f"{done} {verdict}{again}")
+
+
+def _moved(before: Scene, after: Scene) -> str:
+    """Which poses a calibration has moved, and by how much, for people; empty if none."""
+    found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
+    return f" Moved: {', '.join(found)}." if found else ""
+
+
+def _count(project: ProjectState, states: Container[ReviewState]) -> int:
+    """Frames in one of these review states."""
+    return sum(project.review(index).state in states for index in project.records if index >= 0)
+
+
+def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> dict[Key[Any], Any]:
+    """What a project must change so that it has this calibration."""
+    edits: dict[Key[Any], Any] = {}
+    for old, new in zip(before.arms, after.arms, strict=True):
+        if (old.T_world_base != new.T_world_base).any():
+            edits[Key.base_frame(new.name)] = CorrectedTransform(
+                tuple(map(tuple, new.T_world_base.tolist())), provenance
+            )
+    for old, new in zip(before.cameras, after.cameras, strict=True):
+        if (old.T_camera_world != new.T_camera_world).any():
+            matrix = tuple(map(tuple, new.T_camera_world.tolist()))
+            edits[Key.extrinsics(new.name)] = CorrectedTransform(matrix, provenance)
+        if old.intrinsics != new.intrinsics:
+            edits[Key.intrinsics(new.name)] = CorrectedIntrinsics(tuple(new.intrinsics), provenance)
+    return edits
+
+
+OPTIONS: tuple[str, ...] = ()
+"""Options of `carts train` besides the recording and the time."""
+_POLL = 0.25
+"""How often it is seen how training goes [s]."""
+_LONGEST_END = 30.0
+"""How long training that is stopped has for its checkpoint [s]."""
+
+
+def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
+    """Train, and say each minute what is reached; whoever closes the iterator stops the training.
+
+    Args:
+        sequence: the sequence file.
+        folder: of the run; one that was stopped goes on.
+        minutes: time for training [min].
+
+    Raises:
+        CartsError: training failed.
+    """
+    training = _Training([str(folder), "--for", str(sequence), "--minutes", f"{minutes:g}", *OPTIONS])
+    total, text, lines = max(1, round(minutes)), "Making images to measure with", []
+    try:
+        yield Progress(0, total, text, f"in {folder}")
+        while training.running or training.said:
+            line = training.next_line()
+            if line is not None:
+                lines.append(line)
+                text = line
+            yield Progress(min(training.minutes, total), total, text, line, _POLL)
+    finally:
+        training.end()
+    if training.failed:
+        raise CartsError(f"The network could not be adapted: {' '.join(lines[-3:]) or 'training ended early'}")
+    kept = next((line for line in lines if line.startswith("kept, the best:")), lines[-1] if lines else "")
+    refused = next((line for line in lines if line.startswith("not offered, since worse:")), None)
+    yield Progress(total, total, refused or kept.partition(": ")[2] or kept)
+
+
+class _Training:
+    """A process that trains."""
+
+    def __init__(self, arguments: list[str]) -> None:
+        self._began = time.monotonic()
+        # Waiting threads that spin would take the processor from the page.
+        output = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        environment = {**os.environ, **output, PARENT: str(os.getpid())}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "carts_core.cli", "train", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment,
+        )
+        self._lines: SimpleQueue[str] = SimpleQueue()
+        self._reader = threading.Thread(target=self._read, name="carts-training", daemon=True)
+        self._reader.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether more may be said."""
+        return self._reader.is_alive() or self._process.poll() is None
+
+    @property
+    def said(self) -> bool:
+        """Whether there are lines that nobody has taken."""
+        return not self._lines.empty()
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended with an error."""
+        return self._process.wait() != 0
+
+    @property
+    def minutes(self) -> int:
+        """Since it began."""
+        return int((time.monotonic() - self._began) / 60)
+
+    def next_line(self) -> str | None:
+        """What was said next; None where nothing is there yet."""
+        with suppress(Empty):
+            return self._lines.get_nowait()
+        return None
+
+    def end(self) -> None:
+        """Have it keep what it has and end; nobody waits for that."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            threading.Thread(target=self._reap, daemon=True).start()
+
+    def _reap(self) -> None:
+        try:
+            self._process.wait(_LONGEST_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                if line.strip():
+                    self._lines.put(line.strip()[:500])

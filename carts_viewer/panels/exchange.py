@@ -1,0 +1,147 @@
+"""Panels of exports and of imported masks."""
+
+import viser
+
+from carts_core.export import FORMATS, FormatName
+from carts_core.project import Key, ProjectState, ReviewState
+from carts_viewer.actions import intents
+from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings, frames_within
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
+from carts_viewer.session import Session, Storage
+from carts_viewer.state import ViewState
+from carts_viewer.transport.tab_page import TabPage
+
+_PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
+_DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
+_WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
+"""Formats that have no categories, or always both kinds."""
+_WRITTEN = (
+    "Masks, keypoints and poses are those of the rendered arms at their joint positions now; masks with what was "
+    "painted. The recording's own masks are not written."
+)
+_NOT_KEPT = "This project ends with the viewer, and its exports with it: download them."
+
+
+class ExportPanel:
+    """The mask of this frame, or frames in any format, with progress, a way to stop it and where it is."""
+
+    def __init__(self, page: TabPage, session: Session, storage: Storage, emit: Emit) -> None:
+        gui = page.gui
+        cameras = len(session.scene.cameras)
+        self._camera_names = [camera.name for camera in session.scene.cameras]
+        self._kept = storage.scratch is None
+        self._formats: dict[str, FormatName] = {known.label: name for name, known in FORMATS.items()}
+        self._counted: ProjectState | None = None
+        self._chosen = ""
+        self._range: tuple[int, int] | None = None
+        with gui.add_folder("Export frames"):
+            gui.add_html(f'<p class="carts-caption">{_WRITTEN}</p>')
+            self._format = gui.add_dropdown("Format", list(self._formats))
+            self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
+            self._within = gui.add_checkbox("Only the range", True, visible=False)
+            self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
+            self._parts = gui.add_dropdown("Category per", list(_PARTS))
+            self._images = gui.add_checkbox("Copy images", False)
+            self._count = gui.add_html("")
+            self._export = gui.add_button("Export", icon=viser.Icon.FILE_EXPORT, color="teal")
+            self._progress = gui.add_progress_bar(0.0, visible=False)
+            self._cancel = gui.add_button("Cancel export", icon=viser.Icon.X, color="gray", visible=False)
+            self._result = gui.add_html("", visible=False)
+            self._download = gui.add_button("Download it", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        with gui.add_folder("This frame"):
+            gui.add_html('<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background.</p>')
+            mask = gui.add_button("Export mask", icon=viser.Icon.PHOTO_DOWN, color="gray")
+        on_click(mask, intents.ExportMask, emit)
+        on_click(self._export, lambda _: self._intent(), emit)
+        on_click(self._cancel, lambda _: intents.CancelExport(), emit)
+        on_click(self._download, intents.Download, emit)
+        for widget in (self._format, self._frames, self._within, self._cameras):
+            on_input(widget, lambda _: intents.Refresh(), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        name = self._formats.get(self._format.value)
+        self._parts.visible = name not in _WITHOUT_PARTS
+        self._images.visible = name is not None and (FORMATS[name].images or name == "masks")
+        self._within.visible = state.range is not None
+        self._range = state.range if self._within.value else None
+        self._show_count(state)
+        export = state.export
+        running = export is not None and export.path is None
+        self._export.disabled = running
+        self._progress.visible = self._cancel.visible = running
+        self._result.visible = export is not None
+        self._download.visible = export is not None and not running
+        if export is None:
+            return
+        if export.path is None:
+            self._progress.value = 100.0 * export.done / max(export.total, 1)
+            text = f"{escaped(export.format)}: {export.done} of {export.total or '…'}"
+        else:
+            where = f"<code>{escaped(str(export.path))}</code>"
+            text = f"<b>{export.frames} frames</b> as {escaped(export.format)} in<br>{where}"
+            text += "" if self._kept else f"<br>{_NOT_KEPT}"
+        self._result.content = f'<p class="carts-caption" role="status">{text}</p>'
+
+    def _intent(self) -> intents.Export:
+        """What the widgets say; the controller refuses what they cannot say."""
+        return intents.Export(
+            self._formats.get(self._format.value, self._format.value),  # type: ignore[arg-type]
+            self._frames.value,
+            _PARTS.get(self._parts.value, self._parts.value),  # type: ignore[arg-type]
+            bool(self._images.value),
+            self._cameras.value == "Shown one",
+            self._range,
+        )
+
+    def _show_count(self, state: ViewState) -> None:
+        chosen = f"{self._frames.value} {self._cameras.value} {state.camera} {self._range}"
+        if state.unsaved or (state.project is self._counted and chosen == self._chosen):
+            return
+        self._counted, self._chosen = state.project, chosen
+        known = self._frames.value in FRAME_CHOICES
+        frames = frames_within(state.project, self._frames.value, self._range) if known else []
+        cameras = [state.camera] if self._cameras.value == "Shown one" else self._camera_names
+        warnings = export_warnings(state.project, frames, cameras)
+        outside = set(frames_within(state.project, self._frames.value, None)) - set(frames) if known else ()
+        accepted = sum(state.project.review(index).state is ReviewState.ACCEPTED for index in outside)
+        if accepted:
+            names = "frame outside of the range is" if accepted == 1 else "frames outside of the range are"
+            warnings.append(f"{accepted} accepted {names} left out")
+        notes = "".join(f"<br>⚠ {escaped(line)}" for line in warnings)
+        total = len(state.project.identity.frame_ids)
+        self._count.content = f'<p class="carts-caption"><b>{len(frames)}</b> of {total} frames{notes}</p>'
+
+
+_BY_NAME = "By name"
+_HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, keypoints of SurgPose, or a folder of PNGs"
+
+
+class ImportPanel:
+    """A path, a camera, a button, and what was imported last."""
+
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
+        cameras = [camera.name for camera in session.scene.cameras]
+        with gui.add_folder("Masks of others", expand_by_default=False):
+            self._place = gui.add_text("From", "", hint=_HINT)
+            self._camera = gui.add_dropdown(
+                "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Whose images the masks are of"
+            )
+            self._replace = gui.add_checkbox("Replace", False, hint="Replace what was imported before")
+            self._import = gui.add_button("Import masks", icon=viser.Icon.FILE_IMPORT, color="gray")
+            self._text = gui.add_html("")
+        on_click(self._import, lambda _: self._intent(), emit)
+
+    def _intent(self) -> intents.ImportMasks:
+        camera = None if self._camera.value == _BY_NAME else self._camera.value
+        return intents.ImportMasks(str(self._place.value), camera, bool(self._replace.value))
+
+    def show(self, state: ViewState) -> None:
+        """Bring the text up to date."""
+        there = state.project.get(Key.imported_labels()) is not None
+        content = "Nothing was imported yet."
+        if there:
+            content = escaped(state.imported) or "What was imported is the layer <i>Imported masks</i>."
+        if self._text.content != (wanted := f'<p class="carts-caption">{content}</p>'):
+            self._text.content = wanted

@@ -1,0 +1,105 @@
+"""Where the panels are on the page: browsing, overlay and joints on the left, tabs on the right."""
+
+import viser
+
+from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
+from carts_viewer.panels.exchange import ExportPanel, ImportPanel
+from carts_viewer.panels.fit import FitPanel, LivePanel
+from carts_viewer.panels.help import HelpPanel, explain
+from carts_viewer.panels.inputs import Emit, Panel, Waits
+from carts_viewer.panels.jobs import JobsPanel
+from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
+from carts_viewer.panels.optimize import CurvesPanel, FreePanel, OptimizePanel, SettingsPanel
+from carts_viewer.panels.page_state import PageState
+from carts_viewer.panels.paint import PaintPanel
+from carts_viewer.panels.project import HistoryPanel, MessagePanel, PeoplePanel, SavedPanel
+from carts_viewer.panels.review import FindPanel, ReviewPanel
+from carts_viewer.panels.sequence import KeyframesPanel
+from carts_viewer.panels.timeline import TimelineData
+from carts_viewer.session import Session, Storage
+from carts_viewer.state import ViewState
+from carts_viewer.transport.tab_page import TabPage
+
+_WIDTH = 312.0
+"""Of either side [px]."""
+
+
+def choose_theme(gui: viser.GuiApi, *, light: bool) -> None:
+    """The colours of all tabs, or of the one that this is the interface of."""
+    gui.configure_theme(dark_mode=not light, show_share_button=False, show_logo=False)
+
+
+class Layout:
+    """All panels of a page.
+
+    Attributes:
+        panels: in the order in which they are brought up to date.
+        joints: the one with the joints' sliders.
+        timeline: what the strip below the picture shows.
+    """
+
+    def __init__(
+        self, page: TabPage, session: Session, storage: Storage, state: ViewState, emit: Emit, waits: Waits
+    ) -> None:
+        """Build the panels.
+
+        Args:
+            page: where.
+            session: the open sequence.
+            storage: its project.
+            state: what is shown first.
+            emit: takes the intents.
+            waits: whether an intent waits for the worker.
+        """
+        gui = page.gui
+        gui.set_panel_label("CaRTS")
+        gui.main_panel.dock_left()
+        gui.main_panel.set_width(_WIDTH)
+        panels: list[Panel] = [
+            SavedPanel(page, storage, emit),
+            MessagePanel(page, emit),
+            FitPanel(page, session, emit),
+            BrowsePanel(page, session, emit, waits),
+            OverlayPanel(page, session, state, emit, waits),
+            PaintPanel(page, session, state, emit, waits),
+        ]
+        with gui.add_folder("Joints"):
+            self.joints = JointsPanel(page, session, state, emit, waits)
+        right = gui.add_panel()
+        with right.add_tab("Optimize"):
+            panels += [
+                OptimizePanel(page, session, state, emit),
+                SettingsPanel(page, state, emit),
+                CurvesPanel(gui),
+                FreePanel(page, session, state, emit),
+            ]
+        with right.add_tab("Review"):
+            panels += _review(page, session, state, emit, waits)
+        with right.add_tab("Values"):
+            panels.append(ValuesPanel(gui, session))
+        with right.add_tab("Jobs"):
+            panels.append(JobsPanel(page, emit))
+        with right.add_tab("Live"):
+            panels.append(LivePanel(page, emit))
+        with right.add_tab("Export"):
+            panels.append(ExportPanel(page, session, storage, emit))
+        with right.add_tab("Help"):
+            HelpPanel(page, self.joints.perturb, emit)
+        explain(page)
+        right.dock_right()
+        right.set_width(_WIDTH)
+        self.timeline = TimelineData(page, session)
+        self.panels = [*panels, self.joints, PageState(page, session), self.timeline]
+
+
+def _review(page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> list[Panel]:
+    """What is said and known of frames."""
+    return [
+        ReviewPanel(page, emit, waits),
+        KeyframesPanel(page, session, emit),
+        KeypointsPanel(page, session, emit),
+        ImportPanel(page, session, emit),
+        FindPanel(page, session, emit, waits),
+        HistoryPanel(page, emit),
+        PeoplePanel(page, state, emit, waits),
+    ]

@@ -1,0 +1,210 @@
+"""Panel of sequence mode, and the warning of a wrong calibration with its button."""
+
+import viser
+
+from carts_core.optimization import BASE_FRAME_GAIN
+from carts_core.project import ProjectState, between_kept
+from carts_core.settings import Direction
+from carts_viewer.actions import intents
+from carts_viewer.jobs.job_list import Job, JobState
+from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.transport.tab_page import TabPage
+
+
+class CalibrationHint:
+    """Stands below what found the suspicion, and is not there without one."""
+
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        frames = min(intents.Calibrate().frames, len(session.sequence))
+        self._text = page.gui.add_html("", visible=False)
+        self._calibrate = page.gui.add_button(
+            f"Calibrate on {frames} frames",
+            color="gray",
+            visible=False,
+            hint="A job: the page stays usable. One step of undo. Jobs, Calibrate takes another number of frames.",
+        )
+        self._watched: int | None = None
+        on_click(self._calibrate, lambda _: intents.Calibrate(frames), emit)
+
+    def show(self, gain: float | None, state: ViewState) -> None:
+        """Bring it up to date.
+
+        Args:
+            gain: what free base frames would explain of the residual that is left [1]; None where it is not known.
+            state: with the jobs.
+        """
+        job = newest_calibration(state.jobs)
+        if job is not None and not job.over:
+            self._watched, line = job.number, ""
+        else:
+            line = calibration_line(gain)
+        self._calibrate.visible = bool(line)
+        self._text.content = f"{line}{self._progress_line(job)}"
+        self._text.visible = bool(self._text.content)
+
+    def _progress_line(self, job: Job | None) -> str:
+        """How a calibration goes, or what came of one that this tab has seen going, as HTML."""
+        if job is None:
+            return ""
+        text, title = escaped(job.text), f"<b>{escaped(job.title)}</b>"
+        match job.state:
+            case JobState.WAITING | JobState.RUNNING:
+                line = f"{title}: {text or job.state}"
+            case JobState.DONE if job.number == self._watched:
+                line = text
+            case JobState.FAILED if job.number == self._watched:
+                line = f"{title} failed: {text}"
+            case _:
+                return ""
+        return f'<p class="carts-caption" role="status">{line}</p>'
+
+
+def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
+    """The calibration that waits or runs, or that has ended and no other job has followed."""
+    shown = [job for job in jobs if job.state is not JobState.ASKED]
+    found = (job for job in reversed(shown) if job.kind == "calibrate" and (not job.over or job is shown[-1]))
+    return next(found, None)
+
+
+def calibration_line(gain: float | None) -> str:
+    """That base frames may be wrong, if the residual of a run says so, and what to do, as HTML.
+
+    Args:
+        gain: what free base frames would explain of that residual [1]; None where it is not known.
+    """
+    if gain is None or gain < BASE_FRAME_GAIN:
+        return ""
+    return (
+        '<p class="carts-caption">The calibration may be off: with other poses of the arms\' bases (base frames) or of '
+        f"the camera, the remaining residual would be {100 * gain:.0f} % smaller. A good mask can be accepted as it "
+        "is. Masks and joint values become better if you <b>calibrate</b> and then run or solve again, best before you "
+        "accept frames: a calibration moves all masks, so it takes their acceptance back.</p>"
+    )
+
+
+_LONGEST_LIST = 200
+_MEANING = (
+    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Frames that you accepted, moved by hand or "
+    "marked as keyframes are kept as they are."
+)
+_DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
+
+
+class KeyframesPanel:
+    """Marks keyframes and solves between them, with progress and a way to stop."""
+
+    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+        gui = page.gui
+        self._ids = session.sequence.frame_ids
+        self._seen: tuple[ProjectState | None, int, tuple[int, int] | None] = (None, -1, None)
+        self._solvable, self._open, self._plan = False, True, ""
+        self._index = 0
+        with gui.add_folder("Keyframes"):
+            self._held = gui.add_checkbox(
+                "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
+            )
+            self._text = gui.add_html("")
+            self._between = gui.add_button("Solve between", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal")
+            self._all = gui.add_button("Solve all", color="gray")
+            page.row(self._between, self._all, weights=(13, 10))
+            self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
+            self._calibration = CalibrationHint(page, session, emit)
+            self._progress = gui.add_progress_bar(0.0, visible=False)
+            self._listed = gui.add_html("", visible=False)
+            self._take = gui.add_button("Take it as solved", color="gray", visible=False)
+            self._take_all = gui.add_button("Take all", color="gray", visible=False)
+            page.row(self._take, self._take_all, weights=(3, 2))
+            self._drop = gui.add_button("Leave them, close the list", icon=viser.Icon.X, color="gray", visible=False)
+            self._stop = gui.add_button("Stop and keep", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)), emit)
+        on_click(self._between, lambda _: intents.Solve(), emit)
+        on_click(self._all, lambda _: intents.Solve(whole=True), emit)
+        on_click(self._take, lambda _: self._take_shown(), emit)
+        on_click(self._take_all, lambda _: intents.TakeSolved(), emit)
+        on_click(self._drop, lambda _: intents.DropSolved(), emit)
+        on_click(self._stop, lambda _: intents.StopSolving(), emit)
+        on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]), emit)
+
+    def show(self, state: ViewState) -> None:
+        """Bring the widgets up to date."""
+        write(self._held, state.project.is_keyframe(state.index))
+        write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
+        self._all.label = whole_label(state)
+        self._direction.disabled = state.solving
+        self._progress.visible = self._stop.visible = state.solving
+        self._plan_ahead(state)
+        self._between.disabled = state.solving or not self._solvable
+        self._all.disabled = state.solving or not self._open
+        # A range is chosen for solving all of it, more often than not.
+        bright = self._between if self._solvable and state.range is None else self._all
+        for button in (self._between, self._all):
+            button.color = "teal" if button is bright else "gray"
+        lines = [] if state.solving else [self._plan, _MEANING]
+        if state.solve is not None:
+            done, total = state.solve.progress
+            self._progress.value = 100.0 * done / total
+            text = escaped(state.solve.text)
+            lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
+        self._show_listed(state)
+        self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
+        self._calibration.show(None if state.solve is None else state.solve.suspicion(state.project), state)
+
+    def _take_shown(self) -> intents.Intent:
+        return intents.TakeSolved(self._index)
+
+    def _show_listed(self, state: ViewState) -> None:
+        """The frames that became worse or are doubtful, each a link to it."""
+        self._index = state.index
+        listed = () if state.solve is None or state.solving else state.solve.listed
+        held = [frame.index for frame in listed if not frame.taken]
+        self._listed.visible = self._drop.visible = bool(listed)
+        self._take.visible = self._take_all.visible = bool(held)
+        self._take.disabled = state.index not in held
+        rows = "".join(
+            f'<li><a href="#" data-frame="{frame.index}">{escaped(self._ids[frame.index])}</a> '
+            f"{escaped(frame.reason)}{'' if frame.taken else ' <b>kept as it was</b>'}</li>"
+            for frame in listed[:_LONGEST_LIST]
+        )
+        more = f"<li>and {len(listed) - _LONGEST_LIST} more</li>" if len(listed) > _LONGEST_LIST else ""
+        self._listed.content = f'<ul class="carts-list" aria-label="Frames to look at">{rows}{more}</ul>'
+
+    def _plan_ahead(self, state: ViewState) -> None:
+        """Find out what "between" means here; while somebody is moving a joint, what it meant before."""
+        seen = (state.project, state.index, state.range)
+        if self._seen == seen or (state.unsaved and self._seen[1:] == seen[1:]):
+            return
+        self._seen = seen
+        self._plan = f"{self._between_here(state)}<br>{self._all_here(state)}"
+
+    def _between_here(self, state: ViewState) -> str:
+        name = "<b>Solve between</b>"
+        frames = between_kept(state.project, state.index, state.part)
+        kept = set(state.project.kept_frames) & set(state.part)
+        count = sum(frame not in kept for frame in frames)
+        self._solvable = state.index in state.part and bool(kept) and count > 0
+        if state.index not in state.part:
+            return f"{name} keeps to the range, and this frame lies outside of it"
+        if not kept:
+            return f"{name} needs a kept frame; none is kept {'yet' if state.range is None else 'in the range'}"
+        where = f"{name}, {escaped(self._ids[frames[0]])} to {escaped(self._ids[frames[-1]])}"
+        return f"{where}: " + (
+            f"{_frames(count)} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"
+        )
+
+    def _all_here(self, state: ViewState) -> str:
+        count = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
+        self._open = count > 0
+        return f"<b>{whole_label(state)}</b>: " + (
+            f"{_frames(count)} would be fitted" if count else "every frame is kept"
+        )
+
+
+def whole_label(state: ViewState) -> str:
+    """What solving all frames, or those of the range, is called."""
+    return "Solve all" if state.range is None else "Solve range"
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'' if count == 1 else 's'}"

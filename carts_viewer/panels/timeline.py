@@ -1,0 +1,327 @@
+"""Data of the page's timeline: codes of frames, curves, and thumbnails."""
+
+import asyncio
+import http
+import json
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from websockets.http11 import Response
+
+from carts_core.errors import CartsError
+from carts_core.model.scene import Scene
+from carts_core.optimization import undetermined_joints
+from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
+from carts_core.project.state import Record
+from carts_core.project.values import VERDICTS
+from carts_core.recording import Sequence
+from carts_core.recording.images import ImageSource
+from carts_core.recording.video import Video
+from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, review_name
+from carts_viewer.choices import JointRange
+from carts_viewer.panels.inputs import humanized
+from carts_viewer.panels.joints import to_shown
+from carts_viewer.session import Session
+from carts_viewer.state import ViewState
+from carts_viewer.transport.guard import response
+from carts_viewer.transport.tab_page import TabPage
+
+_FIGURES = ("Loss [1]", "Dice [1]", "Probability of failure [1]")
+_MOST_COLUMNS = 4000
+
+
+class Traces:
+    """Values of every frame, brought up to date as the project changes."""
+
+    def __init__(self, session: Session) -> None:
+        frames = len(session.sequence)
+        self._sequence: Sequence | None = None
+        self._figures = np.full((len(_FIGURES), frames), np.nan, np.float32)
+        self._joints = {
+            f"{limits.arm} {humanized(limits.joint)} [{'°' if limits.revolute else 'mm'}]": (limits, number)
+            for arm in session.scene.arms
+            for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
+        }
+        self._corrected: dict[str, Float[np.ndarray, "frames dofs"]] = {
+            arm.name: np.full((frames, len(arm.robot.joint_names)), np.nan, np.float32) for arm in session.scene.arms
+        }
+        self.measure(session.sequence)
+
+    @property
+    def names(self) -> list[str]:
+        """What can be drawn, with its unit."""
+        return [*_FIGURES, *self._joints]
+
+    def measure(self, sequence: Sequence) -> bool:
+        """Take the measured joints of this recording; whether they are others than before."""
+        other = sequence is not self._sequence
+        self._sequence = sequence
+        return other
+
+    def follow(self, project: ProjectState, frames: Iterable[int]) -> None:
+        """Take what a project says of these frames."""
+        for frame in frames:
+            figures, verdict = project.figures(frame), project.verdict(frame)
+            values = (
+                None if figures is None else figures.loss,
+                None if figures is None else figures.dice,
+                None if verdict is None else verdict.failure,
+            )
+            self._figures[:, frame] = [np.nan if value is None else value for value in values]
+            corrections = project.joints(frame)
+            for arm, rows in self._corrected.items():
+                known = corrections.get(arm)
+                rows[frame] = np.nan if known is None else known.joint_positions
+
+    def between(self, name: str, first: int, last: int, columns: int) -> dict[str, Any] | None:
+        """A curve from frame `first` up to, and without, frame `last`; None where there is none.
+
+        Returns:
+            `edges`: the frames at which columns begin, and where the last one ends; `curves`: for what was measured (or
+            found) and, of joints, what was corrected, the lowest and the highest value of each column, null where there
+            is none.
+        """
+        first, last = max(first, 0), min(last, self._figures.shape[1])
+        values = self._values(name)
+        if values is None or last <= first or columns < 1:
+            return None
+        count = min(columns, _MOST_COLUMNS, last - first)
+        edges = np.unique(np.linspace(first, last, count + 1).astype(int))
+        return {"edges": edges.tolist(), "curves": [_extremes(row[first:last], edges - first) for row in values]}
+
+    def _values(self, name: str) -> list[np.ndarray] | None:
+        if name in _FIGURES:
+            return [self._figures[_FIGURES.index(name)]]
+        if name not in self._joints or self._sequence is None:
+            return None
+        limits, joint = self._joints[name]
+        return [_shown(limits, rows[limits.arm][:, joint]) for rows in (self._sequence.measured, self._corrected)]
+
+
+def _shown(limits: JointRange, values: np.ndarray) -> np.ndarray:
+    return values * to_shown(limits, 1.0)
+
+
+def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]:
+    """Lowest and highest finite value between neighbouring edges."""
+    ends = (np.fmin.reduceat(values, edges[:-1]), np.fmax.reduceat(values, edges[:-1]))
+    return [[None if np.isnan(value) else float(f"{value:.5g}") for value in end] for end in ends]
+
+
+HEIGHT = 64
+"""[px]; shown smaller, so that they stay sharp where a CSS pixel is more than one of the screen."""
+_MOST = 4000
+"""How many are kept, some 3 kB each; those that were not asked for the longest go first."""
+_QUALITY = 70
+_PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})\.jpg")
+
+
+class Thumbnails:
+    """Of one sequence."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self._sequence = sequence
+        self._cameras = [camera.name for camera in sequence.scene.cameras]
+        self._sources: dict[tuple[int, int], ImageSource] = {}
+        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        self._lock = threading.Lock()
+        # One at a time: whoever scrubs meanwhile needs the processor more.
+        self._thread = ThreadPoolExecutor(1, "carts-thumbnails")
+
+    async def answer(self, path: str) -> Response:
+        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, all of them numbers from 0, or that there is none."""
+        content = self._find(path)
+        if content is None:
+            try:
+                content = await asyncio.get_running_loop().run_in_executor(self._thread, self._make, path)
+            except RuntimeError:  # The viewer is being closed.
+                content = None
+        if content is None:
+            return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such picture.")
+        return response(http.HTTPStatus.OK, "image/jpeg", content)
+
+    def close(self) -> None:
+        """Make no more pictures."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _source(self, camera: int, domain: int) -> ImageSource:
+        """Images as recorded; a video is read apart from whoever goes through its frames meanwhile."""
+        if (camera, domain) not in self._sources:
+            source = self._sequence.image_source(self._cameras[camera], self._sequence.domains[domain])
+            self._sources[camera, domain] = source.another() if isinstance(source, Video) else source
+        return self._sources[camera, domain]
+
+    def _find(self, path: str) -> bytes | None:
+        with self._lock:
+            if path in self._kept:
+                self._kept.move_to_end(path)
+            return self._kept.get(path)
+
+    def _make(self, path: str) -> bytes | None:
+        found = _PATH.fullmatch(path)
+        if found is None:
+            return None
+        camera, domain, frame = map(int, found.groups())
+        known = camera < len(self._cameras) and domain < len(self._sequence.domains) and frame < len(self._sequence)
+        if not known:
+            return None
+        try:
+            image = self._source(camera, domain).read(frame)
+        except CartsError:
+            return None
+        width = max(round(HEIGHT * image.shape[1] / image.shape[0]), 1)
+        small = cv2.resize(image, (width, HEIGHT), interpolation=cv2.INTER_AREA)
+        content = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        with self._lock:
+            self._kept[path] = content
+            while len(self._kept) > _MOST:
+                self._kept.popitem(last=False)
+        return content
+
+
+_REVIEWS = (
+    ReviewState.UNTOUCHED,
+    ReviewState.OPTIMIZED,
+    ReviewState.NEEDS_WORK,
+    ReviewState.ACCEPTED,
+    ReviewState.REJECTED,
+    BY_HAND,
+    SOLVED,
+)
+_SOURCES = (Source.HAND, Source.OPTIMIZER, Source.PROPAGATED)
+_FULL = 0.2
+"""1 - Dice, and probability of failure, that fill the height of a bar [1]."""
+_MOST_OPEN = 255
+_MOST_IDS = 5000
+"""Of longer sequences, frames are named by their number."""
+
+
+class TimelineData:
+    """Sends a tab what is known of the frames, whole at first, and then what has changed."""
+
+    def __init__(self, page: TabPage, session: Session) -> None:
+        self._page = page
+        self._session = session
+        self._ids = session.sequence.frame_ids
+        stamps = session.sequence.timestamps
+        span = 0.0 if stamps is None or len(stamps) < 2 else float(stamps[-1] - stamps[0])
+        self._fps = (len(self._ids) - 1) / span if span > 0 else 0.0
+        self._records: Mapping[int, Record] = {}
+        self._codes: dict[int, int] = {}
+        self._draft: int | None = None
+        """The frame of which something was sent that is not saved yet."""
+        self._solving: list[int] | None = None
+        self._traces = Traces(session)
+        page.call("setTimeline", self._whole())
+
+    def show(self, state: ViewState) -> None:
+        """Send what has changed; a gesture that is not finished changes its own frame alone."""
+        solving = None
+        if state.solve is not None and state.solving:
+            solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]
+        changed = self._drafted(state) if state.unsaved else self._changed(state.project)
+        measured = self._traces.measure(self._session.sequence)
+        if changed or measured or solving != self._solving:
+            self._solving = solving
+            traced = measured or (bool(changed) and not state.unsaved)
+            message = {"whole": False, "codes": changed, "solving": solving, "traced": traced}
+            self._page.call("setTimeline", message)
+
+    def answer(self, text: str) -> None:
+        """Send a curve that the tab asks for, `{"name", "first", "last", "columns"}`; nonsense is not answered."""
+        try:
+            asked = json.loads(text)
+            name, numbers = str(asked["name"]), [int(asked[key]) for key in ("first", "last", "columns")]
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+            return
+        found = self._traces.between(name, *numbers)
+        if found is not None:
+            self._page.call("setTrace", {"name": name, **found})
+
+    def _whole(self) -> dict[str, Any]:
+        codes = [number for pair in list(self._codes.items()) for number in pair]
+        ids = list(self._ids) if len(self._ids) <= _MOST_IDS else None
+        sequence = self._session.sequence
+        return {
+            "whole": True,
+            "frames": len(self._ids),
+            "fps": self._fps,
+            "ids": ids,
+            "codes": codes,
+            "solving": self._solving,
+            "traces": self._traces.names,
+            "domains": list(sequence.domains),
+            "cameras": [camera.name for camera in sequence.scene.cameras],
+            "aspects": [camera.width / camera.height for camera in sequence.scene.cameras],
+        }
+
+    def _drafted(self, state: ViewState) -> list[int]:
+        """As `_changed`, of the shown frame alone, while somebody or the optimizer moves it."""
+        self._draft, number = state.index, code(state.project, state.index, self._session.scene)
+        if self._codes.get(state.index, 0) == number:
+            return []
+        self._codes[state.index] = number
+        return [state.index, number]
+
+    def _changed(self, project: ProjectState) -> list[int]:
+        """Frame and code, one after the other, of the frames whose code is another one than before."""
+        draft, self._draft = self._draft, None
+        if project.records is self._records and draft is None:
+            return []
+        before, self._records = self._records, project.records
+        touched = [i for i, record in project.records.items() if i >= 0 and before.get(i) is not record]
+        whole = before.get(-1) is not project.records.get(-1)
+        # What the calibration changes makes figures and verdicts of all frames void.
+        indices = {i for i in project.records if i >= 0} if whole else set(touched)
+        indices |= {i for i in before if i >= 0 and i not in project.records}
+        indices |= set() if draft is None else {draft}
+        self._traces.follow(project, indices)
+        changed: list[int] = []
+        for index in sorted(indices):
+            number = code(project, index, self._session.scene)
+            if self._codes.get(index, 0) != number:
+                self._codes[index] = number
+                changed += [index, number]
+        return changed
+
+
+def code(project: ProjectState, frame: int, scene: Scene) -> int:
+    """Review, verdict, source, whether it is kept, how badly it fits (1 to 255, 0 unknown), and how many joints are not
+    determined (one more than there are, 0 unknown), in bits."""
+    record = project.records.get(frame)
+    if record is None:
+        return 0
+    review = _REVIEWS.index(review_name(project, frame))
+    verdict, figures = project.verdict(frame), project.figures(frame)
+    source = next((number for number, source in enumerate(_SOURCES, start=1) if source in record.sources), 0)
+    dice = None if figures is None else figures.dice
+    badness = 1.0 - dice if dice is not None else None if verdict is None else verdict.failure
+    return (
+        review
+        + 8 * _fit(verdict)
+        + 32 * source
+        + 128 * int(record.is_kept)
+        + 256 * _height(badness)
+        + 65536 * _open(project, frame, scene)
+    )
+
+
+def _open(project: ProjectState, frame: int, scene: Scene) -> int:
+    known = {name: found.standard_deviations or () for name, found in project.joints(frame).items()}
+    joints = undetermined_joints(scene, known)
+    return 0 if joints is None else min(1 + len(joints), _MOST_OPEN)
+
+
+def _fit(verdict: FitVerdict | None) -> int:
+    return 0 if verdict is None else 1 + VERDICTS.index(verdict.verdict)
+
+
+def _height(badness: float | None) -> int:
+    return 0 if badness is None else min(max(round(255 * badness / _FULL), 1), 255)

@@ -1,0 +1,196 @@
+"""Sends states to a tab: pictures and values that changed, as fast as the tab draws."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+from carts_core.model.scene import SceneState
+from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
+from carts_core.project.values import WHOLE_PROJECT
+from carts_viewer.choices import composed, other_pose
+from carts_viewer.panels.inputs import Panel
+from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts
+from carts_viewer.picture.overlay import OverlayRenderer, with_imported
+from carts_viewer.picture.scene_view import SceneView
+from carts_viewer.picture.strokes import Tool
+from carts_viewer.session import Session
+from carts_viewer.state import Maps, ViewState
+from carts_viewer.transport.tab_page import TabPage
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """As many as cameras are shown beside one another; the renderer lets several run at once."""
+    return ThreadPoolExecutor(4, thread_name_prefix="overlay")
+
+
+class PageDisplay:
+    """A tab as the worker sees it; used on the worker's thread."""
+
+    def __init__(
+        self, page: TabPage, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
+    ) -> None:
+        self._page = page
+        self._scene = session.scene
+        self._session = session
+        self._renderer = renderer
+        self._scene_view = scene_view
+        self._panels = panels
+        self._rate_limit = RateLimit()
+        self._shown: ViewState | None = None
+
+    def drawn(self) -> None:
+        """The tab has drawn the newest picture; any thread may say so."""
+        self._rate_limit.drawn(self._page.client.client_id)
+
+    def ready_in(self) -> float:
+        """How long until the page can take another picture [s]; 0 when it can now."""
+        return self._rate_limit.ready_in()
+
+    def show_picture(self, state: ViewState) -> None:
+        """Send frame, overlay and 3D scene, as far as they changed."""
+        old = self._shown
+        camera = self._scene.camera(state.camera)
+        new_frame = old is None or state.frame is not old.frame
+        new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
+        if new_frame or new_pose or old is None or _picture(state) != _picture(old):
+            overlays = self._overlays(state, self._seen(state))
+            # Together, or a new frame would be seen for a moment under the old frame's overlay.
+            with self._page.atomic():
+                if new_frame:
+                    self._scene_view.show_frame(state.frame.images[state.camera], camera)
+                self._scene_view.show_overlay(overlays[state.camera], camera)
+                self._show_others(state, old, overlays)
+            self._page.flush()
+            self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
+            self._rate_limit.sent()
+            # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
+            if new_pose:
+                self._scene_view.show_pose(state.pose.scene, state.camera)
+            if (
+                new_frame
+                or old is None
+                or old.project.records.get(WHOLE_PROJECT) is not state.project.records.get(WHOLE_PROJECT)
+            ):
+                self._scene_view.show_measured(self._session.measured(state.frame))
+        self._shown = state
+
+    def _seen(self, state: ViewState) -> list[str]:
+        """The cameras whose images are shown: those that the frame has, the active one first."""
+        others = [camera.name for camera in self._scene.cameras if camera.name != state.camera]
+        return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
+
+    def _overlays(self, state: ViewState, cameras: list[str]) -> dict[str, Rgba]:
+        """By camera; those of several are rendered at the same time."""
+        if len(cameras) == 1:
+            return {cameras[0]: self._overlay(state, cameras[0])}
+        return dict(zip(cameras, _threads().map(lambda camera: self._overlay(state, camera), cameras), strict=True))
+
+    def _overlay(self, state: ViewState, camera: str) -> Rgba:
+        correction = state.mask_correction_of(camera)
+        truth = state.layer is Layer.TRUTH and not state.streaming
+        frame = with_imported(state.frame, self._scene, state.project) if truth else state.frame
+
+        def at(scene: SceneState, maps: Maps | None) -> Rgba:
+            if state.layer is Layer.IMPORTED and not state.streaming:
+                return self._imported(state, camera)
+            if state.layer is Layer.PARTS:
+                painted = state.part_labels_of(camera)
+                return parts(self._renderer.classes(scene, camera, correction, painted), state.opacity)
+            return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
+
+        overlay, share = at(state.pose.scene, state.maps), state.compare.share
+        if share > 0.0:
+            other = other_pose(state.compare, self._session.measured(state.frame), state.run.start)
+            overlay = composed(overlay, at(other, None), share)
+        _draw_paint(overlay, state, correction, state.ignore_region_of(camera))
+        return overlay
+
+    def _imported(self, state: ViewState, camera: str) -> Rgba:
+        """Masks and keypoints of others."""
+        own = self._scene.camera(camera)
+        layer = state.project.get(Key.imported_mask(state.index, camera))
+        points = state.project.get(Key.imported_keypoints(state.index, camera))
+        labels = None if layer is None else layer.labels()
+        return imported(labels, () if points is None else points.points, (own.height, own.width), state.opacity)
+
+    def _show_others(self, state: ViewState, old: ViewState | None, overlays: Mapping[str, Rgba]) -> None:
+        """The images of the other cameras, as far as they are to be seen."""
+        active = self._scene.camera(state.camera)
+        again = old is None or old.frame is not state.frame or old.camera != state.camera or not old.beside
+        for camera in self._scene.cameras:
+            if camera.name != state.camera and camera.name in overlays:
+                image = state.frame.images[camera.name] if again else None
+                self._scene_view.show_beside(camera, active, image, overlays[camera.name])
+            else:
+                self._scene_view.hide_beside(camera)
+
+    def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
+        """Acknowledge strokes that are in the overlay that was just sent: the tab need not draw them any more."""
+        own = self._page.client.client_id
+        if own in new and old.get(own) != new[own]:
+            self._page.call("painted", new[own])
+
+    def show_panels(self, state: ViewState) -> None:
+        """Bring every widget up to date."""
+        for panel in self._panels:
+            panel.show(state)
+
+
+def _picture(state: ViewState) -> tuple:
+    brush = state.brush
+    painted_kinds = Kind.MASK_CORRECTION, Kind.IGNORE_REGION, Kind.PART_LABELS
+    keys = *painted_kinds, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
+    entries = state.project.records.get(state.index)
+    layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
+    painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted
+    return state.layer, state.opacity, id(state.maps), state.beside, state.compare, painted
+
+
+def _draw_paint(
+    overlay: Rgba, state: ViewState, corrected: MaskCorrection | None, ignored: IgnoreRegion | None
+) -> None:
+    """Draw what was painted, unless somebody wants to see nothing but the frame."""
+    at_work = state.brush.tool is not Tool.OFF
+    if at_work or state.layer is not Layer.NONE:
+        # The comparison with the truth, and the parts, show the corrected mask itself.
+        correction = None if state.layer in (Layer.TRUTH, Layer.PARTS) else corrected
+        paint_over(overlay, correction, ignored, max(state.opacity, 0.4) if at_work else state.opacity)
+
+
+LONGEST_WAIT = 0.08
+"""After this long the next picture is sent whether the last one was drawn or not [s]."""
+_REMEMBERED = 3.0
+
+
+class RateLimit:
+    """Keeps count of what was sent and which tabs have drawn it. Safe to use from several threads."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._sent_at = float("-inf")
+        self._drawn_at: dict[int, float] = {}
+
+    def sent(self) -> None:
+        """A picture has been sent to all tabs."""
+        with self._lock:
+            self._sent_at = self._clock()
+
+    def drawn(self, tab: int) -> None:
+        """A tab has drawn the newest picture."""
+        with self._lock:
+            self._drawn_at[tab] = self._clock()
+
+    def ready_in(self) -> float:
+        """How long until the next picture may be sent [s], 0 when it may now."""
+        with self._lock:
+            now = self._clock()
+            # Only tabs that have lately drawn anything are waited for: the others are hidden or gone.
+            for tab, drawn_at in list(self._drawn_at.items()):
+                if now - drawn_at > _REMEMBERED and self._sent_at > drawn_at:
+                    del self._drawn_at[tab]
+            waiting = not self._drawn_at or any(drawn < self._sent_at for drawn in self._drawn_at.values())
+            return max(0.0, self._sent_at + LONGEST_WAIT - now) if waiting else 0.0

@@ -1,0 +1,266 @@
+"""The 3D scene of the page: the frame and its overlay in front of the lens, and behind them arms and cameras.
+
+viser's world is the shown camera's frame (OpenCV axes), so looking through the endoscope is looking from the origin
+along z, whatever camera is shown; the recording's own world is a node that moves when the camera is changed.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+from viser import transforms
+
+from carts_core.model.camera import Camera
+from carts_core.model.scene import Arm, Scene, SceneState
+from carts_viewer.picture.layers import ARM_COLORS, Rgba
+from carts_viewer.transport.viser_private import image_file
+
+LENS = "/lens"
+"""Lines from the lens to the corners of the frame; hidden like `WORLD`."""
+FRAME = "/frame"
+OVERLAY = "/overlay"
+GRID = "/grid"
+"""Centimetres, in the 3D view."""
+OTHERS = "/others"
+"""Frames and overlays of the other cameras, beside the shown one's; the page's script hides them in the 3D view."""
+WORLD = "/world"
+"""Arms and other cameras; the page's script hides it in the endoscope view, where the frame covers it anyway."""
+_LENS_COLOR = (45, 212, 167)
+_OTHER_COLOR = (150, 160, 165)
+_GHOST, _GHOST_OPACITY = (200, 205, 210), 0.28
+"""Of the arms as they are measured."""
+_AXES = 0.012
+"""Length of the axes of base and tip [m]."""
+_GRID_CELL = 0.01
+"""[m]"""
+Colour = Callable[[Any], tuple[int, int, int]]
+"""A link's own colour -> the one that is shown."""
+_JPEG_QUALITY = 88
+_DEPTH_SHARE = 0.25
+_LEAST_DEPTH = 0.005
+_OVERLAY_SHARE = 0.99
+_SPACING = 1.01
+"""From one image to the next, as a share of an image's size."""
+
+
+class SceneView:
+    """What a tab sees; it chooses for itself from where."""
+
+    def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
+        """
+        Args:
+            shown: Where nodes are added, of all tabs or of one.
+            scene: The recording's arms and cameras.
+            state: A pose of it, which decides how far from the lens the frame is put.
+            camera: The camera to begin with.
+        """
+        self._shown = shown
+        self._scene = scene
+        self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
+        self._links: list[list[viser.FrameHandle]] = []
+        self._outlines: dict[str, viser.LineSegmentsHandle] = {}
+        self._planes: dict[str, tuple[Camera, viser.ImageHandle]] = {}
+        self._others: dict[str, tuple[tuple[Camera, Camera], viser.ImageHandle]] = {}
+        self._world = shown.add_frame(WORLD, show_axes=False)
+        self._measured: list[list[viser.FrameHandle]] = []
+        self._places: dict[str, bytes] = {}
+        self._add_arms()
+        self._add_cameras()
+        self._add_grid()
+
+    def show_frame(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera) -> None:
+        """Put an image of this camera in front of the lens."""
+        self._put(FRAME, image, camera, self._depth, "jpeg")
+
+    def show_overlay(self, picture: Rgba, camera: Camera) -> None:
+        """Put an overlay for this camera's image between the image and the lens."""
+        self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
+
+    def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
+        """Put another camera's image, or its overlay, beside that of the active camera; None: as it is.
+
+        Images lie in a grid in the cameras' order, each as high as the active camera's, whose place is the true one.
+        """
+        names = [own.name for own in self._scene.cameras]
+        place, width, height = self._beside(names.index(camera.name), names.index(active.name), camera, active)
+        root = f"{OTHERS}/{names.index(camera.name)}"
+        for node, picture, share, kind in (("frame", image, 1.0, "jpeg"), ("overlay", overlay, _OVERLAY_SHARE, "png")):
+            name = f"{root}/{node}"
+            if picture is None:
+                continue
+            key = (camera, active)
+            if name in self._others and self._others[name][0] == key:
+                self._others[name][1].image = picture
+                continue
+            handle = self._shown.add_image(
+                name,
+                picture,
+                width * share,
+                height * share,
+                format="jpeg" if kind == "jpeg" else "png",
+                jpeg_quality=_JPEG_QUALITY,
+                position=(share * place[0], share * place[1], share * place[2]),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            self._others[name] = (key, handle)
+
+    def hide_beside(self, camera: Camera) -> None:
+        """Take away what lies beside the active camera's image of this camera."""
+        number = [own.name for own in self._scene.cameras].index(camera.name)
+        for node in ("frame", "overlay"):
+            known = self._others.pop(f"{OTHERS}/{number}/{node}", None)
+            if known is not None:
+                known[1].remove()
+
+    def _beside(
+        self, index: int, active_index: int, camera: Camera, active: Camera
+    ) -> tuple[tuple[float, float, float], float, float]:
+        """Position, width and height of another camera's image [m]."""
+        fx, fy, cx, cy = active.intrinsics
+        z = self._depth
+        cell = active.width / fx * z, active.height / fy * z
+        columns = 2 if len(self._scene.cameras) in (2, 4) else 3
+        right, down = index % columns - active_index % columns, index // columns - active_index // columns
+        centre = (active.width / 2 - cx) / fx * z, (active.height / 2 - cy) / fy * z
+        scale = min(cell[0] / camera.width, cell[1] / camera.height)
+        position = (centre[0] + _SPACING * right * cell[0], centre[1] + _SPACING * down * cell[1], z)
+        return position, scale * camera.width, scale * camera.height
+
+    def sent(self, name: str) -> bytes:
+        """The image file that `FRAME` or `OVERLAY` was last sent as."""
+        return image_file(self._planes[name][1])
+
+    def show_pose(self, state: SceneState, camera: str) -> None:
+        """Move arms and cameras to where they are, seen from this camera."""
+        extrinsics = {
+            own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
+        }
+        if not self._stays(WORLD, camera.encode() + b"".join(T.tobytes() for T in extrinsics.values())):
+            _place(self._world, extrinsics[camera])
+            for name, outline in self._outlines.items():
+                _place(outline, np.linalg.inv(extrinsics[name]))
+                outline.visible = name != camera
+        self._place_arms(self._links, state)
+
+    def show_measured(self, state: SceneState) -> None:
+        """Move the ghosts of the arms to where they are measured."""
+        self._place_arms(self._measured, state)
+
+    def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
+        bases = state.T_world_base.numpy().astype(float)
+        for arm, nodes, T_world_base, joints in zip(self._scene.arms, arms, bases, state.joint_positions, strict=True):
+            if self._stays(nodes[0].name, T_world_base.tobytes() + joints.detach().numpy().tobytes()):
+                continue
+            Ts_base_link = arm.robot.forward_kinematics(joints).detach().numpy().astype(float)
+            for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
+                _place(node, T_world_base @ T_base_link)
+
+    def _stays(self, name: str, place: bytes) -> bool:
+        """Whether what has this name is at this very place already."""
+        before, self._places[name] = self._places.get(name), place
+        return before == place
+
+    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
+        """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
+        if name in self._planes and self._planes[name][0] is camera:
+            self._planes[name][1].image = image
+            return
+        fx, fy, cx, cy = camera.intrinsics
+        handle = self._shown.add_image(
+            name,
+            image,
+            camera.width / fx * z,
+            camera.height / fy * z,
+            format="jpeg" if kind == "jpeg" else "png",
+            jpeg_quality=_JPEG_QUALITY,
+            position=((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._planes[name] = (camera, handle)
+        if name == FRAME:
+            self._outline(LENS, camera, _LENS_COLOR)
+
+    def _outline(self, name: str, camera: Camera, color: tuple[int, int, int]) -> viser.LineSegmentsHandle:
+        """Lines from a lens to the corners of its image at the frame's depth, and around the image."""
+        fx, fy, cx, cy = camera.intrinsics
+        z = self._depth
+        corners = [
+            ((u - cx) / fx * z, (v - cy) / fy * z, z)
+            for u, v in ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))
+        ]
+        edges = [(corner, corners[(number + 1) % 4]) for number, corner in enumerate(corners)]
+        rays = [((0.0, 0.0, 0.0), corner) for corner in corners]
+        return self._shown.add_line_segments(
+            name, np.array([*edges, *rays], np.float32), color, thickness=2.0, thickness_units="screen"
+        )
+
+    def _add_arms(self) -> None:
+        for number, arm in enumerate(self._scene.arms):
+            accent = ARM_COLORS[number % len(ARM_COLORS)]
+            self._links.append(self._add_arm(f"{WORLD}/{number}", arm, lambda own, by=accent: _mixed(own, by), None))
+            self._measured.append(self._add_arm(f"{WORLD}/measured {number}", arm, lambda _: _GHOST, _GHOST_OPACITY))
+            # The axes of the base, and of the tip's link.
+            for link in (0, -1):
+                name = arm.robot.link_names[link]
+                self._shown.add_frame(f"{WORLD}/{number}/{name}/axes", axes_length=_AXES, axes_radius=0.03 * _AXES)
+
+    def _add_arm(self, root: str, arm: Arm, color: Colour, opacity: float | None) -> list[viser.FrameHandle]:
+        """The links of an arm with their meshes."""
+        scene = self._shown
+        links = [scene.add_frame(f"{root}/{name}", show_axes=False) for name in arm.robot.link_names]
+        for part, mesh in enumerate(arm.robot.meshes):
+            scene.add_mesh_simple(
+                f"{root}/{arm.robot.link_names[mesh.link]}/{part}",
+                np.asarray(mesh.vertices, np.float32),
+                np.asarray(mesh.faces, np.uint32),
+                color=color(mesh.color),
+                opacity=opacity,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        return links
+
+    def _add_grid(self) -> None:
+        """A grid of centimetres behind the arms, across the line of vision of the shown camera."""
+        self._shown.add_grid(
+            GRID,
+            width=20 * _GRID_CELL,
+            height=20 * _GRID_CELL,
+            plane="xz",
+            cell_size=_GRID_CELL,
+            cell_color=(96, 104, 110),
+            section_color=(130, 140, 146),
+            section_size=5 * _GRID_CELL,
+            position=(0.0, 6.0 * self._depth, 4.0 * self._depth),
+        )
+
+    def _add_cameras(self) -> None:
+        for camera in self._scene.cameras:
+            node = f"{WORLD}/camera {camera.name}"
+            self._outlines[camera.name] = self._outline(node, camera, _OTHER_COLOR)
+
+
+def _place(node: viser.SceneNodeHandle, T_parent_node: Float[np.ndarray, "4 4"]) -> None:
+    node.wxyz = transforms.SO3.from_matrix(T_parent_node[:3, :3]).wxyz
+    node.position = T_parent_node[:3, 3]
+
+
+def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
+    """Depth of the nearest link in front of the camera [m], or a plausible one."""
+    row = [own.name for own in scene.cameras].index(camera)
+    depths = []
+    for arm, T_world_base, joints in zip(scene.arms, state.T_world_base, state.joint_positions, strict=True):
+        Ts = state.T_view_world[row] @ T_world_base @ arm.robot.forward_kinematics(joints)
+        depths += [float(z) for z in Ts[..., 2, 3] if z > 0.0]
+    return min(depths, default=0.1)
+
+
+def _mixed(color, accent: tuple[int, int, int]) -> tuple[int, int, int]:
+    """A link's own colour with a touch of the arm's, so that arms can be distinguished."""
+    own = np.asarray(color, float)[:3] * 255
+    return tuple(int(value) for value in np.clip(0.75 * own + 0.25 * np.array(accent), 0, 255))  # type: ignore[return-value]

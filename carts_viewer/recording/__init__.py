@@ -1,1 +1,0 @@
-"""New recording: from raw files to a sequence file with a hand-eye calibration, in the page."""

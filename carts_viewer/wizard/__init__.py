@@ -1,0 +1,1 @@
+"""New recording: from raw files to a sequence file with a hand-eye calibration."""

@@ -1,0 +1,344 @@
+"""Calibration over a recording in New recording: the job, its report, and the sequence file with its result."""
+
+import threading
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Rows
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.evaluation.calibration import beyond_prior
+from carts_core.files import name_fault
+from carts_core.model.keypoints import link_transforms
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
+from carts_core.optimization.hand_eye import (
+    HandEyePrior,
+    ImagePoint,
+    PointAgreement,
+    PoseDeviation,
+    agreement_with_points,
+)
+from carts_core.recording import Sequence, spread
+from carts_core.recording.importing.found import FoundRecording, Note
+from carts_core.recording.importing.writing import write_sequence
+from carts_core.settings import CALIBRATION
+from carts_core.settings.optimization import Inference
+from carts_core.wording import counted
+from carts_viewer.start.roots import Roots
+from carts_viewer.wizard.points import Clicking
+
+FRAMES = 20
+"""Frames that take part, spread evenly."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is."""
+
+    text: str
+    """For people."""
+    share: float
+    """Of its stages, in [0, 1]."""
+    scene: Scene | None = None
+    """With the calibration so far."""
+    result: CalibrationResult | None = None
+    """At its end."""
+    error: str = ""
+    """Why it failed, for people; empty if it did not."""
+    ended: bool = False
+
+
+STOPPED = Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+"""The end of a calibration whose result nobody wants."""
+
+
+class CalibrationJob:
+    """One calibration on a thread of its own."""
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        scene: Scene,
+        *,
+        known: HandEyePrior,
+        weights: tuple[Path, ...],
+        device: str,
+        inference: Inference,
+        report: Callable[[Progress], None],
+    ) -> None:
+        """Begin.
+
+        Args:
+            sequence: the recording.
+            scene: its arms and cameras, with the calibration to begin with.
+            known: what that calibration leaves open.
+            weights: weights files.
+            device: where the networks run.
+            inference: who runs the surface network.
+            report: called on the job's thread with every progress, the last one `ended`.
+        """
+        self._sequence, self._scene, self._known = sequence, scene, known
+        self._weights, self._device = weights, device
+        self._inference: Inference = inference
+        self._report = report
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="carts-calibration", daemon=True)
+        self._thread.start()
+
+    def cancel(self) -> None:
+        """Stop soon, without a result."""
+        self._cancelled.set()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was stopped, be it as it ended."""
+        return self._cancelled.is_set()
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait until it has ended.
+
+        Args:
+            timeout: [s]
+        """
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        try:
+            result = self._calibrate()
+        except CartsError as error:
+            self._report(Progress("", 0.0, error=str(error), ended=True))
+        except Exception as error:
+            self._report(Progress("", 0.0, error=f"The calibration failed: {error!r}", ended=True))
+        else:
+            self._report(result)
+
+    def _calibrate(self) -> Progress:
+        self._report(Progress("Loading the networks", 0.0))
+        extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
+        self._report(Progress("Reading images", 0.0))
+        frames = []
+        for index in spread(len(self._sequence), FRAMES):
+            if self.cancelled:
+                return STOPPED
+            frames.append(self._sequence.frame(index))
+        held = [camera.name for camera in self._scene.cameras if camera.name not in self._known.free_cameras]
+        free = replace(CALIBRATION, locked_cameras=tuple(held))
+        optimizer = CalibrationOptimizer(
+            self._scene, frames, extractor, free=free, known_base_frames=self._known.base_covariances
+        )
+        last: CalibrationIterate | None = None
+        for iterate in optimizer:
+            if self.cancelled:
+                return STOPPED
+            last = iterate
+            text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
+            self._report(Progress(text, iterate.stage / iterate.stages, iterate.scene))
+        if last is None:
+            return Progress("", 0.0, error="The calibration made no step.", ended=True)
+        result = optimizer.result()
+        return Progress("Calibrated", 1.0, result.scene, result, ended=True)
+
+
+def as_plain(scene: Scene) -> dict[str, Any]:
+    """A calibration as a draft keeps it."""
+    return {
+        "arms": {arm.name: arm.T_world_base.tolist() for arm in scene.arms},
+        "cameras": {camera.name: camera.T_camera_world.tolist() for camera in scene.cameras},
+        "intrinsics": {camera.name: list(camera.intrinsics) for camera in scene.cameras},
+    }
+
+
+@dataclass(frozen=True)
+class PoseReport:
+    """What became of an arm's pose before a camera."""
+
+    arm: str
+    camera: str
+    turn_deg: float
+    shift_mm: float
+    """At the mean of the tips in the clicked frames [mm]."""
+    deviation: PoseDeviation
+    """Of the new pose."""
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """A calibration that has ended, as a draft keeps it."""
+
+    loss_before: float
+    """Mean over the frames [1]."""
+    loss_after: float
+    verdict: str
+    """good, doubtful or failed; empty without a verdict."""
+    reason: str
+    """Of the verdict, with a remedy; for people."""
+    poses: tuple[PoseReport, ...]
+    before: tuple[float | None, ...]
+    """Residuals of the draft's points [px]; None for points that were not used."""
+    after: tuple[float | None, ...]
+    disagreeing: tuple[int, ...]
+    """Points whose residual has grown beyond what noise explains."""
+    objection: str
+    """Why the points speak against the calibration, for people; empty where they agree."""
+
+
+def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
+    """The figures of a calibration.
+
+    Args:
+        result: of the calibration that began with that of the points.
+        clicking: with the calibration from the points.
+        points: that were clicked.
+
+    Raises:
+        CartsError: the points are of other arms, cameras or frames.
+    """
+    found = clicking.result
+    assert found is not None
+    measured = clicking.sequence.measured
+    compared = agreement_with_points(result.scene, measured, points, found)
+    assessment = result.assessment
+    before, after = (tuple(_number(each) for each in row) for row in (compared.before, compared.after))
+    return CalibrationReport(
+        loss_before=float(np.mean(result.frame_losses_before)),
+        loss_after=float(np.mean(result.frame_losses_after)),
+        verdict="" if assessment is None else assessment.verdict.value,
+        reason="" if assessment is None else f"{assessment.reason} {assessment.remedy}".strip(),
+        poses=_poses(result, clicking, points),
+        before=before,
+        after=after,
+        disagreeing=compared.disagreeing,
+        objection=_objection(result, compared, clicking, points),
+    )
+
+
+def _objection(
+    result: CalibrationResult, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]
+) -> str:
+    """Why the points speak against the calibration; empty where they agree."""
+    before, after, limits = compared.before, compared.after, compared.limits
+    if compared.disagreeing:
+        worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])
+        return (
+            f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than their "
+            f"noise explains: the {_named(clicking, points[worst])} from {before[worst]:.1f} to {after[worst]:.1f} px, "
+            f"with {limits[worst]:.1f} px allowed."
+        )
+    if not compared.agrees:
+        return (
+            "All points together moved farther from the clicks than their noise explains: RMS "
+            f"{compared.rms_before:.1f} to {compared.rms_after:.1f} px, with {compared.rms_limit:.1f} px allowed."
+        )
+    assert clicking.result is not None
+    text = beyond_prior(clicking.scene, result, clicking.result.base_covariances)
+    return "" if text is None else text[0].upper() + text[1:]
+
+
+def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
+    """How far each arm moved before each camera."""
+    frames = sorted({point.frame for point in points})
+    poses = []
+    for (name, camera), deviation in result.deviations.items():
+        arm = clicking.scene.arm(name)
+        middle = link_transforms(arm, clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
+        old, new = (
+            scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base
+            for scene in (clicking.scene, result.scene)
+        )
+        turn = Rotation.from_matrix(new[:3, :3] @ old[:3, :3].T).magnitude()
+        shift = np.linalg.norm((new - old)[:3] @ middle)
+        poses.append(PoseReport(name, camera, float(np.degrees(turn)), 1e3 * float(shift), deviation))
+    return tuple(poses)
+
+
+def _named(clicking: Clicking, point: ImagePoint) -> str:
+    return f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
+    """The scene with base frames, camera poses and intrinsics filled in.
+
+    Raises:
+        SettingsError: the calibration is of other arms or cameras.
+    """
+    try:
+        arms = tuple(replace(arm, T_world_base=np.array(calibration["arms"][arm.name])) for arm in scene.arms)
+        cameras = tuple(
+            replace(
+                camera,
+                T_camera_world=np.array(calibration["cameras"][camera.name]),
+                intrinsics=tuple(float(value) for value in calibration["intrinsics"][camera.name]),
+            )
+            for camera in scene.cameras
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise SettingsError("the calibration is of other arms or cameras. Calibrate again.") from error
+    return replace(scene, arms=arms, cameras=cameras)
+
+
+def calibrated_recording(
+    recording: FoundRecording, before: Scene, calibration: Mapping[str, Any], text: str
+) -> FoundRecording:
+    """The recording with a calibration filled in.
+
+    Args:
+        recording: as found, with stand-ins.
+        before: the scene that it describes.
+        calibration: `as_plain`.
+        text: where the calibration comes from, for people.
+
+    Raises:
+        SettingsError: the calibration is of other arms or cameras.
+    """
+    names = {arm.name for arm in recording.arms}, {camera.name for camera in recording.cameras}
+    if (set(calibration["arms"]), set(calibration["cameras"])) != names:
+        raise SettingsError("the calibration is of other arms or cameras. Calibrate again.")
+    arms = tuple(
+        replace(arm, T_world_base=np.array(calibration["arms"][arm.name]), base_from=text) for arm in recording.arms
+    )
+    cameras = []
+    for camera in recording.cameras:
+        found = tuple(float(value) for value in calibration["intrinsics"][camera.name])
+        placed = replace(camera, T_camera_world=np.array(calibration["cameras"][camera.name]))
+        if not np.allclose(found, before.camera(camera.name).intrinsics, rtol=1e-9, atol=0.0):
+            placed = replace(placed, intrinsics=found, pixel_center=0.5)
+        cameras.append(placed)
+    stale = ("no base frame (hand-eye calibration)",)
+    notes = [note for note in recording.notes if not any(words in note.text for words in stale)]
+    return replace(recording, arms=arms, cameras=tuple(cameras), notes=(*notes, Note("found", f"calibration: {text}.")))
+
+
+def target_folder(roots: Roots, source: Path, name: str) -> Path:
+    """Where the sequence of a recording is written: beside it, or in it where it is an allowed folder itself.
+
+    Raises:
+        SettingsError: the name cannot be part of a path.
+    """
+    if (fault := name_fault(name)) is not None:
+        raise SettingsError(f"the name {name!r} cannot be used, {fault}. Choose another.")
+    parent = source.parent if source not in roots.folders else source
+    folder = roots.checked(parent) / f"{name}_sequence"
+    number = 2
+    while folder.exists() or folder.is_symlink():
+        folder = parent / f"{name}_sequence_{number}"
+        number += 1
+    return folder
+
+
+def write_saved(recording: FoundRecording, folder: Path, name: str) -> Path:
+    """Write the sequence file with its tables; gives the file.
+
+    Raises:
+        CartsError: it cannot be written; nothing is there then.
+    """
+    return write_sequence(replace(recording, name=name), folder)

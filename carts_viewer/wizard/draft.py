@@ -1,0 +1,292 @@
+"""Drafts of New recording: what a user has chosen, kept in a file after each change."""
+
+import json
+import math
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, get_args
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.files import remove_file, write_text
+from carts_core.files.reading import SETTINGS, VALUES, check_path, is_regular, parse_json, read_text, typed
+from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.optimization.hand_eye import ImagePoint
+from carts_core.project.identity import data_dir
+from carts_core.recording.importing.found import recording_name
+from carts_core.settings.interchange import NO_TABLE, AngleUnit, ImportOptions, LengthUnit
+from carts_viewer.wizard.calibration import CalibrationReport
+
+_FORMAT = "carts-draft/1"
+_LONGEST_NAME = 200
+"""Characters."""
+
+
+class Step(StrEnum):
+    """Where in New recording somebody is."""
+
+    FILES = "Files"
+    CHECK = "Check"
+    HAND_EYE = "Hand-eye"
+    SAVE = "Save"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What a person has said. Nothing changes it; a change makes a new one."""
+
+    step: Step = Step.FILES
+    source: str = ""
+    """Folder or file of the recording; empty before it is chosen."""
+    name: str = ""
+    """Of the sequence; by default that of the source."""
+    options: ImportOptions = field(default_factory=ImportOptions)
+    points: tuple[ImagePoint, ...] = ()
+    """In the order in which they were clicked."""
+    focal_length: bool = False
+    """Whether the focal length is solved for, too."""
+    calibration: Mapping[str, Any] | None = None
+    """Base frames, camera poses and intrinsics by arm or camera, as `carts calibrate` found them; None before."""
+    offered: Mapping[str, Any] | None = None
+    """A calibration that clicked points speak against, until it is kept or discarded."""
+    report: CalibrationReport | None = None
+    """Figures of the calibration that is kept or offered."""
+
+    def to_json(self) -> str:
+        """The draft as text."""
+        plain = asdict(self)
+        plain["options"] = {
+            name: _plain(value) for name, value in plain["options"].items() if value not in (None, {}, ())
+        }
+        return json.dumps({"format": _FORMAT, **plain}, indent=1)
+
+    @staticmethod
+    def from_json(text: str) -> "Draft":
+        """The draft of a text.
+
+        Raises:
+            SettingsError: the text is no draft.
+        """
+        try:
+            plain = parse_json(text)
+            if plain.pop("format") != _FORMAT:
+                raise ValueError("it is of another version")
+            draft = typed(plain, Draft)
+            for named in _texts([plain["source"], plain["options"]]):
+                check_path(named)
+            return draft
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
+
+    def uncalibrated(self, **changes: Any) -> "Draft":
+        """The draft with other fields, and without the calibration that does not hold for these."""
+        return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
+
+    def with_options(self, **changes: Any) -> "Draft":
+        """The draft with other options; what was clicked or calibrated before stays."""
+        return replace(self, options=replace(self.options, **changes))
+
+
+@dataclass(frozen=True)
+class DraftSummary:
+    """A draft in a list."""
+
+    key: str
+    name: str
+    changed: float
+    """[s since 1970]"""
+
+
+class DraftFile:
+    """The file of one draft."""
+
+    def __init__(self, key: str | None = None) -> None:
+        """
+        Args:
+            key: of a draft that is there; None for a new one.
+
+        Raises:
+            SettingsError: there is no such draft.
+        """
+        if key is not None and key not in {draft.key for draft in drafts()}:
+            raise SettingsError("this import is not there any more. Begin a new one.")
+        self.key = key or secrets.token_hex(8)
+
+    def read(self) -> Draft:
+        """What it holds; an empty draft before anything was written.
+
+        Raises:
+            SettingsError: it is damaged.
+        """
+        path = _path(self.key)
+        if not is_regular(path):
+            return Draft()
+        try:
+            text = read_text(path, VALUES)
+        except (OSError, ValueError) as error:
+            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and begin anew.") from error
+        return Draft.from_json(text)
+
+    def write(self, draft: Draft) -> None:
+        """Keep a draft; one without a source is not worth it."""
+        if draft.source:
+            write_text(_path(self.key), draft.to_json())
+
+    def delete(self) -> None:
+        """Forget it."""
+        delete_draft(self.key)
+
+
+def drafts() -> list[DraftSummary]:
+    """All drafts, the newest first."""
+    found = []
+    for path in _folder().glob("*.json"):
+        try:
+            plain = parse_json(read_text(path, SETTINGS))
+            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_LONGEST_NAME]
+            found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
+        except (CartsError, OSError, ValueError, AttributeError):
+            found.append(DraftSummary(path.stem, "a damaged import", time.time()))
+    return sorted(found, key=lambda draft: -draft.changed)
+
+
+def delete_draft(key: str) -> None:
+    """Forget a draft, if it is there."""
+    if key in {draft.key for draft in drafts()}:
+        remove_file(_path(key))
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in what JSON gave."""
+    if isinstance(value, str):
+        yield value
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _texts(part)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def _folder() -> Path:
+    return data_dir() / "drafts"
+
+
+def _path(key: str) -> Path:
+    return _folder() / f"{key}.json"
+
+
+_CHOICES = {
+    "angle_unit": get_args(AngleUnit),
+    "length_unit": get_args(LengthUnit),
+    "clock": ("s", "ms", "us", "ns"),
+}
+_NUMBERS = ("time_offset", "frame_rate", "tool_point")
+_MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
+
+
+def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> Draft | None:
+    """The draft after a choice; None if the choice is none of the form's.
+
+    Args:
+        draft: before.
+        name: of the choice, as in `form`.
+        value: what was chosen; "" leaves it to the guess.
+        guessed: joint -> column, as guessed.
+
+    Raises:
+        SettingsError: the value is not possible.
+    """
+    kind, _, which = name.partition(" ")
+    options: dict[str, Any] = {}
+    if name in _CHOICES:
+        if value and value not in _CHOICES[name]:
+            raise SettingsError(f"{name} is {value!r}; allowed is {', '.join(_CHOICES[name])}.")
+        options[name] = value or None
+    elif name in _NUMBERS:
+        options[name] = _number(value)
+    elif kind == "calibration_size" and which:
+        others = {camera: size for camera, size in draft.options.calibration_size.items() if camera != which}
+        given = value.replace(" ", "").replace("×", "x")
+        options[kind] = {**others, which: given} if given else others
+    elif kind == "flip" and which in JOINT_NAMES:
+        without = tuple(joint for joint in draft.options.flip if joint != which)
+        options[kind] = (*without, which) if value == "1" else without
+    elif kind == "unit" and which in (*JOINT_NAMES, "jaw"):
+        rest = {joint: unit for joint, unit in draft.options.units.items() if joint != which}
+        options["units"] = {**rest, which: value} if value else rest
+    elif name == "no-table":
+        options |= {"kinematics": NO_TABLE, "columns": {}, "flip": (), "units": {}}
+    elif kind == "column" and which in _MEANINGS:
+        options["columns"] = _columns(draft, which, value, guessed)
+    elif name == "remove-camera":
+        options["images"] = {camera: place for camera, place in draft.options.images.items() if camera != value}
+    return _new_import(draft.with_options(**options)) if options else None
+
+
+def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Draft:
+    """The draft after a file or folder was picked for one of its parts.
+
+    Args:
+        draft: before.
+        part: "source", "images", "images CAMERA", "calibration CAMERA", "kinematics" or "robot ARM".
+        path: what was picked.
+        found: camera -> where its images were found, which are kept when another camera is added.
+    """
+    kind, _, which = part.partition(" ")
+    options = draft.options
+    match kind:
+        case "source":
+            return replace(Draft(), source=str(path), name=recording_name(path), step=Step.CHECK)
+        case "images":
+            images = options.images or {name: str(place) for name, place in found.items()}
+            return _new_import(draft.with_options(images={**images, which or _new_name(images, path): str(path)}))
+        case "calibration":
+            return _new_import(draft.with_options(calibration={**options.calibration, which: path}))
+        case "kinematics":
+            return _new_import(draft.with_options(kinematics=path, columns={}, flip=(), units={}))
+        case "robot":
+            return _new_import(draft.with_options(robot={**options.robot, which: str(path)}))
+    return draft
+
+
+def _new_import(draft: Draft) -> Draft:
+    """What was calibrated before does not hold for other files; points in images stay."""
+    return draft.uncalibrated()
+
+
+def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -> dict[str, str]:
+    """Chosen columns. The first choice of a joint keeps the others as they were guessed."""
+    chosen = dict(draft.options.columns)
+    joints = which in (*JOINT_NAMES, "jaw")
+    if joints and not any(name in chosen for name in JOINT_NAMES):
+        chosen = {**chosen, **{name: guessed[name] for name in (*JOINT_NAMES, "jaw") if name in guessed}}
+    chosen.pop(which, None)
+    return {**chosen, which: value} if value else chosen
+
+
+def _number(value: str) -> float | None:
+    if not value.strip():
+        return None
+    try:
+        number = float(value.replace(",", "."))
+    except ValueError as error:
+        raise SettingsError(
+            f"{value!r} is no number. Type one, such as 0.12, or nothing to have it guessed."
+        ) from error
+    if not math.isfinite(number):
+        raise SettingsError(f"{value!r} is no finite number.")
+    return number
+
+
+def _new_name(images: Mapping[str, Any], path: Path) -> str:
+    """A name for one more camera: that of its folder, or with a number."""
+    name, number = path.stem, 2
+    while name in images:
+        name, number = f"{path.stem} {number}", number + 1
+    return name

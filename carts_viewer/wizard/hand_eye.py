@@ -1,0 +1,538 @@
+"""The Hand-eye step of New recording: clicked points, calibration, and saving."""
+
+import math
+from collections.abc import Callable
+from collections.abc import Sequence as Rows
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from carts_core.errors import SettingsError
+from carts_core.model.scene import Scene
+from carts_core.optimization import CalibrationResult, StopReason
+from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint, PoseDeviation
+from carts_core.recording import Sequence
+from carts_core.recording.importing.found import FoundRecording
+from carts_core.wording import counted
+from carts_viewer.picture import layers
+from carts_viewer.picture.layers import Rgba
+from carts_viewer.picture.overlay import OverlayRenderer
+from carts_viewer.picture.scene_view import SceneView
+from carts_viewer.start.host import Host
+from carts_viewer.transport.document import button, check_box, choices, escaped, text_field
+from carts_viewer.transport.page import Page
+from carts_viewer.wizard.calibration import (
+    FRAMES,
+    STOPPED,
+    CalibrationJob,
+    Progress,
+    as_plain,
+    calibrated_recording,
+    calibrated_scene,
+    report_of,
+    target_folder,
+    write_saved,
+)
+from carts_viewer.wizard.check import opened
+from carts_viewer.wizard.draft import Draft
+from carts_viewer.wizard.points import Clicking, Wish, unknown_cameras
+
+_GOOD, _WRONG, _EDGE = (250, 204, 21, 255), (239, 68, 68, 255), (0, 0, 0, 255)
+_OPACITY = 0.9
+
+
+class FramePicture:
+    """What lies behind the document at its side."""
+
+    def __init__(self, page: Page, sequence: Sequence) -> None:
+        self._page = page
+        self._sequence = sequence
+        self._renderer = OverlayRenderer(sequence)
+        self._shown: tuple[int, str] | None = None
+        frame = sequence.frame(0)
+        state = sequence.scene.state(frame.measured, mounts=frame.mounts)
+        self._view = SceneView(page.server.scene, sequence.scene, state, sequence.scene.cameras[0].name)
+
+    def show(
+        self,
+        index: int,
+        camera: str,
+        scene: Scene | None,
+        points: Rows[ImagePoint],
+        wrong: frozenset[int],
+    ) -> None:
+        """Show a frame.
+
+        Args:
+            index: of the frame.
+            camera: whose image.
+            scene: with a calibration that is worth showing; None without one.
+            points: all that were clicked.
+            wrong: which of these contradict the others.
+        """
+        frame = self._sequence.frame(index, cameras=[camera])
+        own = self._sequence.scene.camera(camera)
+        if scene is None:
+            picture = layers.nothing(own.height, own.width)
+        else:
+            ids = self._renderer.arm_ids(scene.state(frame.measured, mounts=frame.mounts), camera)
+            picture = layers.contour(ids, _OPACITY)
+        for row, point in enumerate(points):
+            if point.frame == index and point.camera == camera:
+                _cross(picture, point, _WRONG if row in wrong else _GOOD)
+        with self._page.server.atomic():
+            if self._shown != (index, camera):
+                self._view.show_frame(frame.images[camera], own)
+            self._view.show_overlay(picture, own)
+        self._page.server.flush()
+        self._shown = (index, camera)
+
+
+def _cross(picture: Rgba, point: ImagePoint, color: tuple[int, int, int, int]) -> None:
+    size = max(picture.shape[:2]) / 640
+    at = (int(np.floor(point.pixel[0])), int(np.floor(point.pixel[1])))
+    for shade, thickness in ((_EDGE, 3 * size), (color, size)):
+        cv2.drawMarker(picture, at, shade, cv2.MARKER_CROSS, round(11 * size), max(1, round(thickness)))
+
+
+def hand_eye_panel(
+    draft: Draft,
+    clicking: Clicking,
+    wish: Wish | None,
+    progress: Progress | None,
+    problem: str,
+    folder: str,
+    undoable: bool,
+) -> str:
+    """The panel.
+
+    Args:
+        draft: with its points and its calibration.
+        clicking: what is asked for, and what follows from the points.
+        wish: what is to be clicked now.
+        progress: of a calibration that runs or has just ended.
+        problem: what went wrong last; empty if nothing did.
+        folder: where the sequence would be saved.
+        undoable: whether there is something to undo.
+    """
+    running = progress is not None and not progress.ended
+    failed = problem or ("" if progress is None else progress.error)
+    alert = f'<div class="problem" role="alert">{escaped(failed)}</div>' if failed else ""
+    undo = button("undo", "Undo", kind="quiet", disabled=not undoable or running)
+    head = (
+        f'<h1>Hand-eye</h1><div class="bar">{button("back", "← Check", kind="quiet", disabled=running)}{undo}'
+        f"{button('leave', 'All recordings', kind='quiet', disabled=running)}</div>{alert}"
+    )
+    if running:
+        assert progress is not None
+        return head + _running(progress)
+    asked = _asked(clicking, wish, draft.points)
+    parts = [_calibration(draft, clicking), asked, _known(draft, clicking), _refine(draft, clicking, progress)]
+    return head + "".join(parts) + _save(draft, clicking, folder)
+
+
+def _running(progress: Progress) -> str:
+    return (
+        f"<h2>Calibrating over {FRAMES} frames</h2><progress max='1' value='{progress.share:.2f}'></progress>"
+        f"<p>{escaped(progress.text)}</p>{button('cancel', 'Stop')}"
+    )
+
+
+def _calibration(draft: Draft, clicking: Clicking) -> str:
+    """Figures of a calibration, and the choice whether one that the points speak against is kept."""
+    report = draft.report
+    if report is None:
+        return ""
+    verdict = f"<b>{escaped(report.verdict.capitalize())}.</b> " if report.verdict else ""
+    if draft.offered is not None:
+        title = "Calibration not kept"
+        choice = (
+            f'<div class="note guessed">{escaped(report.objection)} The outline shows this calibration. Keep it if '
+            "these clicks are wrong.</div>"
+            f"<div class='bar'>{button('keep', 'Keep anyway')}{button('discard', 'Discard')}</div>"
+        )
+    else:
+        title, choice = "Calibrated", ""
+        if report.objection:
+            choice = f'<div class="note guessed">Kept by choice. {escaped(report.objection)}</div>'
+    poses = "".join(
+        f"<tr><td>{escaped(pose.arm)}, {escaped(pose.camera)}</td><td>{pose.turn_deg:.2f}°</td>"
+        f"<td>{pose.shift_mm:.1f} mm</td></tr>"
+        for pose in report.poses
+    )
+    return (
+        f"<h2>{title}</h2>{choice}<p>{verdict}{escaped(report.reason)}</p>"
+        f"<p>Loss {report.loss_before:.4f} → {report.loss_after:.4f}</p>"
+        f"<table><tr><th></th><th>turn</th><th>shift of the tip</th></tr>{poses}</table>{_residuals(draft, clicking)}"
+    )
+
+
+def _residuals(draft: Draft, clicking: Clicking) -> str:
+    """The residual of each point before and after the calibration."""
+    report = draft.report
+    assert report is not None
+    cameras, arms = clicking.sequence.scene.cameras, clicking.sequence.scene.arms
+    rows = []
+    for row, (point, old, new) in enumerate(zip(draft.points, report.before, report.after, strict=True)):
+        name = point.landmark if len(arms) == 1 else f"{point.arm}: {point.landmark}"
+        place = f"frame {clicking.sequence.frame_ids[point.frame]}" + (f", {point.camera}" if len(cameras) > 1 else "")
+        values = "".join(f"<td>{'–' if value is None else f'{value:.1f}'}</td>" for value in (old, new))
+        wrong = ' class="wrong"' if row in report.disagreeing else ""
+        rows.append(f"<tr{wrong}><td class='name'>{escaped(name)} <small>{escaped(place)}</small></td>{values}</tr>")
+    return (
+        "<details open><summary>Residuals of points [px]</summary>"
+        f"<table><tr><th></th><th>before</th><th>after</th></tr>{''.join(rows)}</table></details>"
+    )
+
+
+def _asked(clicking: Clicking, wish: Wish | None, points: Rows[ImagePoint]) -> str:
+    """What to click now; nothing once there is enough."""
+    if wish is None:
+        return "<h2>Points</h2><p>All points are there. More can be chosen below.</p>" + _other(clicking, wish)
+    arms = f"{wish.arm}: " if len(clicking.sequence.scene.arms) > 1 else ""
+    done = len({(p.camera, p.frame, p.arm, p.landmark) for p in points})
+    frame = clicking.sequence.frame_ids[wish.frame]
+    return (
+        f"<h2>Click the {escaped(arms + wish.landmark)}</h2><p>{escaped(clicking.hint(wish.arm, wish.landmark))}</p>"
+        f'<p class="quiet-text">Camera {escaped(wish.camera)}, frame {escaped(frame)} · '
+        f"{counted(done, 'point')} so far, {len(clicking.plan)} are good. Zoom with the wheel.</p>"
+        f'<div class="bar">{button("skip", "Not visible")}{button("skip-frame", "Other frame")}</div>'
+        f"{_other(clicking, wish)}"
+    )
+
+
+def _other(clicking: Clicking, wish: Wish | None) -> str:
+    """Any camera, frame and landmark."""
+    scene, sequence = clicking.sequence.scene, clicking.sequence
+    at = wish or clicking.plan[-1]
+    cameras = {camera.name: camera.name for camera in scene.cameras}
+    arms = {arm.name: arm.name for arm in scene.arms}
+    frames = {str(index): name for index, name in enumerate(sequence.frame_ids[:2000])}
+    names = {name: name for name in clicking.names(at.arm)}
+    lists = [
+        choices("look camera", cameras, at.camera) if len(cameras) > 1 else "",
+        choices("look frame", frames, str(at.frame)),
+        choices("look arm", arms, at.arm) if len(arms) > 1 else "",
+        choices("look landmark", names, at.landmark),
+    ]
+    return f"<details><summary>Choose what to click</summary><div class='bar'>{''.join(lists)}</div></details>"
+
+
+def _known(draft: Draft, clicking: Clicking) -> str:
+    """How well the arms are known, and which points do not fit."""
+    focal = check_box("focal_length", draft.focal_length, "Find the focal length, too")
+    if clicking.result is None:
+        text = clicking.problem if draft.points else "An outline follows the arm from the fourth point on."
+        return f"<h2>Uncertainty</h2><p>{escaped(text)}</p>{focal}"
+    result, report = clicking.result, draft.report
+    deviations = result.deviations
+    if report is not None:
+        deviations = {(pose.arm, pose.camera): pose.deviation for pose in report.poses}
+    rows = "".join(_deviation(*key, deviation) for key, deviation in deviations.items())
+    lengths = "".join(
+        f"<p>Focal length of {escaped(camera)}: {result.scene.camera(camera).intrinsics[0]:.0f} px "
+        f"± {100 * share:.0f} %</p>"
+        for camera, share in result.focal_deviation.items()
+    )
+    missing = "".join(
+        f"<p>{escaped(arm)} in {escaped(camera)}: {counted(more, 'more point')} needed.</p>"
+        for (arm, camera), more in result.missing.items()
+    )
+    return (
+        f"<h2>Uncertainty</h2><p>{'Of the calibration from points' if report is None else 'Of the new calibration'}; "
+        f"RMS residual of points <b>{_rms(draft, result):.1f} px</b>.</p>"
+        f"<table><tr><th></th><th>sideways</th><th>in depth</th><th>turn</th></tr>{rows}</table>"
+        f"{lengths}{missing}{_wrong(draft, clicking, result)}{focal}"
+    )
+
+
+def _rms(draft: Draft, result: HandEyeResult) -> float:
+    """Of the points that agree with each other [px], after the calibration if there is one."""
+    if draft.report is None:
+        return result.error
+    agreeing = [row for row in range(len(draft.points)) if row not in result.contradicting]
+    values = [value for row in agreeing if (value := draft.report.after[row]) is not None]
+    return math.sqrt(sum(value**2 for value in values) / max(len(values), 1))
+
+
+def _deviation(arm: str, camera: str, deviation: PoseDeviation) -> str:
+    return (
+        f"<tr><td>{escaped(arm)}, {escaped(camera)}</td><td>± {deviation.sideways_mm:.1f} mm</td>"
+        f"<td>± {deviation.depth_mm:.1f} mm</td><td>± {deviation.rotation_deg:.1f}°</td></tr>"
+    )
+
+
+def _wrong(draft: Draft, clicking: Clicking, result: HandEyeResult) -> str:
+    """Points that contradict the others, each with a way to take it back."""
+    parts = []
+    for row in result.contradicting:
+        point = draft.points[row]
+        where = f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
+        parts.append(
+            f'<div class="note">The {escaped(where)} is {result.distances[row]:.0f} px off and hardly counts. '
+            f"{button('remove-point', 'Remove it', str(row), kind='quiet')}</div>"
+        )
+    return "".join(parts)
+
+
+def _refine(draft: Draft, clicking: Clicking, progress: Progress | None) -> str:
+    done = ""
+    if progress is not None and progress.ended and not progress.error:
+        done = f'<div class="note good">{escaped(progress.text)}</div>'
+    elif draft.calibration is not None and draft.report is None:
+        done = '<div class="note good">Calibrated</div>'
+    begin = button("calibrate", "Calibrate", kind="main", disabled=clicking.result is None)
+    return (
+        "<h2>Refine</h2><p>Fits base frames and cameras to what the network sees in 20 frames. Takes a minute or two."
+        f"</p><div class='bar'>{begin}</div>{done}"
+    )
+
+
+def _save(draft: Draft, clicking: Clicking, folder: str) -> str:
+    ready = clicking.result is not None or draft.calibration is not None
+    remark = "" if ready else "<p class='quiet-text'>Without points the arm stays at a stand-in.</p>"
+    if draft.offered is not None:
+        remark = "<p class='quiet-text'>Saves the calibration from the points, since the new one is not kept.</p>"
+    begin = button("save", "Save and open", kind="main" if draft.calibration is not None else "")
+    return (
+        f"<h2>Save</h2><div class='bar'>{text_field('name', draft.name, label='Name')}</div>"
+        f"<p class='quiet-text'>To <code>{escaped(folder)}</code></p>{remark}"
+        f"<div class='bar'>{begin}</div>"
+    )
+
+
+_WIDTH = 340.0
+"""Of the document at the side [px]; `static/document.css` has it, too."""
+
+Report = Callable[[Callable[[Draft], Draft]], None]
+"""Called on the site's thread with what a calibration makes of the draft."""
+
+
+class HandEyeStep:
+    """The recording opened, with what was clicked in it.
+
+    Attributes:
+        problem: what went wrong last, for people; empty if nothing did.
+    """
+
+    def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Report) -> None:
+        """
+        Args:
+            host: where it is shown.
+            recording: as found.
+            draft: with points from before, if there are some.
+            report: called when a calibration ends.
+
+        Raises:
+            CartsError: the recording does not make a sequence.
+        """
+        self._host, self._recording, self._report = host, recording, report
+        self.problem = ""
+        self._sequence, self._folder = opened(recording)
+        self._clicking = Clicking(self._sequence, focal_length=draft.focal_length)
+        self._solved: tuple[object, ...] | None = None
+        self._skipped: frozenset[Wish] = frozenset()
+        self._wanted: Wish | None = None
+        self._job: CalibrationJob | None = None
+        self._progress: Progress | None = None
+        panel = host.page.server.gui.main_panel
+        panel.dock_left()
+        panel.set_width(_WIDTH)
+        self._picture = FramePicture(host.page, self._sequence)
+
+    def close(self) -> None:
+        """Stop a calibration, and take the picture away."""
+        if self._job is not None:
+            self._job.cancel()
+            self._job.join()
+        self._host.page.server.scene.reset()
+        self._folder.cleanup()
+
+    def show(self, draft: Draft, *, undoable: bool) -> None:
+        """Bring picture and panel up to date."""
+        self._solve(draft)
+        wish = self.wish(draft)
+        at = wish or (self._clicking.plan[0] if not draft.points else _wish_of(draft.points[-1]))
+        wrong = frozenset(() if self._clicking.result is None else self._clicking.result.contradicting)
+        self._picture.show(at.frame, at.camera, self.shown_scene(draft), draft.points, wrong)
+        folder = self._target(draft)
+        content = hand_eye_panel(draft, self._clicking, wish, self._progress, self.problem, folder, undoable)
+        self._host.document.show(content, "side")
+
+    def clicked(self, draft: Draft, u: float, v: float) -> Draft:
+        """The draft with what was asked for at this place; a click where nothing is asked for changes nothing."""
+        wish, self.problem = self.wish(draft), ""
+        if wish is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
+            return draft
+        camera = self._sequence.scene.camera(wish.camera)
+        point = ImagePoint(wish.frame, wish.camera, wish.arm, wish.landmark, (u * camera.width, v * camera.height))
+        if self._wanted == wish:
+            self._wanted = None
+        kept = tuple(each for each in draft.points if _wish_of(each) != wish)
+        self._progress = None
+        return draft.uncalibrated(points=(*kept, point))
+
+    def chosen(self, draft: Draft, name: str, value: str) -> Draft:
+        """The draft after a choice in the panel; anything else changes nothing.
+
+        Raises:
+            SettingsError: the choice is not possible now.
+        """
+        self.problem = ""
+        kind, _, which = name.partition(" ")
+        wish = self.wish(draft)
+        if name == "cancel" and self._job is not None:
+            self._job.cancel()
+            if self._running():
+                self._progress = Progress("Stopping …", 1.0)
+        if self._running():
+            return draft
+        if name == "skip" and wish is not None:
+            self._skip({wish})
+        elif name == "skip-frame" and wish is not None:
+            self._skip_frame(draft, wish)
+        elif kind == "look":
+            self._look(wish or self._clicking.plan[-1], which, value)
+        elif name == "calibrate":
+            self._calibrate()
+        else:
+            return self._changed(draft, name, value)
+        return draft
+
+    def _changed(self, draft: Draft, name: str, value: str) -> Draft:
+        """The draft after a choice that changes it."""
+        if name == "focal_length":
+            draft = draft.uncalibrated(focal_length=value == "1")
+        elif name == "name":
+            draft = replace(draft, name=value.strip())
+        elif name == "keep" and draft.offered is not None:
+            draft = replace(draft, calibration=draft.offered, offered=None)
+        elif name == "discard" and draft.offered is not None:
+            draft = draft.uncalibrated()
+        elif name == "remove-point" and value.isdecimal() and int(value) < len(draft.points):
+            row = int(value)
+            self._wanted = _wish_of(draft.points[row])
+            draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
+        return draft
+
+    def write(self, draft: Draft) -> Path:
+        """Write the sequence; gives its file.
+
+        Raises:
+            CartsError: it cannot be written.
+        """
+        if self._running():
+            raise SettingsError("the calibration still runs. Stop it, or wait for it.")
+        folder = target_folder(self._host.roots, Path(draft.source), draft.name)
+        count = len(draft.points)
+        if draft.calibration is not None:
+            text = f"{count} points clicked in carts view, and a calibration over {FRAMES} frames"
+            calibration = draft.calibration
+        elif self._clicking.result is not None:
+            text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)
+        else:
+            return write_saved(self._recording, folder, draft.name)
+        recording = calibrated_recording(self._recording, self._sequence.scene, calibration, text)
+        return write_saved(recording, folder, draft.name)
+
+    def _solve(self, draft: Draft) -> None:
+        wanted = (draft.points, draft.focal_length)
+        if self._solved != wanted:
+            self._clicking.free_focal_length(draft.focal_length)
+            self._clicking.solve(draft.points)
+            self._solved = wanted
+
+    def wish(self, draft: Draft) -> Wish | None:
+        """What is to be clicked now; None if nothing is."""
+        return self._wanted or self._clicking.next_wish(draft.points, self._skipped)
+
+    def _skip(self, wishes: set[Wish]) -> None:
+        self._skipped |= wishes
+        self._wanted = None
+
+    def _skip_frame(self, draft: Draft, wish: Wish) -> None:
+        """Ask for the same in a frame that nothing is asked about yet, next to this one."""
+        used = {(entry.camera, entry.frame) for entry in self._clicking.plan}
+        used |= {(point.camera, point.frame) for point in draft.points}
+        frames = range(len(self._sequence))
+        free = [frame for frame in frames if (wish.camera, frame) not in used]
+        if not free:
+            raise SettingsError("there is no other frame. Use the list below, or leave out what is not visible.")
+        other = min(free, key=lambda frame: abs(frame - wish.frame))
+        self._clicking.move_frame(wish.camera, wish.frame, other)
+        self._wanted = None
+
+    def _look(self, at: Wish, which: str, value: str) -> None:
+        """Ask for what a person has chosen."""
+        names = {
+            "camera": [camera.name for camera in self._sequence.scene.cameras],
+            "frame": [str(index) for index in range(len(self._sequence))],
+            "arm": [arm.name for arm in self._sequence.scene.arms],
+            "landmark": self._clicking.names(at.arm),
+        }
+        if value in names.get(which, ()):
+            wish = replace(at, **{which: int(value) if which == "frame" else value})
+            known = self._clicking.names(wish.arm)
+            self._wanted = wish if wish.landmark in known else replace(wish, landmark=known[0])
+
+    def _running(self) -> bool:
+        return self._progress is not None and not self._progress.ended
+
+    def shown_scene(self, draft: Draft) -> Scene | None:
+        """Arms and cameras as the overlay shows them; None without an overlay."""
+        if self._running() and self._progress is not None and self._progress.scene is not None:
+            return self._progress.scene
+        if (calibration := draft.calibration or draft.offered) is not None:
+            return calibrated_scene(self._sequence.scene, calibration)
+        return None if self._clicking.result is None else self._clicking.result.scene
+
+    def _calibrate(self) -> None:
+        if self._clicking.result is None:
+            raise SettingsError(self._clicking.problem or "Click points first.")
+        self._progress = Progress("Beginning", 0.0)
+
+        def report(progress: Progress) -> None:
+            self._host.post(lambda: self._proceed(progress))
+
+        self._job = CalibrationJob(
+            self._sequence,
+            self._clicking.result.scene,
+            known=HandEyePrior(self._clicking.result.base_covariances, unknown_cameras(self._sequence.scene)),
+            weights=self._host.weights,
+            device=self._host.device,
+            inference=self._host.inference,
+            report=report,
+        )
+
+    def _proceed(self, progress: Progress) -> None:
+        if self._job is not None and self._job.cancelled:
+            if not progress.ended:
+                return
+            # It may have ended before it saw that it was stopped, and still not be wanted.
+            progress = STOPPED if progress.result is not None else progress
+        self._progress = progress
+        self._report(lambda draft: draft if progress.result is None else self._calibrated(draft, progress.result))
+
+    def _calibrated(self, draft: Draft, result: CalibrationResult) -> Draft:
+        """The draft with a calibration that the points agree with, or with the offer of one that they speak against."""
+        report = report_of(result, self._clicking, draft.points)
+        if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
+            text = f"The calibration from your points is as it was, with a loss of {report.loss_before:.4f}."
+            verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
+            self._progress = Progress("", 0.0, error=text + verdict, ended=True)
+            return draft
+        self._progress, found = None, as_plain(result.scene)
+        draft = draft.uncalibrated(report=report)
+        return replace(draft, offered=found) if report.objection else replace(draft, calibration=found)
+
+    def _target(self, draft: Draft) -> str:
+        try:
+            return str(target_folder(self._host.roots, Path(draft.source), draft.name))
+        except SettingsError as error:
+            return str(error)
+
+
+def _wish_of(point: ImagePoint) -> Wish:
+    return Wish(point.camera, point.frame, point.arm, point.landmark)

@@ -1,0 +1,124 @@
+"""Points that are clicked one after the other, and the calibration that follows each of them."""
+
+from collections.abc import Sequence as Rows
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carts_core.errors import CartsError
+from carts_core.model.keypoints import SHAFT_EDGE, TIP, LandmarkKind, landmarks, link_transforms
+from carts_core.model.scene import Scene
+from carts_core.optimization.hand_eye import HandEyeResult, HandEyeSettings, ImagePoint, solve_hand_eye
+from carts_core.recording import Sequence
+
+_FRAMES = 4
+"""In which the first camera is asked about."""
+_FURTHER_FRAMES = 2
+"""In which each other camera is asked about."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a person is asked to click."""
+
+    camera: str
+    frame: int
+    arm: str
+    landmark: str
+
+
+class Clicking:
+    """Which points there are, which are wanted next, and what follows from them.
+
+    Attributes:
+        sequence: the recording, with base frames that mean nothing.
+        plan: all that is asked for, in order.
+        result: where the arms are according to the points; None while there are too few.
+        problem: why there is no result, for people; empty if there is.
+    """
+
+    def __init__(self, sequence: Sequence, *, focal_length: bool = False) -> None:
+        self.sequence = sequence
+        self.plan = _plan(sequence)
+        self.result: HandEyeResult | None = None
+        self.problem = ""
+        self._settings = HandEyeSettings(focal_length=focal_length, free_cameras=unknown_cameras(sequence.scene))
+
+    @property
+    def scene(self) -> Scene:
+        """With what is known of the calibration."""
+        return self.sequence.scene if self.result is None else self.result.scene
+
+    def free_focal_length(self, free: bool) -> None:
+        """Solve for focal lengths, too, or not; takes effect with the next `solve`."""
+        self._settings = replace(self._settings, focal_length=free)
+
+    def next_wish(self, points: Rows[ImagePoint], skipped: frozenset[Wish]) -> Wish | None:
+        """The first that is neither clicked nor skipped; None when there is no more."""
+        done = {Wish(point.camera, point.frame, point.arm, point.landmark) for point in points} | skipped
+        return next((wish for wish in self.plan if wish not in done), None)
+
+    def move_frame(self, camera: str, frame: int, other: int) -> None:
+        """Ask in another frame for what was to be asked for in this one."""
+        self.plan = tuple(
+            replace(wish, frame=other) if (wish.camera, wish.frame) == (camera, frame) else wish for wish in self.plan
+        )
+
+    def solve(self, points: Rows[ImagePoint]) -> None:
+        """Find the calibration that the points show."""
+        self.result, self.problem = None, ""
+        try:
+            self.result = solve_hand_eye(self.sequence.scene, self.sequence.measured, points, self._settings)
+        except CartsError as error:
+            self.problem = str(error)
+
+    def names(self, arm: str) -> tuple[str, ...]:
+        """All landmarks of an arm."""
+        return tuple(landmarks(self.sequence.scene.arm(arm)))
+
+    def hint(self, arm: str, landmark: str) -> str:
+        """Where to find a landmark."""
+        return landmarks(self.sequence.scene.arm(arm))[landmark].hint
+
+
+def unknown_cameras(scene: Scene) -> tuple[str, ...]:
+    """Cameras but the first whose pose relative to it nothing says: it is the very same."""
+    first = scene.cameras[0]
+    return tuple(
+        camera.name for camera in scene.cameras[1:] if np.array_equal(camera.T_camera_world, first.T_camera_world)
+    )
+
+
+def _plan(sequence: Sequence) -> tuple[Wish, ...]:
+    """For each camera some frames in which the arms are far from where they are in the others."""
+    scene = sequence.scene
+    arms = [arm for arm in scene.arms if len(sequence.measured[arm.name])]
+    tips = np.concatenate([link_transforms(arm, sequence.measured[arm.name])[:, -1, :3, 3] for arm in arms], axis=-1)
+    frames = spread_out(tips, _FRAMES)
+    unknown = unknown_cameras(scene)
+    wishes = []
+    for number, camera in enumerate(scene.cameras):
+        if number and camera.name not in unknown:
+            # The first camera says all that there is to know of a calibrated pair.
+            continue
+        chosen = frames if number == 0 else [frames[row] for row in (0, -1)][:_FURTHER_FRAMES]
+        for frame in dict.fromkeys(chosen):
+            wishes += [Wish(camera.name, frame, arm.name, name) for arm in arms for name in _asked(scene, arm.name)]
+    return tuple(wishes)
+
+
+def _asked(scene: Scene, arm: str) -> list[str]:
+    """The landmarks that are asked for: tip, end of the shaft, and an edge of it."""
+    known = landmarks(scene.arm(arm))
+    joints = [name for name, mark in known.items() if mark.kind is LandmarkKind.POINT and name != TIP]
+    return [name for name in (TIP, *joints[-1:], SHAFT_EDGE) if name in known]
+
+
+def spread_out(places: Rows[np.ndarray] | np.ndarray, count: int) -> list[int]:
+    """Rows whose places are far from each other, in order: the most typical one first, then the furthest from all."""
+    points = np.asarray(places, float)
+    chosen = [int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())]
+    while len(chosen) < min(count, len(points)):
+        distances = np.min([np.linalg.norm(points - points[row], axis=1) for row in chosen], axis=0)
+        chosen.append(int(distances.argmax()))
+    return sorted(chosen)

@@ -1,0 +1,296 @@
+"""New recording: choose files, check what was guessed, click points, calibrate, save. Kept after each change."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.model.scene import Scene
+from carts_core.recording import TimeOffsetEstimate
+from carts_core.recording.video import SUFFIXES
+from carts_viewer.start.host import FileBrowser, Host
+from carts_viewer.start.roots import Entry
+from carts_viewer.transport.document import button, escaped
+from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews
+from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
+from carts_viewer.wizard.hand_eye import HandEyeStep
+from carts_viewer.wizard.points import Wish
+
+_SOURCES = (*SUFFIXES, ".bag", ".mcap", ".parquet")
+_TABLES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
+_LENSES = (".yaml", ".yml", ".mat", ".json", ".ini", ".txt")
+_PURPOSES = {
+    "source": ("Choose the folder of the recording: images or videos, and a table of joints.", _SOURCES, True),
+    "images": ("Choose a folder of images, or a video.", SUFFIXES, True),
+    "calibration": ("Choose the camera's calibration (ROS, OpenCV, Kalibr, MATLAB).", _LENSES, False),
+    "kinematics": ("Choose the table of joint positions or tip poses.", _TABLES, False),
+    "robot": ("Choose the URDF of the instrument; carts robot makes one.", (".urdf",), False),
+}
+_MOST_UNDO = 200
+
+
+class RecordingPlace:
+    """A draft, and the page that shows it."""
+
+    def __init__(self, host: Host, key: str | None = None) -> None:
+        self._host = host
+        self._problem = ""
+        self._part = "source"
+        self._browser: FileBrowser | None = None
+        self._undo: list[Draft] = []
+        self._guess: Guess | None = None
+        self._delay: TimeOffsetEstimate | None = None
+        self._pictures: dict[str, list[tuple[str, str]]] = {}
+        self._step: HandEyeStep | None = None
+        try:
+            self._file = DraftFile(key)
+            self._draft = self._file.read()
+        except CartsError as error:
+            self._file, self._draft, self._problem = DraftFile(), Draft(), str(error)
+        if not self._draft.source:
+            self._browse("source")
+
+    @property
+    def draft(self) -> Draft:
+        """What a person has said so far."""
+        return self._draft
+
+    @property
+    def wish(self) -> Wish | None:
+        """What is to be clicked now; None if nothing is."""
+        return None if self._step is None else self._step.wish(self._draft)
+
+    @property
+    def shown_scene(self) -> Scene | None:
+        """Arms and cameras as the overlay shows them; None without an overlay."""
+        return None if self._step is None else self._step.shown_scene(self._draft)
+
+    def show(self) -> None:
+        """Bring the document up to date."""
+        if self._draft.step is Step.HAND_EYE and self._enter_hand_eye():
+            assert self._step is not None
+            try:
+                self._step.show(self._draft, undoable=bool(self._undo))
+                return
+            except (CartsError, LookupError, TypeError, ValueError) as error:
+                self._leave_hand_eye()
+                self._problem = f"The points or the calibration of this import do not fit the recording: {error}"
+                self._change(self._draft.uncalibrated(step=Step.CHECK))
+        self._host.document.show(self._browsing() if self._browser is not None else self._checking())
+
+    def choose(self, name: str, value: str) -> None:
+        """Do what somebody has chosen."""
+        self._problem = ""
+        actions: dict[str, Callable[[], None]] = {
+            "leave": self._host.show_start,
+            "undo": self._take_back,
+            "change": lambda: self._browse(value),
+            "close-browser": lambda: self._set_browser(None),
+            "continue": lambda: self._set(replace(self._draft, step=Step.HAND_EYE)),
+            "back": lambda: self._set(replace(self._draft, step=Step.CHECK)),
+            "delete": self._delete,
+            "estimate-delay": self._estimate_delay,
+            "accept-delay": self._accept_delay,
+        }
+        if name in ("leave", "delete"):
+            return actions[name]()
+        browser = self._browser
+        if name in actions:
+            actions[name]()
+        elif name == "browse" and browser is not None:
+            browser.browse(value)
+        elif name == "pick" and browser is not None:
+            self._pick(browser.picked(value))
+        elif self._step is not None and self._draft.step is Step.HAND_EYE:
+            return self._in_hand_eye(name, value)
+        elif name == "trial":
+            if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
+                self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))
+        elif (draft := changed(self._draft, name, value, self._guessed_columns())) is not None:
+            self._set(draft)
+        self.show()
+
+    def click(self, u: float, v: float) -> None:
+        """A point of the arm, where one is asked for."""
+        if self._step is not None and self._draft.step is Step.HAND_EYE:
+            self._problem = ""
+            self._set(self._step.clicked(self._draft, u, v))
+            self.show()
+
+    def fail(self, error: Exception) -> None:
+        """Show what went wrong."""
+        self._problem = str(error) or type(error).__name__
+        if self._step is not None:
+            self._step.problem = self._problem
+        self.show()
+
+    def close(self) -> None:
+        """Stop what runs; the draft is kept already."""
+        self._leave_hand_eye()
+
+    def _set(self, draft: Draft) -> None:
+        """Go on with another draft; the present one can be gone back to."""
+        if draft == self._draft:
+            return
+        self._undo = [*self._undo, self._draft][-_MOST_UNDO:]
+        self._change(draft)
+
+    def _change(self, draft: Draft) -> None:
+        anew = (draft.source, draft.options) != (self._draft.source, self._draft.options)
+        self._draft = draft
+        if anew:
+            self._guess = self._delay = None
+        if anew or draft.step is not Step.HAND_EYE:
+            self._leave_hand_eye()
+        self._file.write(draft)
+
+    def _take_back(self) -> None:
+        if self._undo:
+            before = self._undo.pop()
+            self._change(before)
+            if not before.source:
+                self._file.delete()
+                self._browse("source")
+
+    def _delete(self) -> None:
+        self._file.delete()
+        self._draft = Draft()
+        self._host.show_start()
+
+    def _set_browser(self, browser: FileBrowser | None) -> None:
+        self._browser = browser
+
+    def _browse(self, part: str) -> None:
+        """Look for a file or folder for a part of the recording."""
+        kind = part.partition(" ")[0]
+        if kind not in _PURPOSES:
+            raise SettingsError("this part of a recording is not known.")
+        purpose, suffixes, folders = _PURPOSES[kind]
+
+        def wanted(entry: Entry) -> bool:
+            return entry.path.suffix.lower() in suffixes
+
+        self._part = part
+        self._browser = FileBrowser(self._host.roots, wanted=wanted, folders=folders, purpose=purpose)
+        if self._draft.source and kind != "source":
+            source = Path(self._draft.source)
+            self._browser.begin_in(source if source.is_dir() else source.parent)
+
+    def _pick(self, path: Path | None) -> None:
+        if path is None:
+            return
+        recording = None if self._guess is None else self._guess.recording
+        found = {} if recording is None else {camera.name: camera.images for camera in recording.cameras}
+        self._set(picked(self._draft, self._part, path, found))
+        self._browser = None
+
+    def _guessed_columns(self) -> dict[str, str]:
+        meanings = None if self._guess is None else self._guess.meanings
+        return {} if meanings is None else next(iter(meanings.arms.values()), {})
+
+    def _browsing(self) -> str:
+        back = (
+            button("close-browser", "← Back", kind="quiet")
+            if self._draft.source
+            else button("leave", "← All recordings", kind="quiet")
+        )
+        assert self._browser is not None
+        head = f"{_steps(Step.FILES)}<h1>New recording</h1><div class='bar'>{back}</div>"
+        return f"{head}{self._alert()}{self._browser.html()}"
+
+    def _checking(self) -> str:
+        found = self._guessed()
+        ready = found.recording is not None and not found.problems
+        go_on = button("continue", "Continue to hand-eye", kind="main", disabled=not ready)
+        bar = "".join(
+            [
+                button("leave", "← All recordings", kind="quiet"),
+                button("change", "Other folder …", "source", kind="quiet"),
+                button("undo", "Undo", kind="quiet", disabled=not self._undo),
+                button("delete", "Delete this import", kind="quiet"),
+                f'<span class="far">{go_on}</span>',
+            ]
+        )
+        recording = found.recording
+        what = "" if recording is None else f"{recording.kind}, {len(recording.frame_ids)} frames"
+        return (
+            f"{_steps(Step.CHECK)}<h1>{escaped(self._draft.name)}</h1><p class='quiet-text'><code>"
+            f"{escaped(self._draft.source)}</code> · {escaped(what)}</p><div class='bar'>{bar}</div>{self._alert()}"
+            f"{check_form(self._draft, found, self._pictures, self._delay)}"
+        )
+
+    def _guessed(self) -> Guess:
+        """What the files hold; read again only when something about them was changed."""
+        if self._guess is None:
+            if not self._pictures:
+                self._host.document.show(f"<h1>{escaped(self._draft.name)}</h1><p>Reading the recording …</p>")
+            self._guess, self._pictures = guess(self._draft), {}
+            if self._guess.recording is not None:
+                with suppress(CartsError):
+                    self._add_pictures(self._guess)
+        return self._guess
+
+    def _estimate_delay(self) -> None:
+        """Compare the motion in images and table."""
+        recording = self._guessed().recording
+        if recording is not None:
+            self._host.document.show("<h1>Time</h1><p>Comparing the motion in the images with the table …</p>")
+            self._delay = estimated_delay(recording)
+
+    def _accept_delay(self) -> None:
+        if self._delay is not None and self._delay.proposed is not None:
+            self._set(changed(self._draft, "time_offset", str(self._delay.proposed), {}) or self._draft)
+
+    def _add_pictures(self, found: Guess) -> None:
+        assert found.recording is not None
+        sequence, folder = opened(found.recording)
+        with folder:
+            for camera in sequence.scene.cameras:
+                images = previews(sequence, camera.name)
+                publish = self._host.page.media.publish
+                self._pictures[camera.name] = [(frame, publish(jpeg)) for frame, jpeg in images]
+
+    def _alert(self) -> str:
+        return f'<div class="problem" role="alert">{escaped(self._problem)}</div>' if self._problem else ""
+
+    def _enter_hand_eye(self) -> bool:
+        """Open the recording for the last step; False, with a problem, if that is not possible."""
+        if self._step is None:
+            found = self._guessed()
+            try:
+                if found.recording is None or found.problems:
+                    raise SettingsError(next(iter(found.problems.values()), "the recording cannot be read."))
+                self._host.document.show("<h1>Hand-eye</h1><p>Opening the images …</p>", "side")
+                self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
+            except CartsError as error:
+                self._problem = str(error)
+                self._change(replace(self._draft, step=Step.CHECK))
+                return False
+        return True
+
+    def _leave_hand_eye(self) -> None:
+        step, self._step = self._step, None
+        if step is not None:
+            step.close()
+
+    def _in_hand_eye(self, name: str, value: str) -> None:
+        assert self._step is not None
+        if name == "save":
+            path = self._step.write(self._draft)
+            self._file.delete()
+            self._host.open_sequence(path)
+            return
+        self._set(self._step.chosen(self._draft, name, value))
+        self.show()
+
+    def _calibrated(self, draft_change: Callable[[Draft], Draft]) -> None:
+        """The calibration has something to say; called on the site's thread."""
+        if self._step is not None and self._draft.step is Step.HAND_EYE:
+            self._set(draft_change(self._draft))
+            self.show()
+
+
+def _steps(now: Step) -> str:
+    entries = "".join(f"<li{' aria-current=step' if step is now else ''}>{step}</li>" for step in Step)
+    return f'<ol class="steps">{entries}</ol>'
