@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..files import remove_file
 from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
-from ..recording import Frame, Sequence
+from ..recording import Sequence
 from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
 from ..stopping import when_stopped
@@ -151,18 +151,17 @@ class Optimizing:
 
     def _origins(self, part: _Part) -> FrameInputs:
         asked, sequence = self._asked, self._sequence
-        starts = Starts(sequence, part.domain, part.cameras, asked.start.perturb_deg, asked.start.seed)
+        seed = (asked.start.seed,) if asked.mode == "sequence" else asked.start.seed
 
-        def load(index: int) -> Frame:
-            frame = sequence.frame(index, part.domain, part.cameras)
-            return replace(frame, measured=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed))
+        def start(index: int) -> dict[str, np.ndarray]:
+            frame = sequence.frame(index, part.domain, cameras=())
+            return start_positions(sequence, frame, asked.start.perturb_deg, seed)
 
         backgrounds = Backgrounds.of(
             sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
         )
-        load = starts.frame if asked.mode == "sequence" else load
         settings = json.dumps(self._settings())
-        return FrameInputs(sequence, part.cameras, self._observer, load, backgrounds.images, settings)
+        return FrameInputs(sequence, part.cameras, part.domain, self._observer, start, backgrounds.images, settings)
 
     def _kept(self, part: _Part) -> str:
         """What there is of a part that was stopped."""

@@ -479,11 +479,13 @@ class Observer:
         """A frame with the masks that are fitted, for cameras that the recording has no mask of."""
         return frame if self.given is None else self.given.filled(frame)
 
-    def inputs(self, frame: "Frame") -> tuple[object, ...]:
-        """What of a frame's masks its result depends on, for a fingerprint."""
+    def mask_inputs(
+        self, sequence: "Sequence", index: int, cameras: Iterable[str], domain: str | None
+    ) -> tuple[object, ...]:
+        """The masks that the result of a frame depends on, for a fingerprint."""
         if self.given is None:
-            return tuple(sorted((frame.masks or {}).items()))
-        return tuple(sorted(what(frame.index).items()) for what in (self.given.masks, self.given.ignored))
+            return tuple((camera, str(sequence.mask_fingerprint(index, camera, domain))) for camera in sorted(cameras))
+        return tuple(sorted(masks(index).items()) for masks in (self.given.masks, self.given.ignored))
 
     def check(
         self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]

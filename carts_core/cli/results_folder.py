@@ -20,7 +20,7 @@ from ..files.reading import TABLE, parse_json, read_bytes, typed
 from ..fingerprints import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
 from ..model.scene import Scene, SceneState
 from ..optimization import Assessment
-from ..recording import Frame, Sequence
+from ..recording import Sequence
 from ..rendering import Renderer
 from ..stopping import finished_first
 from .options import Observer, check_writable
@@ -57,26 +57,28 @@ _CODE = (
 
 
 class FrameInputs:
-    """Fingerprints of what frames are made from, as some cameras see them in a domain.
+    """Fingerprints of the inputs of frames, for some cameras in a domain. No image is decoded.
 
     Args:
-        sequence, cameras: whose frames these are.
-        observer: who says what images show.
-        load: the frame at a position, its `measured` where the optimization starts.
+        sequence, cameras, domain: the frames.
+        observer: source of the observations.
+        start: position of a frame -> arm -> joint positions where the optimization starts [dofs] [rad, m].
         backgrounds: camera name -> mean background that frames are compared with, where there is one.
-        settings: what was asked for, as JSON.
+        settings: the requested settings, as JSON.
     """
 
     def __init__(
         self,
         sequence: Sequence,
         cameras: tuple[str, ...],
+        domain: str | None,
         observer: Observer,
-        load: Callable[[int], Frame],
+        start: Callable[[int], Mapping[str, np.ndarray]],
         backgrounds: Mapping[str, np.ndarray],
         settings: str,
     ) -> None:
-        self._sequence, self._load, self._observer = sequence, load, observer
+        self._sequence, self._cameras, self._domain = sequence, sorted(cameras), domain
+        self._start, self._observer = start, observer
         recorded = [sequence.recorded_camera(name) for name in cameras]
         self._common = {
             "code": code_fingerprint(_CODE),
@@ -96,15 +98,17 @@ class FrameInputs:
         """Of a frame that is corrected alone.
 
         Raises:
-            SequenceError: one of its images cannot be read.
+            SequenceError: one of its images is missing.
         """
-        frame = self._load(index)
-        arms = self._sequence.measured
-        joints = [(name, frame.measured[name], arms[name][index]) for name in sorted(frame.measured)]
-        joints += sorted(frame.mounts.items())
-        images = [(name, frame.images[name]) for name in sorted(frame.images)]
+        sequence, start = self._sequence, self._start(index)
+        joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
+        joints += sorted(sequence.mounts(index).items())
+        images = [(name, sequence.image_fingerprint(index, name, self._domain)) for name in self._cameras]
         origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
-        return origin | ({"masks": fingerprint(self._observer.inputs(frame))} if self._observer.masked else {})
+        if self._observer.masked:
+            masks = self._observer.mask_inputs(sequence, index, self._cameras, self._domain)
+            origin["masks"] = fingerprint(masks)
+        return origin
 
     def of_all(self, indices: Several[int]) -> InputHashes:
         """Of frames that are corrected together: each depends on what all are made from."""
@@ -128,8 +132,8 @@ def changes(before: InputHashes, now: InputHashes) -> str | None:
         # With other frames, these are of other frames too.
         different = [kind for kind in different if kind not in ("joints", "images", "masks")]
     if "calibration" in different:
-        # Images are compared without their distortion, which belongs to the calibration.
-        different = [kind for kind in different if kind not in ("images", "masks", "background")]
+        # Masks and backgrounds are compared without their distortion, which belongs to the calibration.
+        different = [kind for kind in different if kind not in ("masks", "background")]
     if "joints" in different or "images" in different:
         # A background is made from frames.
         different = [kind for kind in different if kind != "background"]

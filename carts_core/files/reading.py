@@ -13,8 +13,9 @@ import stat
 import tomllib
 from dataclasses import dataclass
 from functools import cache
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -85,7 +86,7 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def open_regular(path: Path, kind: Kind) -> BinaryIO:
+def open_regular(path: Path, kind: Kind) -> BufferedReader:
     """A regular file for reading; opening a pipe or a device neither waits nor has an effect.
 
     Raises:

@@ -1,5 +1,6 @@
 """Images that lie in a part of a picture, or inside a ROS bag."""
 
+import hashlib
 import threading
 import weakref
 from collections.abc import Callable
@@ -58,6 +59,10 @@ class Cropped:
                 f"{left + width} x {top + height}. Correct crop = [left, top, width, height] in the sequence file."
             )
         return np.ascontiguousarray(image[top : top + height, left : left + width])
+
+    def fingerprint(self, index: int) -> str:
+        """Of the whole image and the rectangle. Errors as those of the source."""
+        return f"{self.source.fingerprint(index)} {self.crop}"
 
     def remarks(self) -> tuple[str, ...]:
         """Those of the whole images."""
@@ -162,10 +167,23 @@ class BagImages:
         Raises:
             SequenceError: there is none at that time, or it is damaged.
         """
+        return decode_message(self._message(index), self.name(index))
+
+    def fingerprint(self, index: int) -> str:
+        """SHA-256 of the message's fields.
+
+        Raises:
+            SequenceError: there is none at that time.
+        """
+        fields = vars(self._message(index))
+        data = np.asarray(fields.pop("data"), np.uint8).tobytes()
+        return hashlib.sha256(repr(fields).encode() + data).hexdigest()
+
+    def _message(self, index: int) -> Any:
         message = self._bag.message(self.topic, self._times[index])
         if message is None:
             raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
-        return decode_message(message, self.name(index))
+        return message
 
     def remarks(self) -> tuple[str, ...]:
         """None: messages are used as they are."""

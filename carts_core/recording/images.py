@@ -3,6 +3,7 @@
 A file that is cut off is an error and not a half grey image.
 """
 
+import hashlib
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -44,6 +45,10 @@ class ImageSource(Protocol):
         """The image of frame `index` as recorded, RGB."""
         ...
 
+    def fingerprint(self, index: int) -> str:
+        """SHA-256 that changes when the stored image of frame `index` does; nothing is decoded."""
+        ...
+
     def remarks(self) -> tuple[str, ...]:
         """Sentences on what is changed about stored images before they are used: turned, scaled, deinterlaced."""
         ...
@@ -72,6 +77,16 @@ class ImageFiles:
             SequenceError: it is missing, truncated, not an image, or has more bits than the others.
         """
         return read_image(self.files[index], self.bits)
+
+    def fingerprint(self, index: int) -> str:
+        """SHA-256 of the file and of the bits that its values are scaled from.
+
+        Raises:
+            SequenceError: it is missing or cannot be read.
+        """
+        content = read_file(self.files[index])
+        eight_bits = content.startswith(JPEG) or (content.startswith(PNG) and content[24:25] != b"\x10")
+        return hashlib.sha256(content + (b"" if eight_bits else bytes([self.bits()]))).hexdigest()
 
     def bits(self) -> int:
         """Bits of a value; 8 where files have no more."""
@@ -284,15 +299,23 @@ class _Raster:
 
 
 def _decode(path: Path, *, colour: bool) -> _Raster:
+    return _raster(read_file(path), f"image {path}", colour=colour)
+
+
+def read_file(path: Path) -> bytes:
+    """Content of an image file.
+
+    Raises:
+        SequenceError: it is missing or cannot be read.
+    """
     try:
-        content = read_bytes(path, IMAGE)
+        return read_bytes(path, IMAGE)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(
             f"image {path} is missing. Put it back, or correct the path in the sequence file."
         ) from error
     except OSError as error:
         raise SequenceError(f"image {path} cannot be read: {error}.") from error
-    return _raster(content, f"image {path}", colour=colour)
 
 
 def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:

@@ -1,5 +1,6 @@
 """Recordings: frames with images, measured joint positions and, where known, masks and true joint positions."""
 
+import hashlib
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
@@ -15,7 +16,7 @@ from ..model.camera import Camera
 from ..model.scene import Scene
 from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, spread
-from .images import ImageFiles, ImageSource, read_image, read_mask
+from .images import ImageFiles, ImageSource, read_file, read_image, read_mask
 from .matching import TimeMatching
 from .sequence_file import CameraInput, Description, read_description
 
@@ -275,6 +276,21 @@ class Sequence:
         if not isinstance(source, ImageFiles) or any(entry.camera.distortion) or not source.upright(index):
             return None
         return source.files[index]
+
+    def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
+        """Text that changes when the recorded image of a frame does; nothing is decoded, and distortion is not part
+        of it.
+
+        Raises:
+            SequenceError: there is no such domain or camera, or the image is missing.
+        """
+        return self._camera(camera).images[self._domain(domain)].fingerprint(index)
+
+    def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
+        """SHA-256 of the mask file of a frame; None without one. Errors as `image_fingerprint`."""
+        masks = self._camera(camera).masks.get(self._domain(domain))
+        path = None if masks is None else masks[index]
+        return None if path is None else hashlib.sha256(read_file(path)).hexdigest()
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
         """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position.

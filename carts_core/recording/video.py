@@ -1,6 +1,7 @@
 """Video files as images of a camera. Frames are found by presentation time, never by counting while seeking."""
 
 import copy
+import hashlib
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
@@ -26,7 +27,7 @@ from jaxtyping import Float, UInt8
 
 from ..errors import SequenceError
 from ..files.image_size import LARGEST_IMAGE, pixels_problem
-from ..files.reading import MIB, VIDEO, check_regular, is_regular
+from ..files.reading import MIB, VIDEO, check_regular, is_regular, open_regular
 from ..wording import counted
 
 _EXACT = ("mp4", "matroska")
@@ -298,6 +299,19 @@ class Video:
             image = _one_field(frame, bottom=self._bottom_first) if interlaced else _pixels(frame)
             return np.ascontiguousarray(_turned(image, _display_matrix(frame)))
 
+    def fingerprint(self, index: int) -> str:
+        """SHA-256 of the file, with the number of the frame and whether fields are separated.
+
+        Raises:
+            SequenceError: it is missing or cannot be read.
+        """
+        try:
+            status = self.path.stat()
+            content = _file_digest(self.path, status.st_mtime_ns, status.st_size)
+        except OSError as error:
+            raise SequenceError(f"video {self.path} cannot be read: {error}.") from error
+        return f"{content} {self._numbers[index]} {self._deinterlace}"
+
     def remarks(self) -> tuple[str, ...]:
         """What is changed about the frames, by the first of them: turned, deinterlaced, pixels that are not square.
 
@@ -388,6 +402,13 @@ class Video:
         if not self._index.key_frames:
             return enumerate(frames)
         return ((self._number_of[frame.pts], frame) for frame in frames if frame.pts in self._number_of)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _file_digest(path: Path, modified: int, size: int) -> str:
+    del modified, size  # They are part of the key.
+    with open_regular(path, VIDEO) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _pixels(frame: VideoFrame) -> UInt8[np.ndarray, "height width 3"]:

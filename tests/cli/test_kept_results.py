@@ -15,6 +15,7 @@ import trimesh
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import locked_folder
 from carts_core.networks.weights import read_weights, save_weights
+from carts_core.recording.images import ImageFiles
 from carts_core.resources import shipped_robot, shipped_weights
 
 Outcome = Callable[..., str]
@@ -113,6 +114,14 @@ def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(optimize: Out
         assert "3 of 3 frames already there" in optimize(), f"before {change.__name__}"
         change(tmp_path)
         assert printed in optimize(), change.__name__
+    assert "3 of 3 frames already there" in optimize()
+
+
+def test_kept_results_are_recognized_without_decoding_images(
+    optimize: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    optimize()
+    monkeypatch.setattr(ImageFiles, "read", lambda source, index: pytest.fail(f"{source.name(index)} was decoded"))
     assert "3 of 3 frames already there" in optimize()
 
 

@@ -63,6 +63,16 @@ def test_frames_backwards_are_right(video_file):
     assert [number_of(video.read(index)) for index in order] == order
 
 
+def test_a_fingerprint_is_of_the_file_and_the_frame(video_file):
+    video = Video(video_file, tuple(range(FRAMES)))
+    known = video.fingerprint(1)
+    assert known == Video(video_file, (1,)).fingerprint(0) != video.fingerprint(2)
+    content = bytearray(video_file.read_bytes())
+    content[-1] ^= 1
+    video_file.write_bytes(content)
+    assert video.fingerprint(1) != known
+
+
 TIMES = 1500 + np.cumsum(np.random.default_rng(0).choice([20, 40, 90, 200], FRAMES))
 """When the frames of a timed video are shown [ms]: not from 0 on, and not evenly."""
 
