@@ -12,22 +12,22 @@ from ..errors import SequenceError
 from ..model.scene import Scene, SceneState
 
 FRAMES = 30
-"""How many frames, spread evenly over the recording, the estimate looks at."""
+"""Largest number of frames, spread evenly over the recording, of which the background is the median."""
 
 MARGIN = 15 / 640
-"""How far round an arm's silhouette pixels are not trusted, as a share of the image's width."""
+"""Uncertainty margin around the silhouette of an arm, relative to the width of the image."""
 
 _LARGEST_ERROR = 3
-"""Where measured arms are farther away than so many margins, there is none [1]."""
+"""Largest error of measured kinematics, in margins [1]."""
 
 _STAYS = 0.4
-"""Share of an arm's silhouette that is covered throughout a recording, from which it hardly moves [1]."""
+"""Share of an arm's silhouette that is covered in all views, above which the arm counts as immobile [1]."""
 
 _FEWEST = 3
-"""Views that a pixel has to be the median of, for their agreement to say something [1]."""
+"""Smallest number of views whose agreement makes a pixel known [1]."""
 
 _AGREE = 3.0, 4.0
-"""How many times the image's usual deviation views of the empty scene may differ by, and grey levels beside that."""
+"""Largest difference between views of the empty scene: multiple of the image's usual deviation, plus grey levels."""
 
 _COVERED = 256
 _ROWS_AT_ONCE = 64
@@ -35,13 +35,13 @@ _ROWS_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class MeanBackground:
-    """The mean background BG_m of a camera, and how far it is one."""
+    """Mean background BG_m of a camera and the pixels in which it is known."""
 
     image: UInt8[np.ndarray, "height width 3"]
     known: Bool[np.ndarray, "height width"]
-    """Where it certainly shows no arm, measured kinematics being off as they may be."""
+    """Pixels that show no arm, even with the expected error of measured kinematics."""
     problem: str | None = None
-    """Why it cannot say what is there without arms, for people; None where it can."""
+    """Why the background is not reliable, as a sentence; None where it is."""
 
 
 def spread(length: int, count: int = FRAMES) -> list[int]:
@@ -50,7 +50,7 @@ def spread(length: int, count: int = FRAMES) -> list[int]:
 
 
 def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Bool[np.ndarray, "height width"]:
-    """A silhouette with the margin that measured kinematics are off by, or several of them."""
+    """A silhouette dilated by one or several uncertainty margins of measured kinematics."""
     radius = max(1, round(margins * MARGIN * silhouette.shape[1]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return cv2.dilate(silhouette.astype(np.uint8), disc).astype(bool)
@@ -155,7 +155,7 @@ def _middle(values: Int[np.ndarray, "views ..."], count: Int[np.ndarray, "rows c
 def _filled(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """`image` with what is never seen filled in from around it."""
+    """`image` with the pixels that are never seen filled in from their surroundings."""
     # Next to what is always covered the arm itself may show, where it is off by more than the margin.
     rim = widen(hole)
     return fill(image, hole if rim.all() else rim)

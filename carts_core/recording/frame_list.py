@@ -25,7 +25,7 @@ EXAMPLES = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jp
 
 
 class FrameId(str):
-    """A frame's id that a pattern can pad: `{frame}` is the text, `{frame:03d}` its number."""
+    """Id of a frame that a pattern can pad: `{frame}` is the text, `{frame:03d}` its number."""
 
     def __format__(self, spec: str) -> str:
         return format(int(self), spec) if spec.endswith("d") else format(str(self), spec)
@@ -60,7 +60,7 @@ def expand(pattern: str, key: str, **values: object) -> str:
 
 @lru_cache(maxsize=64)
 def _check_format(pattern: str) -> None:
-    """Check that a pattern has nothing but placeholders, padded to a width that a file's name can have.
+    """Check that a pattern has only known placeholders, padded to a width that a file's name can have.
 
     Raises:
         KeyError: a placeholder is unknown, or asks for a part of a value.
@@ -78,19 +78,19 @@ def _check_format(pattern: str) -> None:
 
 
 def is_per_frame(pattern: str) -> bool:
-    """Whether the pattern gives every frame a name of its own."""
+    """Whether the pattern contains the id or index of the frame."""
     return re.search(r"\{(frame|index)\b", pattern) is not None
 
 
 def is_glob(pattern: str) -> bool:
-    """Whether the pattern stands for the sorted files that match it."""
+    """Whether the pattern has wildcards and stands for the sorted files that match it."""
     return "*" in pattern or "?" in pattern
 
 
 _FRAME_ALONE = "{frame}"
-"""The pattern of frames whose cells are their ids."""
+"""Pattern of frames whose cells are their ids."""
 _SHORT = 50
-"""No id of so many digits is too long for a name."""
+"""Number of digits up to which no id is too long for a name."""
 MOST_FRAMES = 1_000_000
 """Longest sequence; nine hours at 30 frames per second."""
 
@@ -101,13 +101,13 @@ class FrameList:
 
     frame_ids: tuple[str, ...]
     timestamps: Float[np.ndarray, " frames"] | None
-    """When each image was taken [s]."""
+    """Acquisition time of each image [s]."""
     video_frames: tuple[int, ...]
     """Number of every frame in its video, from 0."""
     counted: str
-    """How errors say how many there are, say "the kinematics table has 3 rows"."""
+    """Number of frames, as a clause for errors, such as "the kinematics table has 3 rows"."""
     table: Table | None = None
-    """The table whose rows they are; None for all frames of a video."""
+    """Table with a row per frame; None for all frames of a video."""
 
     def __post_init__(self) -> None:
         if len(self.frame_ids) > MOST_FRAMES:
@@ -116,13 +116,13 @@ class FrameList:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Where a table has the frames' ids."""
+    """Column and pattern of the frames' ids in a table."""
 
     column: str
     pattern: str
-    """How a frame is called, from its cell in that column."""
+    """Pattern that makes the id from a cell of the column."""
     asked_by: str
-    """What names the column, for errors."""
+    """Key that names the column, for errors."""
 
     def of(self, table: Table) -> tuple[str, ...]:
         """The id of every row.
@@ -165,7 +165,7 @@ def take_frame_names(section: TomlTable) -> FrameNames:
 
 
 def take_frame_list(section: TomlTable) -> FrameList:
-    """The frames that the `[frames]` table describes: the rows of a table, or all frames of a video.
+    """Frames that the `[frames]` table describes: the rows of a table, or all frames of a video.
 
     Raises:
         SequenceError: the table or video is missing, wrong, or has no times.
@@ -186,7 +186,7 @@ def take_frame_list(section: TomlTable) -> FrameList:
 
 
 def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
-    """A frame per row of a table; takes the key `video_frame`.
+    """One frame per row of a table; takes the key `video_frame`.
 
     Args:
         table: the table.
@@ -244,7 +244,7 @@ def _take_pattern(section: TomlTable) -> str:
 
 
 def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ...]:
-    """The column of a table that says which frames of a video its rows are.
+    """Video frame numbers of the rows, from a column of a table.
 
     Raises:
         SequenceError: there is no such column, or a cell is no whole number from 0.

@@ -1,4 +1,4 @@
-"""Images that lie in a part of a picture, or inside a ROS bag."""
+"""Image sources beside plain files and videos: crops of other sources, and topics of ROS bags."""
 
 import hashlib
 import threading
@@ -20,7 +20,7 @@ from ..imports import needs_extra
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""File names that are taken for ROS bags; a folder with `metadata.yaml` is one, too."""
+"""Suffixes of ROS bags; a folder with `metadata.yaml` is a bag, too."""
 
 _CHANNELS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
 _BAYER = {
@@ -42,7 +42,7 @@ class Cropped:
     """Left, top, width and height [px]."""
 
     def name(self, index: int) -> str:
-        """What errors call the image of frame `index`."""
+        """Name of the image of frame `index`, for errors."""
         return self.source.name(index)
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -61,11 +61,11 @@ class Cropped:
         return np.ascontiguousarray(image[top : top + height, left : left + width])
 
     def fingerprint(self, index: int) -> str:
-        """Of the whole image and the rectangle. Errors as those of the source."""
+        """Fingerprint of the whole image, with the rectangle. Errors as those of the source."""
         return f"{self.source.fingerprint(index)} {self.crop}"
 
     def remarks(self) -> tuple[str, ...]:
-        """Those of the whole images."""
+        """Remarks of the whole images."""
         return self.source.remarks()
 
 
@@ -99,16 +99,17 @@ class Bag:
         self.close()
 
     def rows(self, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
-        """Logs of topics, as `decoders.bags.rows`; errors as when it is opened."""
+        """Logged rows of topics, as `decoders.bags.rows`; errors as of the constructor."""
         return self._call(bags.rows, wanted)
 
     def image_times(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
-        """Record times [ns] and header times [s] of a topic's images; errors as when it is opened."""
+        """Record times [ns] and header times [s] of a topic's images; errors as of the constructor."""
         record, stamps = self._call(bags.image_times, topic)
         return record, stamps
 
     def message(self, topic: str, time: int | None = None) -> Any:
-        """The message that was recorded at a time [ns], or the first one; None without one. Errors as when opened."""
+        """The message recorded at a time [ns], or the first one; None if there is none. Errors as of the
+        constructor."""
         fields = self._call(bags.message, topic, time)
         return None if fields is None else SimpleNamespace(**fields)
 
@@ -128,7 +129,7 @@ class Bag:
 
 
 _SHARED: "weakref.WeakValueDictionary[tuple[Path, int], Bag]" = weakref.WeakValueDictionary()
-"""Bags that cameras use, by path and time of the last change [ns]."""
+"""Open bags by path and modification time [ns], shared between cameras."""
 
 
 def _shared(path: Path) -> Bag:
@@ -158,7 +159,7 @@ class BagImages:
             raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {', '.join(sorted(names))}.")
 
     def name(self, index: int) -> str:
-        """What errors call the image of frame `index`."""
+        """Name of the image of frame `index`, for errors."""
         return f"{self.path}, {self.topic} at {self._times[index]} ns"
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -186,12 +187,12 @@ class BagImages:
         return message
 
     def remarks(self) -> tuple[str, ...]:
-        """None: messages are used as they are."""
+        """No remarks: messages are used as they are."""
         return ()
 
 
 def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:
-    """The pixels of a `sensor_msgs` image message, RGB.
+    """Pixels of a `sensor_msgs` image message, RGB.
 
     Args:
         message: an `Image` or `CompressedImage`.

@@ -1,4 +1,4 @@
-"""Image files and masks: decoded strictly, turned upright, in 8 bits; each change to the stored pixels is stated.
+"""Image files and masks: strict decoding, upright orientation, 8 bits, and remarks on every change to stored pixels.
 
 A file that is cut off is an error and not a half grey image.
 """
@@ -22,23 +22,24 @@ from ..files.reading import IMAGE, open_regular, read_bytes
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 _REMEDY = "Copy or export it again."
 _HEADER = 2**18
-"""Bytes at the beginning of an image that hold its traits."""
+"""Bytes at the beginning of an image that contain its traits."""
 DEPTHS = (8, 10, 12, 14, 16)
-"""Bits of a value that cameras have."""
+"""Bit depths of cameras."""
 _SAMPLED, _SAMPLED_MASKS = 12, 2
-"""Images of a camera in which bits are counted, and masks in which grey borders are looked for, when it is opened."""
+"""Number of images of a camera whose bit depth is measured, and of masks that are checked for grey borders, on
+opening."""
 _NEAR = 16
-"""Values of compressed masks this near to black or white are black or white."""
+"""Distance from black or white within which values of compressed masks count as black or white."""
 _MOST_LABELS = 32
 _ONE_COLOUR = 0.35
-"""How far the colours of one label may be apart, in parts of their brightest channel."""
+"""Largest distance between the colours of one label, relative to their brightest channel."""
 
 
 class ImageSource(Protocol):
-    """Where the images of one camera in one domain come from."""
+    """Source of the images of one camera in one domain."""
 
     def name(self, index: int) -> str:
-        """What errors call the image of frame `index`."""
+        """Name of the image of frame `index`, for errors."""
         ...
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -46,11 +47,11 @@ class ImageSource(Protocol):
         ...
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 that changes when the stored image of frame `index` does; nothing is decoded."""
+        """Text that changes when the stored image of frame `index` does; the image is not decoded."""
         ...
 
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what is changed about stored images before they are used: turned, scaled, deinterlaced."""
+        """Sentences on changes to stored images before they are used: rotation, scaling, deinterlacing."""
         ...
 
 
@@ -79,7 +80,7 @@ class ImageFiles:
         return read_image(self.files[index], self.bits)
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the file and of the bits that its values are scaled from.
+        """SHA-256 of the file and, for images of more than 8 bits, of the bit depth.
 
         Raises:
             SequenceError: it is missing or cannot be read.
@@ -89,13 +90,13 @@ class ImageFiles:
         return hashlib.sha256(content + (b"" if eight_bits else bytes([self.bits()]))).hexdigest()
 
     def bits(self) -> int:
-        """Bits of a value; 8 where files have no more."""
+        """Bit depth of the images; at least 8."""
         if self._counted is None:
             self._counted = bits_of_files(self.files)
         return self._counted
 
     def upright(self, index: int) -> bool:
-        """Whether a file has its pixels as they are used, not turned by EXIF; also where it is missing."""
+        """Whether the stored pixels are used without an EXIF rotation; also True for a missing file."""
         try:
             with open_regular(self.files[index], IMAGE) as stream:
                 return image_traits(stream.read(_HEADER)).orientation == 1
@@ -103,13 +104,13 @@ class ImageFiles:
             return True
 
     def remarks(self) -> tuple[str, ...]:
-        """What is changed about some of the images."""
+        """Remarks on some of the images."""
         bits = () if self._given is not None else bits_remark(self.files)
         return (*image_remarks(spread_files(self.files)), *bits)
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """An image file as RGB, turned as its EXIF orientation says.
+    """An image file as RGB, rotated as its EXIF orientation requires.
 
     Args:
         path: of the file.
@@ -122,7 +123,7 @@ def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.nd
 
 
 def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3"]:
-    """As `read_image`, of an encoded image that lies in another file or came over a network.
+    """As `read_image`, for an encoded image in memory.
 
     Args:
         content: PNG, JPEG, TIFF, BMP, WebP or PPM.
@@ -135,7 +136,7 @@ def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """A mask file: white, or one colour, or opaque on transparent is instrument; half bright (128 of 255) is white.
+    """A mask file: white, one colour, or opaque on transparent is instrument; values from 128 of 255 are white.
 
     Raises:
         SequenceError: the file is missing, truncated, not an image, or has labels instead of black and white.
@@ -168,17 +169,17 @@ class LabelImage:
     """A label image: one value per pixel, a colour per pixel, or a mask."""
 
     mask: Bool[np.ndarray, "height width"] | None
-    """Where it is white; None where it has labels."""
+    """White pixels; None for an image with labels."""
     values: np.ndarray | None
-    """[height, width]: grey values in full depth, or palette indices; None for colours."""
+    """Grey values in full depth, or palette indices [height, width]; None for colours."""
     colours: UInt8[np.ndarray, "height width 3"]
     """RGB"""
     remarks: tuple[str, ...]
-    """What was changed or decided, in words that follow the file's name."""
+    """Changes and decisions, as clauses that follow the file's name."""
 
 
 def read_labels(path: Path) -> LabelImage:
-    """An image of labels or a mask, in full depth.
+    """A label image or mask, in full depth.
 
     Raises:
         SequenceError: it is missing, damaged, or its transparency contradicts its colours.
@@ -202,7 +203,7 @@ def read_labels(path: Path) -> LabelImage:
 
 
 def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
-    """What is changed about some of the mask files; errors are left to those who use them."""
+    """Remarks on some of the mask files; unreadable files are ignored here."""
     found: list[str] = []
     chosen = spread_files([*files], _SAMPLED_MASKS)
     for file in chosen:
@@ -214,7 +215,7 @@ def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
-    """What is changed about images when they are read, by their headers; missing ones are left out."""
+    """Remarks on images, from their headers; missing files are ignored."""
     traits = []
     for file in files:
         try:
@@ -229,7 +230,7 @@ def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
 
 
 def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
-    """What is said of images of 16 bits; nothing for 8."""
+    """Remark on the bit depth of images of 16 bits; empty for 8."""
     if not is_deep(files):
         return ()
     bits = bits_of_files(files)
@@ -252,7 +253,7 @@ def is_deep(files: Sequence[Path]) -> bool:
 
 
 def bits_of_files(files: Sequence[Path]) -> int:
-    """Bits in use of the values of a camera's images, counted in some of them; 8 where files have no more."""
+    """Bit depth in use, measured in some of a camera's images; at least 8."""
     largest = 0
     for file in spread_files(files) if is_deep(files) else ():
         try:
@@ -263,7 +264,7 @@ def bits_of_files(files: Sequence[Path]) -> int:
 
 
 def spread_files(files: Sequence[Path], most: int = _SAMPLED) -> list[Path]:
-    """Some of the files, from the first to the last."""
+    """Evenly spaced files, from the first to the last."""
     if not files:
         return []
     rows = np.unique(np.linspace(0, len(files) - 1, min(most, len(files))).round().astype(int))
@@ -277,9 +278,9 @@ class _Raster:
     pixels: np.ndarray
     """[height, width] or [height, width, 3], RGB, of 8 or 16 bits."""
     opaque: np.ndarray | None
-    """Where it is opaque, for an image that is not so everywhere."""
+    """Opaque pixels; None where all are."""
     indices: np.ndarray | None
-    """Of its palette."""
+    """Palette indices; None without a palette."""
     traits: ImageTraits
 
     @property
@@ -289,7 +290,7 @@ class _Raster:
 
     @property
     def grey(self) -> np.ndarray | None:
-        """The values of an image without colours; None for one with colours."""
+        """Values of an image without colours; None for an image with colours."""
         if self.pixels.ndim == 2:
             return self.pixels
         first = self.pixels[..., :1]
@@ -319,7 +320,7 @@ def read_file(path: Path) -> bytes:
 
 
 def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
-    """The pixels of an encoded image.
+    """Pixels of an encoded image.
 
     Args:
         content: of the file.
@@ -365,7 +366,7 @@ _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: image.swapaxes(0, 1)[::-1, ::-1],
     8: np.rot90,
 }
-"""What turns stored pixels upright, by EXIF's orientation."""
+"""EXIF orientation -> operation that turns stored pixels upright."""
 
 
 def _palette_indices(content: bytes) -> np.ndarray:
@@ -396,7 +397,7 @@ def _eight_bits(
 
 
 def _white_part(raster: _Raster, what: str) -> Bool[np.ndarray, "height width"] | None:
-    """Where a mask is instrument; None for an image of labels."""
+    """Instrument pixels of a mask; None for an image of labels."""
     grey = raster.grey
     brightness = raster.pixels.max(-1) if grey is None else grey
     lit = brightness >= 0.5 * raster.white
@@ -415,7 +416,7 @@ def _white_part(raster: _Raster, what: str) -> Bool[np.ndarray, "height width"] 
 
 
 def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
-    """Whether the areas of an image, without their borders, are black or as bright as it is anywhere."""
+    """Whether the areas of an image, apart from their borders, are either black or of its maximum brightness."""
     top = int(grey.max())
     flat = _flat_values(grey).astype(np.int64)
     noisy = raster.traits.lossy or len(np.unique(grey)) > _MOST_LABELS
@@ -425,13 +426,13 @@ def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
 
 
 def _flat_values(grey: np.ndarray) -> np.ndarray:
-    """The values of the areas of an image: those that a pixel shares with all its neighbours."""
+    """Values of the interior of areas: pixels that are equal to all their neighbours."""
     kernel = np.ones((3, 3), np.uint8)
     return np.unique(grey[cv2.erode(grey, kernel) == cv2.dilate(grey, kernel)])
 
 
 def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
-    """Words on images that are turned."""
+    """Remarks on rotated images."""
     turned = Counter(each.orientation for each in traits if each.orientation != 1)
     return [
         f"{'' if count == len(traits) else f'{count} '}turned as EXIF orientation {orientation} says"
@@ -441,7 +442,7 @@ def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
 
 
 def find_damage(content: bytes) -> str | None:
-    """What is wrong with a JPEG or PNG file, None when it is whole (or of another kind).
+    """Description of the damage of a JPEG or PNG file; None for a whole one and for other kinds.
 
     OpenCV decodes a truncated JPEG without an error and leaves the rest grey, so this looks at the file itself.
     """

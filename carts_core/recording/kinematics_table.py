@@ -28,13 +28,13 @@ MOST_CELLS = 10_000_000
 
 @dataclass(frozen=True)
 class Table:
-    """A CSV file as text; only cells of a column that is asked for are looked at."""
+    """A CSV file as text; cells are parsed when their column is requested."""
 
     path: Path
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
-    """Line of the file in which each row ends, counted from 1."""
+    """Line of the file in which each row ends, from 1."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -71,7 +71,7 @@ class Table:
         return values
 
     def _cells(self, column: str, asked_by: str) -> Iterator[str]:
-        """The cells of a column as they stand in the file."""
+        """Unparsed cells of a column."""
         if column not in self.header:
             raise SequenceError(
                 f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
@@ -81,7 +81,7 @@ class Table:
 
 
 def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
-    """Read a CSV file, which errors call `what`; blank lines are skipped.
+    """Read a CSV file, named `what` in errors; blank lines are skipped.
 
     Raises:
         SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
@@ -114,7 +114,7 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
 
 
 def _filled_rows(reader: Any, path: Path, what: str) -> tuple[list[tuple[str, ...]], list[int]]:
-    """Cells, and number of the last line, of every row that is not empty."""
+    """Cells and last line number of every row that is not empty."""
     rows: list[tuple[str, ...]] = []
     lines: list[int] = []
     cells = 0
@@ -136,17 +136,17 @@ def _number(cell: str) -> float:
 
 
 ANGLE_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
-"""[rad] of one unit; "percent" is not among them, since it counts from the middle of the limits."""
+"""Angle unit -> [rad]. "percent" is not among them, since it depends on the limits."""
 LENGTH_UNITS: Mapping[str, float] = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3}
-"""[m] of one unit."""
+"""Length unit -> [m]."""
 PERCENT = "percent"
-"""Unit of -100 to 100 of the range of a joint."""
+"""Unit whose range of -100 to 100 is the range of the joint."""
 _BEYOND = 0.15
-"""Share of the range of a joint by which positions may exceed its limits."""
+"""Share of a joint's range by which positions may exceed its limits."""
 FAR = 0.5
-"""The same, beyond which a unit is wrong."""
+"""Share of a joint's range beyond which the unit is assumed wrong."""
 _FEW = 0.02
-"""Share of rows that may be beyond, as spikes of an encoder."""
+"""Share of rows that may exceed the limits, such as encoder spikes."""
 
 
 @dataclass(frozen=True)
@@ -161,22 +161,22 @@ class Joint:
 
     @property
     def unit(self) -> str:
-        """Its SI unit."""
+        """SI unit of the joint."""
         return "rad" if self.revolute else "m"
 
     def beyond(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> np.ndarray:
-        """Which positions [rad], [m] exceed the limits by more than a share of their range."""
+        """Positions [rad], [m] that exceed the limits by more than a share of their range."""
         if not np.isfinite([self.lower, self.upper]).all():
             return np.zeros(len(values), bool)
         margin = share * (self.upper - self.lower)
         return (values < self.lower - margin) | (values > self.upper + margin)
 
     def fits(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> bool:
-        """Whether all positions but a few are within the limits."""
+        """Whether nearly all positions are within the limits."""
         return bool(self.beyond(values, share).mean() <= _FEW)
 
     def from_percent(self, values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Positions of -100 to 100 between the limits [rad], [m]."""
+        """Positions [rad], [m] from -100 to 100 percent of the range."""
         return self.lower + (values + 100) / 200 * (self.upper - self.lower)
 
 
@@ -208,17 +208,17 @@ def _joints_of(urdf: Path) -> tuple[Joint, ...]:
 
 @dataclass(frozen=True)
 class Misfit:
-    """A joint whose positions are beyond its limits, and what would bring them within."""
+    """A joint whose positions exceed its limits, with possible remedies."""
 
     joint: Joint
     lowest: float
     """[rad], [m]"""
     highest: float
     remedies: tuple[str, ...] = field(default=())
-    """Each "the other sign", a unit, or another joint's column, for people."""
+    """Possible remedies: "the other sign", a unit, or another joint's column."""
 
     def sentence(self) -> str:
-        """For people."""
+        """Description of the misfit as a sentence."""
         text = (
             f"{self.joint.name} is from {self.lowest:.4g} to {self.highest:.4g} {self.joint.unit}, and the robot's "
             f"limits are {self.joint.lower:.4g} to {self.joint.upper:.4g} {self.joint.unit}"
@@ -229,7 +229,7 @@ class Misfit:
 def misfits(
     joints: Sequence[Joint], values: Float[np.ndarray, "rows joints"], share: float = _BEYOND
 ) -> tuple[Misfit, ...]:
-    """The joints whose positions [rad], [m] are beyond their limits."""
+    """Joints whose positions [rad], [m] exceed their limits."""
     wrong = [index for index, joint in enumerate(joints) if len(values) and not joint.fits(values[:, index], share)]
     order = _other_order(joints, values, wrong)
     return tuple(
@@ -244,7 +244,7 @@ def misfits(
 
 
 def _remedies(joint: Joint, values: np.ndarray) -> tuple[str, ...]:
-    """Units and signs with which positions that were read as SI units fit the limits, so that they still move there."""
+    """Units and signs that bring positions read as SI units within the limits."""
     found = []
     if joint.fits(-values):
         found.append("the other sign")
@@ -255,7 +255,7 @@ def _remedies(joint: Joint, values: np.ndarray) -> tuple[str, ...]:
 
 
 def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> tuple[str, ...]:
-    """Orders of the columns in which all positions fit, where a sign alone does not mend each joint."""
+    """Column orders that bring all positions within the limits, unless changed signs do."""
     if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
         return ()
     names = [joint.name for joint in joints]
@@ -276,7 +276,7 @@ def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) 
 
 
 def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert: Callable[..., np.ndarray]) -> bool:
-    """Whether converted columns are nowhere far beyond the limits; the sign does not count."""
+    """Whether converted columns are, up to their sign, never far beyond the limits."""
     for joint, values in zip(joints, columns, strict=True):
         converted = convert(joint, values)
         if not (joint.fits(converted, FAR) or joint.fits(-converted, FAR)):
@@ -287,12 +287,12 @@ def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert
 _UNITS = {"revolute": (*ANGLE_UNITS, PERCENT), "prismatic": (*LENGTH_UNITS, PERCENT)}
 
 PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
-"""Largest magnitude [rad], [m] of a joint position; more means that the unit was not given."""
+"""Largest plausible joint position [rad], [m]; larger values indicate a wrong unit."""
 
 
 @dataclass(frozen=True)
 class JointColumn:
-    """joint position = column * scale + offset."""
+    """Linear map from a column to a joint: position = column * scale + offset."""
 
     joint: str
     column: str
@@ -302,23 +302,23 @@ class JointColumn:
     """[rad] or [m]"""
     unit: str
     given: bool = False
-    """Whether the file says the unit, so that positions beyond the limits are meant."""
+    """Whether the file states the unit, so that positions beyond the limits are intended."""
 
 
 @dataclass(frozen=True)
 class JointColumns:
-    """How the joint positions of one robot are read from a table."""
+    """Mapping from the columns of a table to the joint positions of a robot."""
 
     robot: Robot
     columns: tuple[JointColumn, ...]
     defaults: Mapping[str, float]
-    """Position [rad], [m] of every joint that the table does not measure."""
+    """Constant position [rad], [m] of every joint that the table does not measure."""
     key: str
-    """How errors call the mapping."""
+    """Name of the mapping, for errors."""
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The joints that have a column, in the robot's order."""
+        """Joints that have a column, in the robot's order."""
         mapped = {column.joint for column in self.columns}
         return tuple(name for name in self.robot.joint_names if name in mapped)
 
@@ -348,7 +348,7 @@ class JointColumns:
         return positions
 
     def _check_limits(self, table: Table, column: JointColumn, index: int, values: np.ndarray) -> None:
-        """See that positions whose unit is not given are not far beyond the limits of the robot.
+        """Check that positions of unstated unit are not far beyond the limits of the robot.
 
         Raises:
             SequenceError: they are, and another unit would fit.
@@ -431,7 +431,7 @@ def _take_column(
 
 
 def _conversion(joint: str, unit: str, robot: Robot) -> tuple[float, float]:
-    """Scale and offset to [rad] or [m]; those of percent are between the limits of the joint."""
+    """Scale and offset to [rad] or [m]; percent refers to the limits of the joint."""
     index = robot.joint_names.index(joint)
     if unit != PERCENT:
         return {**ANGLE_UNITS, **LENGTH_UNITS}[unit], 0.0

@@ -16,19 +16,19 @@ from .toml_table import TomlTable
 
 INTERPOLATIONS = ("linear", "nearest")
 _ROUNDING = 1e-6
-"""Times closer than this are the same [s]."""
+"""Smallest distinguishable time difference [s]."""
 
 
 @dataclass(frozen=True)
 class TimeMatching:
-    """How frames find their joint positions: at the frame's time plus `time_offset` in the table's clock."""
+    """Matching of frames and rows: at the frame's time plus `time_offset` in the table's clock."""
 
     time_offset: float = 0.0
     """Time in the table minus time of the image [s]."""
     interpolation: str = "linear"
     """`linear` between the row before and the row after, or the `nearest` row."""
     max_gap: float = 0.1
-    """How far in time every row that is used may be from where it is used [s]."""
+    """Largest time between a frame and the rows used for it [s]."""
 
 
 def take_matching(section: TomlTable) -> TimeMatching:
@@ -49,27 +49,27 @@ def take_matching(section: TomlTable) -> TimeMatching:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Between which rows of a table each frame lies."""
+    """Rows of a table on both sides of each frame in time."""
 
     before: Int[np.ndarray, " frames"]
     after: Int[np.ndarray, " frames"]
     share: Float[np.ndarray, " frames"]
-    """How far each frame is on the way from the row before to the row after, in [0, 1]."""
+    """Interpolation weight of the row after, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class RowTimes:
-    """Where the rows of a table come from, and when they were logged."""
+    """Origin and times of the rows of a table."""
 
     path: Path
-    """The table, for errors."""
+    """Path of the table, for errors."""
     lines: tuple[int, ...]
-    """Its line of each row, for errors."""
+    """Line of each row in the table, for errors."""
     times: Float[np.ndarray, " rows"] | None
-    """Of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
+    """Time of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
 
     def neighbours(self, frames: FrameList, matching: TimeMatching, what: str) -> Neighbours:
-        """The rows that each frame lies between.
+        """The rows on both sides of each frame in time.
 
         Args:
             frames: with their times.
@@ -119,7 +119,7 @@ class RowTimes:
 
 @dataclass(frozen=True)
 class JointSamples:
-    """Joint positions as a table has them."""
+    """Joint positions of the rows of a table."""
 
     positions: Float[np.ndarray, "rows dofs"]
     """[rad, m]"""
@@ -136,7 +136,7 @@ class JointSamples:
         return (1.0 - share) * self.positions[found.before] + share * self.positions[found.after]
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times dofs"]:
-        """The joint positions at times of the table's clock [rad, m]; NaN before its first and after its last row."""
+        """Joint positions at times of the table's clock [rad, m]; NaN outside its range."""
         assert self.rows.times is not None
         known = self.rows.times
         return np.stack([np.interp(times, known, one, left=np.nan, right=np.nan) for one in self.positions.T], 1)
@@ -144,14 +144,14 @@ class JointSamples:
 
 @dataclass(frozen=True)
 class PoseSamples:
-    """Poses of a camera's mount as a table has them."""
+    """Poses of a camera's mount of the rows of a table."""
 
     Ts_world_mount: Float[np.ndarray, "rows 4 4"]
     """[m]"""
     rows: RowTimes
 
     def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames 4 4"]:
-        """T_world_mount of every frame [m]: places between rows linearly, rotations about a fixed axis.
+        """T_world_mount of every frame [m]; positions are interpolated linearly, rotations spherically.
 
         Raises:
             SequenceError: a frame has no row near enough in time.
@@ -161,7 +161,7 @@ class PoseSamples:
         return self._between(found.before + found.share * (found.after - found.before))
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4 4"]:
-        """T_world_mount at times of the table's clock [m]; NaN before its first and after its last row."""
+        """T_world_mount at times of the table's clock [m]; NaN outside its range."""
         assert self.rows.times is not None
         numbers = np.arange(len(self.rows.times), dtype=np.float64)
         places = np.interp(times, self.rows.times, numbers, left=np.nan, right=np.nan)
@@ -170,7 +170,7 @@ class PoseSamples:
         return Ts
 
     def _between(self, places: Float[np.ndarray, " places"]) -> Float[np.ndarray, "places 4 4"]:
-        """Poses at places among the rows, numbered from 0."""
+        """Poses at fractional row numbers, from 0."""
         if len(self.Ts_world_mount) == 1:
             return np.tile(self.Ts_world_mount, (len(places), 1, 1))
         rows, points = np.arange(len(self.Ts_world_mount)), self.Ts_world_mount[:, :3, 3]
@@ -202,16 +202,16 @@ class Rows:
 
     frames: FrameList
     matching: TimeMatching | None
-    """How rows are matched with frames by time; None where every row is a frame."""
+    """Matching of rows and frames by time; None where every row is a frame."""
     table: Table
     """Measured joint positions."""
     truth: Path | None
     """Table of true joint positions."""
     delimiter: str
     names: FrameNames | None
-    """Where tables have the frames' ids; None where rows are matched by time."""
+    """Column and pattern of the frames' ids; None where rows are matched by time."""
     timestamp: str
-    """Column with a row's time; empty without one."""
+    """Column with the time of a row; empty without one."""
 
     def measured_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples:
         """The measured joint positions of an arm, from its own `table` or that of the sequence.
@@ -244,7 +244,7 @@ class Rows:
         return table
 
     def times_of(self, table: Table) -> RowTimes:
-        """When the rows of a table were logged.
+        """Times of the rows of a table.
 
         Raises:
             SequenceError: there is no such column, or the times do not increase.
@@ -257,7 +257,7 @@ class Rows:
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
-    """The rows that the `[kinematics]` table describes.
+    """Read the tables that `[kinematics]` and `[frames]` describe.
 
     Args:
         section: `[kinematics]`.
@@ -309,9 +309,9 @@ POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 
 _UNITS = {"m": 1.0, "mm": 1e-3}
 _NORM_TOLERANCE = 0.01
-"""How far the length of a quaternion may be from 1."""
+"""Largest deviation of a quaternion's norm from 1."""
 _FARTHEST = 100.0
-"""[m]"""
+"""Largest distance of the mount from the origin [m]."""
 
 
 def take_camera_motion(table: TomlTable, rows: Rows) -> PoseSamples | None:
@@ -365,7 +365,7 @@ def _numbers(section: TomlTable, key: str, table: Table, columns: list, count: i
 
 
 def _check_joints(section: TomlTable, table: Table, columns: list[str]) -> None:
-    """Joints of the ECM are in rad and m; other units give impossible values."""
+    """Check that joints of the ECM are plausible in rad and m."""
     for column, joint in zip(columns, JOINT_NAMES, strict=True):
         kind = "prismatic" if joint == "insertion" else "revolute"
         largest = np.abs(table.numbers(column, section.name("ecm_joints"))).max()

@@ -22,7 +22,7 @@ from .sequence_file import CameraInput, Description, read_description
 
 
 class ByteCache:
-    """Least recently used arrays go first. Safe to use from several threads; what one makes, others wait for.
+    """Least-recently-used cache of arrays with a limit in bytes; thread-safe, and each array is computed only once.
 
     Args:
         limit: memory [bytes]; a single array may be larger.
@@ -36,7 +36,7 @@ class ByteCache:
         self._changed = threading.Condition()
 
     def get(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array under `key`, made when it is not there.
+        """The array of `key`, computed by `make` if it is not cached.
 
         Raises:
             Exception: what `make` raises. Nothing is kept then, and whoever waited for it calls their own `make`.
@@ -58,7 +58,7 @@ class ByteCache:
         return array
 
     def clear(self) -> None:
-        """Keep none of them any longer."""
+        """Remove all arrays."""
         with self._changed:
             self._arrays.clear()
             self._used = 0
@@ -80,12 +80,12 @@ CACHE_BYTES = 192 * 2**20
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a sequence in one domain. The arrays are the receiver's own copies."""
+    """One time step of a sequence in one domain. The arrays are copies."""
 
     index: int
     """0-based position in the sequence."""
     frame_id: str
-    """The row's own name, say "001"."""
+    """Id of the frame, such as "001"."""
     domain: str
     images: dict[str, UInt8[np.ndarray, "height width 3"]]
     """Camera -> RGB image, undistorted."""
@@ -103,7 +103,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Logged:
-    """What the tables say at times of their own clock; NaN before their first and after their last row."""
+    """Logged values at times of the tables' clock; NaN outside their range."""
 
     joints: dict[str, Float[np.ndarray, "times dofs"]]
     """Arm -> joint positions [rad, m]."""
@@ -112,7 +112,7 @@ class Logged:
 
 
 class Sequence:
-    """A recording that a sequence file describes. Made by `Sequence.open`; safe to use from several threads.
+    """A recording described by a sequence file. Made by `Sequence.open`; thread-safe.
 
     Attributes:
         path: the sequence file.
@@ -152,7 +152,7 @@ class Sequence:
 
     @staticmethod
     def open(path: Path | str, *, progress: Callable[[str], None] | None = None) -> "Sequence":
-        """Read a sequence file (`docs/reference/sequence_format.md`); images are decoded later, when asked for.
+        """Read a sequence file (`docs/reference/sequence_format.md`); images are decoded on demand.
 
         Args:
             path: the TOML file.
@@ -166,7 +166,7 @@ class Sequence:
         return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
-        """The same images with the joint positions of another time; the sequence file stays as it is.
+        """The same images with joint positions at another time offset; the sequence file is not changed.
 
         Args:
             time_offset: what to add to an image's time for the time in the kinematics tables [s].
@@ -233,7 +233,7 @@ class Sequence:
         return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Logged:
-        """What the tables have at times of their own clock [s].
+        """Logged values at times of the tables' clock [s].
 
         Raises:
             SequenceError: rows are not matched by time.
@@ -244,7 +244,7 @@ class Sequence:
         return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
 
     def checked_matching(self) -> TimeMatching:
-        """How joint positions are matched with frames by time.
+        """Matching of frames and rows by time.
 
         Raises:
             SequenceError: they are not.
@@ -257,7 +257,7 @@ class Sequence:
         return self.matching
 
     def recorded_camera(self, name: str) -> Camera:
-        """A camera as its images were recorded, with their distortion; `scene` has it without.
+        """A camera with the distortion of its recorded images; `scene` has it without.
 
         Raises:
             SequenceError: there is no such camera.
@@ -265,11 +265,11 @@ class Sequence:
         return self._camera(name).camera
 
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
-        """Where a camera's images come from, as recorded; nothing is kept. Errors as `has_masks`."""
+        """Source of a camera's recorded images; not cached. Errors as `has_masks`."""
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
-        """The file whose pixels are those of a frame's image; None where the image is undistorted, cropped, turned or
+        """The file with exactly the pixels of a frame's image; None where the image is undistorted, cropped, turned or
         decoded from a video or a bag. Errors as `has_masks`."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
@@ -278,8 +278,8 @@ class Sequence:
         return source.files[index]
 
     def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
-        """Text that changes when the recorded image of a frame does; nothing is decoded, and distortion is not part
-        of it.
+        """Text that changes with the recorded image of a frame. The image is not decoded, and its distortion does not
+        count.
 
         Raises:
             SequenceError: there is no such domain or camera, or the image is missing.
@@ -302,7 +302,7 @@ class Sequence:
         return masks is not None and (index is None or masks[index] is not None)
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
-        """The mean background BG_m: what the camera sees where no arm is, RGB, undistorted.
+        """Mean background BG_m: the undistorted view of the camera without arms, RGB.
 
         It is the image that the sequence file names, else the median over the recording of what the arms, as measured,
         do not cover. The first call may take seconds.
@@ -313,11 +313,11 @@ class Sequence:
         return self.mean_background(camera, domain).image.copy()
 
     def forget_images(self) -> None:
-        """Drop the decoded images and masks that are kept for the next time."""
+        """Remove decoded images and masks from the cache."""
         self._cache.clear()
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The same with where it is known, and whether it tells what is there without arms; errors as `background`."""
+        """The background with its known pixels and reliability; errors as `background`."""
         domain = self._domain(domain)
         with self._background_lock:
             if (camera, domain) not in self._backgrounds:
@@ -399,13 +399,13 @@ class Sequence:
 
 
 AHEAD = 8
-"""At most this many frames are read in advance."""
+"""Number of frames to prefetch."""
 LONGEST_STRIDE = 10
-"""Going further than this many frames at once is a jump, which says nothing about the next one."""
+"""Largest step between frames from which a direction is inferred."""
 
 
 class FrameReader:
-    """Reads frames, and on a thread of its own the neighbours in the direction of travel into the sequence's cache.
+    """Reads frames and prefetches their neighbours in the direction of travel into the sequence's cache, on a thread.
 
     Asking for another frame makes what was planned void. An error in a frame that nobody has asked for yet is dropped;
     who asks for it reads it again and gets the error. The thread lives while there is something to read.
@@ -436,7 +436,7 @@ class FrameReader:
         return frame
 
     def close(self) -> None:
-        """Stop reading in advance and wait for the thread; `frame` still works."""
+        """Stop prefetching and wait for the thread; `frame` still works."""
         with self._lock:
             self._closed = True
             self._plan.clear()
@@ -445,7 +445,7 @@ class FrameReader:
             thread.join()
 
     def _neighbours(self, index: int, cameras: Collection[str]) -> list[int]:
-        """Numbers of the frames that will probably be asked for next, the likeliest first."""
+        """Numbers of the frames to prefetch, the most probable first."""
         sizes = [own.width * own.height for own in self._sequence.scene.cameras if own.name in cameras]
         # An image, a mask; and no more than half of the cache, or they would push out what was seen last.
         ahead = min(AHEAD, CACHE_BYTES // 2 // max(4 * sum(sizes), 1))

@@ -76,7 +76,7 @@ def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
 
 
 def take_camera(table: TomlTable) -> Camera:
-    """The camera that one `[[cameras]]` table describes.
+    """The camera that a `[[cameras]]` table describes.
 
     Raises:
         SequenceError: a value is missing or impossible.
@@ -136,7 +136,7 @@ def _is_number(value: object) -> bool:
 
 
 def resolve_robot(table: TomlTable) -> Path:
-    """The URDF that the key `robot` names: a path, or `builtin:NAME`.
+    """URDF that the key `robot` names: a path, or `builtin:NAME`.
 
     Raises:
         SequenceError: no robot of that name is built in.
@@ -152,18 +152,18 @@ def resolve_robot(table: TomlTable) -> Path:
 
 @dataclass(frozen=True)
 class CameraInput:
-    """A camera and the files that belong to it, by domain."""
+    """A camera with its images, masks and backgrounds by domain."""
 
     camera: Camera
     images: Mapping[str, ImageSource]
     masks: Mapping[str, tuple[Path | None, ...]]
-    """Mask file of every frame, None for a frame that has none; empty when the sequence has no masks."""
+    """Mask file of every frame, None for a frame without one; empty for a sequence without masks."""
     background: Mapping[str, Path]
     motion: PoseSamples | None
-    """Of what carries it; None for a camera that stays."""
+    """Poses of the camera's mount; None for a static camera."""
 
     def remarks(self) -> tuple[str, ...]:
-        """What is changed about images and masks before they are used, and what is unusual about the calibration."""
+        """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
         camera = self.camera
         files = {file: None for domain in self.masks.values() for file in domain if file is not None}
         found = [text for source in self.images.values() for text in _remarks_of(source)]
@@ -174,7 +174,7 @@ class CameraInput:
 
 
 def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
-    """The camera that one `[[cameras]]` table describes, every file of it present.
+    """The camera that a `[[cameras]]` table describes; all its files are checked to exist.
 
     Raises:
         SequenceError: a value is missing or wrong, or a file is missing.
@@ -210,7 +210,7 @@ def _remarks_of(source: ImageSource) -> tuple[str, ...]:
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
-    """Pattern of every domain: text is for all domains, a table names them one by one."""
+    """Domain -> pattern: text holds for all domains, a table names them one by one."""
     value = table.take(key, (str, dict)) if required else table.take(key, (str, dict), {})
     if isinstance(value, str):
         if required and len(domains) > 1 and "{domain" not in value:
@@ -300,7 +300,7 @@ FORMAT = "carts-sequence/1"
 """Value of the key `format`."""
 
 _BRIGHTEST = 1e3
-"""Largest value of the keys of `[light]` that are numbers."""
+"""Largest value of the numeric keys of `[light]`."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ class ArmInput:
 
 @dataclass(frozen=True)
 class Description:
-    """A sequence file, read and checked."""
+    """Checked content of a sequence file."""
 
     path: Path
     name: str
@@ -323,11 +323,11 @@ class Description:
     domains: tuple[str, ...]
     frames: FrameList
     matching: TimeMatching | None
-    """How joint positions are matched with frames by time; None where every row of the tables is a frame."""
+    """Matching of rows and frames by time; None where every row of the tables is a frame."""
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
     remarks: tuple[str, ...] = ()
-    """What is changed about images and masks before they are used, and what is unusual about calibrations."""
+    """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
 
     def at_frames(self, samples: JointSamples) -> Float[np.ndarray, "frames dofs"]:
         """The joint positions of every frame [rad, m].
@@ -352,7 +352,7 @@ class Description:
 
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
-    """Read a sequence file and everything that it points at, images excepted.
+    """Read a sequence file and all files that it names, except images.
 
     Args:
         path: the TOML file.
@@ -445,7 +445,7 @@ def _take_arm(
 def calibrated_sequence_file(
     path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate", time_offset: float | None = None
 ) -> str:
-    """The text of a sequence file like the one at `path`, for another folder and with another calibration.
+    """Text of a copy of a sequence file for another folder, with another calibration.
 
     What differs between the scenes is written as numbers; everything else, comments included, stays. Paths, which are
     relative to the file's folder, are changed for the new one; absolute paths stay.

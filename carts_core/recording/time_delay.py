@@ -1,4 +1,4 @@
-"""The delay between images and kinematics, from the motion that both show.
+"""Estimation of the delay between images and kinematics from their common motion.
 
 Optical flow says how each part of the image moved from one frame to the next, and the kinematics how points of the arms
 moved between the same two times. One is nearly a linear function of the other, whatever the hand-eye calibration is. So
@@ -21,76 +21,76 @@ from ..model.robot import Robot
 from .sequence import Sequence
 
 WIDTH = 192
-"""[px] Images are compared at this width."""
+"""Width at which images are compared [px]."""
 _CELLS = 6, 5
 """Columns and rows of the grid over which flow is averaged."""
 _MOST_FRAMES, _STRETCHES = 600, 4
-"""Frames that are read at most, in so many stretches spread over a long recording."""
+"""Largest number of frames that are read, and number of stretches over which they are spread."""
 _FEWEST_STEPS = 60
-"""Steps between frames that an estimate needs."""
+"""Smallest number of steps between frames."""
 _LONGEST_STEP = 0.25
-"""[s] Frames that are farther apart do not show one motion."""
+"""Longest step between frames that counts as one motion [s]."""
 _BLOCKS = 10
-"""Parts of the recording, each of which the jackknife leaves out once."""
+"""Number of blocks of the jackknife."""
 _GRID = 0.02
-"""[s] Distance of the delays that are tried first."""
+"""Spacing of the initial grid of delays [s]."""
 _WIDEST = 3.0
-"""[s] How far the search goes by itself where the best delay is at the end of what was tried."""
+"""Largest delay to which the search extends when the optimum is at the end of its range [s]."""
 _PLAIN = 0.6
-"""A delay that explains a smaller share is compared with those up to `_WIDEST`."""
+"""Explained share below which delays up to `_WIDEST` are tried as well."""
 _EQUAL, _APART = 0.05, 0.15
-"""Share by which another delay may explain less, and time [s] by which it is apart, to be as good."""
+"""Loss of explained share, and distance [s], that make another delay an equally good one."""
 _KEPT = 1e-4
-"""Share of the largest variance, below which a direction of motion is left out."""
+"""Share of the largest variance below which a direction of motion is dropped."""
 _POSTURES = 3
-"""Directions of the arms' places that how motion shows in the image depends on."""
+"""Number of principal directions of link positions that modulate the flow."""
 _RIDGE = 1e-3
 _LEVER = 0.1
-"""[m] What a camera turns about counts as so far away."""
+"""Lever by which rotations of a camera are converted to lengths [m]."""
 _FEWEST_KNOWN = 0.5
-"""Share of the steps for which there must be rows."""
+"""Smallest share of the steps with logged rows."""
 _STILL = 0.02
-"""[px] A recording with less flow than this shows no motion."""
+"""Smallest flow that counts as motion [px]."""
 _FEWEST_EXPLAINED, _FEWEST_GAIN = 0.15, 0.1
-"""Share of the flow that the best delay must predict, and by how much more than delays usually do."""
+"""Smallest share of flow explained by the best delay, and its smallest margin over other delays."""
 _MOST_DEVIATION = 0.04
-"""[s] No estimate that is less certain can be relied on."""
+"""Largest standard deviation of a reliable estimate [s]."""
 _LEAST_DEVIATION = 0.001
-"""[s] No estimate is said to be more certain than this."""
+"""Lower bound of the reported standard deviation [s]."""
 _WORTH_A_CHANGE = 3.0, 0.008
-"""A delay is proposed where it is so many deviations and so many seconds off the present one."""
+"""Smallest change of the delay that is proposed, in standard deviations and in seconds."""
 
 
 @dataclass(frozen=True)
 class TimeOffsetEstimate:
-    """What the motion says about `time_offset`."""
+    """Estimate of `time_offset` from motion."""
 
     present: float
-    """The sequence's `time_offset` [s]."""
+    """`time_offset` of the sequence [s]."""
     seconds: float
-    """The best one [s]."""
+    """Estimated offset [s]."""
     deviation: float
-    """Its standard deviation [s]."""
+    """Standard deviation of the estimate [s]."""
     explained: float
-    """Share of the flow that it predicts in parts of the recording that were left out [1]."""
+    """Share of the flow that the estimate predicts in held-out blocks [1]."""
     explained_now: float
-    """Share that the present one predicts; below 0 if it misleads [1]."""
+    """Share that the present offset predicts; below 0 if it is worse than none [1]."""
     problem: str | None
-    """Why it cannot be relied on, for people; None where it can."""
+    """Why the estimate is not reliable, as a sentence; None where it is."""
     others: tuple[float, ...] = ()
-    """Other delays that explain as much [s]."""
+    """Other delays with nearly the same explained share [s]."""
     at_end: bool = False
-    """Whether it is at the end of what was tried, so that a better one may be beyond."""
+    """Whether the estimate is at the end of the searched range."""
 
     @property
     def proposed(self) -> float | None:
-        """The offset that should take the place of the present one [s]; None where it should stay."""
+        """Proposed new offset [s]; None where the present one should stay."""
         deviations, least = _WORTH_A_CHANGE
         off = abs(self.seconds - self.present)
         return None if self.problem or off < max(deviations * self.deviation, least) else round(self.seconds, 4)
 
     def sentence(self) -> str:
-        """For people."""
+        """Result as a sentence."""
         if self.problem:
             return f"The delay between images and kinematics is not known: {self.problem}"
         found = f"{self.seconds:.3f} s ± {self.deviation:.3f} s"
@@ -111,7 +111,7 @@ def estimate_time_offset(
     largest: float = 0.5,
     progress: Callable[[int, int], None] | None = None,
 ) -> TimeOffsetEstimate:
-    """Find the `time_offset` of a sequence from the motion in its images; nothing is changed.
+    """Estimate the `time_offset` of a sequence from the motion in its images; the sequence is not changed.
 
     Args:
         sequence: rows of its tables are matched with frames by time.
@@ -144,7 +144,7 @@ def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
 
 
 def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
-    """Frames to read, and the pairs of neighbours among them that are near enough in time."""
+    """Frames to read, and pairs of neighbours among them that are close enough in time."""
     count, long = len(times), len(times) > _MOST_FRAMES
     length = _MOST_FRAMES // _STRETCHES if long else count
     starts = np.linspace(0, count - length, _STRETCHES if long else 1).astype(int)
@@ -181,7 +181,7 @@ def _flows(
 
 
 class _Delays:
-    """Flow regressed on motion, at any delay.
+    """Regression of flow on motion at a given delay.
 
     Args:
         sequence: whose arms move.
@@ -199,7 +199,7 @@ class _Delays:
         self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
-        """The best offset around the present one [s]."""
+        """Best offset around the present one [s]."""
         steps = round(largest / _GRID)
         grid = [present + step * _GRID for step in range(-steps, steps + 1)]
         tried = {offset: parts for offset in grid if (parts := self._parts(offset)) is not None}
@@ -226,7 +226,7 @@ class _Delays:
         )
 
     def _refined(self, around: float, blocks: np.ndarray) -> float:
-        """The offset near another one that explains most of some blocks [s]."""
+        """Refined offset near another one for some blocks [s]."""
 
         def unexplained(offset: float) -> float:
             parts = self._parts(offset)
@@ -237,7 +237,8 @@ class _Delays:
         return float(found.x)
 
     def _parts(self, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """By block, products of motion at an offset X and flow Y: X^T X, X^T Y, |Y|^2; None where rows are missing."""
+        """Normal equations of motion X and flow Y at an offset, by block: X^T X, X^T Y, |Y|^2; None where rows are
+        missing."""
         places, motion = self._motion(offset)
         there = np.asarray(np.isfinite(motion).all(1))
         if there.mean() < _FEWEST_KNOWN:
@@ -260,7 +261,7 @@ class _Delays:
         )
 
     def _motion(self, offset: float) -> tuple[Float[np.ndarray, "steps inputs"], Float[np.ndarray, "steps inputs"]]:
-        """Where points of arms are, and how they and mounts of cameras move in each step [m]; NaN if not logged."""
+        """Positions of link points, and motion of these and of camera mounts in each step [m]; NaN if not logged."""
         begin, end = (self._sequence.logged_at(times + offset) for times in (self._begin, self._end))
         places, moved = [], []
         for arm in self._sequence.scene.arms:
@@ -275,7 +276,7 @@ class _Delays:
 
 
 def _as_good(curve: dict[float, float], best: float) -> tuple[float, ...]:
-    """Other peaks of the explained share that are nearly as high, as those of a periodic motion."""
+    """Other local maxima of the explained share that are nearly as high, as for periodic motion."""
     offsets = sorted(curve)
     shares = [curve[offset] for offset in offsets]
     peaks = [
@@ -288,14 +289,14 @@ def _as_good(curve: dict[float, float], best: float) -> tuple[float, ...]:
 
 
 def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns directions"]:
-    """The directions in which rows differ, scaled so that they do by 1 in each."""
+    """Whitened principal directions of the rows."""
     _, sizes, directions = np.linalg.svd(values, full_matrices=False)
     kept = sizes**2 > _KEPT * sizes[0] ** 2
     return directions[kept].T / (sizes[kept] / np.sqrt(len(values)))
 
 
 def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.ndarray, "rows coordinates"]:
-    """Middles of the links in the arm's base frame [m]."""
+    """Centres of the links in the arm's base frame [m]."""
     Ts = robot.forward_kinematics(torch.from_numpy(np.nan_to_num(joints))).numpy()
     middles = [Ts[:, mesh.link, :3, :3] @ mesh.vertices.mean(0) + Ts[:, mesh.link, :3, 3] for mesh in robot.meshes]
     return np.where(np.isfinite(joints).all(1, keepdims=True), np.concatenate(middles, 1), np.nan)
@@ -308,7 +309,7 @@ def _explained(parts: tuple[np.ndarray, np.ndarray, np.ndarray], blocks: np.ndar
 
 
 def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Share of the flow of every block that a function fitted to the others predicts; below 0 if it is misled [1]."""
+    """Share of the flow of every block predicted by a fit to the others; below 0 if worse than none [1]."""
     XX, XY, YY = parts
     unexplained = 0.0
     for left in range(_BLOCKS):

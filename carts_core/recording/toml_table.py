@@ -1,4 +1,4 @@
-"""A TOML table that is read key by key, and says so when a key is wrong, missing or left over."""
+"""TOML tables with typed access to their keys and errors for wrong, missing and unknown ones."""
 
 import difflib
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_t
 from ..wording import closest, listed, shown
 
 _MOST_COMPARED = 200
-"""Keys that a missing one is compared with."""
+"""Number of keys among which a misspelling is looked for."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
 
@@ -36,7 +36,7 @@ def read_toml(path: Path) -> "TomlTable":
 
 
 class TomlTable:
-    """One table of a file. Keys are taken one by one; `finish` complains about those that nobody took."""
+    """A table of a TOML file. Keys are taken one by one; `finish` raises an error for unknown ones."""
 
     def __init__(self, values: dict[str, Any], file: Path, where: str, prefix: str = "") -> None:
         self.file = file
@@ -46,11 +46,11 @@ class TomlTable:
         self._known: list[str] = []
 
     def name(self, key: str) -> str:
-        """How errors call a key, say `sequence.toml: [cameras] 'left': size`."""
+        """Full name of a key for errors, such as `sequence.toml: [cameras] 'left': size`."""
         return f"{self.file}: {self.where + ': ' if self.where else ''}{key}"
 
     def error(self, key: str, text: str) -> SequenceError:
-        """An error about one key."""
+        """Error about a key."""
         return SequenceError(f"{self.name(key)} {text}")
 
     def __contains__(self, key: str) -> bool:
@@ -99,7 +99,7 @@ class TomlTable:
         return value
 
     def take_table(self, key: str) -> "TomlTable":
-        """The table `[key]`, an empty one when it is absent."""
+        """The table `[key]`; empty if it is absent."""
         place = f"{self.where}: " if self.where else ""
         return TomlTable(self.take(key, dict, {}), self.file, f"{place}[{self._prefix}{key}]")
 
@@ -126,12 +126,12 @@ class TomlTable:
         return tables
 
     def items(self) -> dict[str, Any]:
-        """Everything in the table; for tables whose keys are names that the user chose."""
+        """All entries of a table whose keys are chosen by the user."""
         self._known.extend(self._values)
         return dict(self._values)
 
     def path(self, value: str) -> Path:
-        """A path in the file, which is relative to the file's folder.
+        """Absolute form of a path that is relative to the file's folder.
 
         Raises:
             SequenceError: no file can be called so.
@@ -145,7 +145,7 @@ class TomlTable:
         return self.file.parent / value
 
     def finish(self) -> None:
-        """Check that every key was one that the format knows.
+        """Check that all keys are known to the format.
 
         Raises:
             SequenceError: one was not.
@@ -157,7 +157,7 @@ class TomlTable:
 
 
 def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
-    """See that a name can be part of the names of files.
+    """Check that a name can be part of file names.
 
     Raises:
         SequenceError: it cannot.

@@ -31,11 +31,11 @@ from ..files.reading import MIB, VIDEO, check_regular, is_regular, open_regular
 from ..wording import counted
 
 _EXACT = ("mp4", "matroska")
-"""Containers that give every frame its presentation time and find it again."""
+"""Containers with exact presentation times and seeking."""
 _COMPLETE = ("mp4",)
-"""Of these, the ones that give every packet its times and say of each whether decoding may begin there."""
+"""Those of them whose packets have complete times and key frame flags."""
 _COMPARED = 16
-"""Places at most, and packets at each of them, at which the container's table is compared with what the file holds."""
+"""Number of places, and of packets at each of them, at which the container's index is compared with the packets."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -43,32 +43,32 @@ _OPTIONS = {
     "probesize": str(32 * MIB),
     "max_streams": "32",
 }
-"""What FFmpeg may open: videos and no playlists, which would make it fetch other files."""
+"""Options of FFmpeg: video containers only, no playlists, which would open other files."""
 _SECONDS = 10.0
-"""Longest wait for opening a file, and for a read of it."""
+"""Timeout for opening and reading [s]."""
 
 
 @dataclass(frozen=True)
 class VideoIndex:
-    """The frames of a video file in the order in which they are shown."""
+    """Index of the frames of a video file in presentation order."""
 
     count: int
     pts: tuple[int, ...] | None
-    """Presentation time of every frame in units of `time_base`, increasing; None where the file does not say."""
+    """Presentation time of every frame in units of `time_base`, increasing; None if not known."""
     time_base: Fraction
     """[s]"""
     key_frames: tuple[tuple[int, int], ...]
-    """Number of every frame at which decoding may begin, and the time to seek to for it; empty where seeking is not
-    exact, so that frames are decoded in order from the first."""
+    """Frame number and seek time of each key frame; empty where seeking is not exact, so that frames are decoded in
+    order from the first."""
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"] | None:
-        """Presentation times [s], as the file gives them: the first is not always 0. None where it gives none."""
+        """Presentation times [s]; the first is not always 0. None if not known."""
         return None if self.pts is None else np.array(self.pts, np.float64) * float(self.time_base)
 
 
 def index_video(path: Path) -> VideoIndex:
-    """The index of a video file; known ones are remembered until the file changes.
+    """Index of a video file; cached until the file changes.
 
     Raises:
         SequenceError: the file is missing or cannot be decoded.
@@ -90,7 +90,7 @@ def index_video(path: Path) -> VideoIndex:
 
 @contextmanager
 def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video file and its video stream.
+    """Context of an open video file and its video stream.
 
     Args:
         path: the file.
@@ -105,7 +105,7 @@ def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer,
 
 
 def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
-    """As `opened`; the caller closes the container."""
+    """Open video file and its video stream; the caller closes the container."""
     options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
         container = av.open(str(path.absolute()), container_options=options, timeout=_SECONDS)
@@ -125,7 +125,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
 
 
 def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Frames from where the container stands on; damaged ones are left out."""
+    """Frames from the present position on; damaged ones are skipped."""
     packets = container.demux(stream)
     while True:
         try:
@@ -146,7 +146,7 @@ def _index(path: Path, modified: int, size: int) -> VideoIndex:
 
 
 def _by_table(path: Path) -> VideoIndex | None:
-    """The index from the container's own table, without reading the packets; None where that is not to be relied on.
+    """Index from the container's own table, without reading all packets; None where the table is not reliable.
 
     The table has decoding times, which are presentation times only where frames are shown in the order in which they
     are decoded; it lacks what a file's later fragments hold, and has what was cut off its end. So packets here and
@@ -172,7 +172,7 @@ def _by_table(path: Path) -> VideoIndex | None:
 def _as_in_table(
     container: InputContainer, stream: VideoStream, entries: Sequence[IndexEntry], *, to_end: bool = False
 ) -> bool:
-    """Whether the packets from the first of these entries on are the ones that the entries tell of."""
+    """Whether the packets from the first of these entries on match the entries."""
     try:
         container.seek(entries[0].timestamp, stream=stream)
         packets = (packet for packet in container.demux(stream) if packet.size)
@@ -186,7 +186,7 @@ def _as_in_table(
 
 
 def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
-    """The index as the container gives it, None where that is not to be relied on."""
+    """Index from the packets; None where their times are not reliable."""
     with opened(path, parsed=parsed) as (container, stream):
         if not parsed and not any(name in container.format.name for name in _COMPLETE):
             return None
@@ -215,7 +215,7 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
 
 
 def _by_decoding(path: Path) -> VideoIndex:
-    """The index of what comes out when the whole file is decoded in order."""
+    """Index from decoding the whole file in order."""
     with opened(path) as (container, stream):
         times = [frame.pts for frame in decoded_frames(container, stream)]
         time_base = stream.time_base or Fraction(1)
@@ -233,19 +233,19 @@ def _remedy(path: Path) -> str:
 
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ogv")
-"""File names that are taken for videos."""
+"""Suffixes of video files."""
 
 _BOTTOM_FIRST = (3, 4)
-"""FFmpeg's orders of fields, BB and TB, in which the bottom field is shown first."""
+"""FFmpeg's field orders with the bottom field first: BB and TB."""
 _ONE = 2**16
-"""1 in a display matrix."""
+"""Fixed-point 1 in a display matrix."""
 _NOT_TURNED = "the file's display matrix turns by no right angle or scales; frames are used as stored."
 _KEPT_BYTES = 32 * 2**20
-"""Memory for frames as decoded, so that going backwards decodes everything between two key frames only now and then."""
+"""Memory for decoded frames, which makes stepping backwards cheap."""
 
 
 class Video:
-    """Frames of one video file by number; safe to use from several threads.
+    """Frames of a video file by number; thread-safe.
 
     Decoding begins at the last key frame that is shown no later than the frame asked for, and frames that come out are
     identified by their presentation time. Where seeking does not arrive where it should, decoding begins at an earlier
@@ -276,7 +276,7 @@ class Video:
         self._open: tuple[InputContainer, VideoStream] | None = None
         self._frames: Iterator[tuple[int, VideoFrame]] = iter(())
         self._last: int | None = None
-        """Number of the frame that was decoded last; None before the first after a jump."""
+        """Number of the last decoded frame; None before the first after a seek."""
         if (count := self._index.count) <= max(numbers):
             raise SequenceError(
                 f"video {path} has {counted(count, 'frame')}, but frame number {max(numbers)} (counted from 0) "
@@ -284,7 +284,7 @@ class Video:
             )
 
     def name(self, index: int) -> str:
-        """What errors call the image of frame `index`."""
+        """Name of the image of frame `index`, for errors."""
         return f"{self.path}, frame number {self._numbers[index]}"
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -313,7 +313,7 @@ class Video:
         return f"{content} {self._numbers[index]} {self._deinterlace}"
 
     def remarks(self) -> tuple[str, ...]:
-        """What is changed about the frames, by the first of them: turned, deinterlaced, pixels that are not square.
+        """Remarks on the frames, from the first of them: rotation, deinterlacing, pixels that are not square.
 
         Raises:
             SequenceError: the video is damaged there.
@@ -350,14 +350,14 @@ class Video:
         return frame
 
     def another(self) -> "Video":
-        """A reader of its own of the same file: who jumps about with it does not disturb who reads on with this one."""
+        """An independent reader of the same file, with its own position and cache."""
         other = copy.copy(self)
         other._lock, other._kept = threading.Lock(), _Kept(_KEPT_BYTES // 4)
         other._open, other._frames, other._last = None, iter(()), None
         return other
 
     def _decode(self, number: int) -> VideoFrame | None:
-        """Decode up to frame `number`; None when it does not come out."""
+        """Decode up to frame `number`; None if decoding fails."""
         key, seek_to = self._key_frame_before(number)
         if self._last is None or not key - 1 <= self._last < number:
             while not self._jump(key, seek_to):
@@ -375,12 +375,12 @@ class Video:
         return None
 
     def _key_frame_before(self, number: int) -> tuple[int, int | None]:
-        """Number of the frame where decoding begins, and the time to seek to, None for the file's start."""
+        """Key frame from which decoding begins, and its seek time; None for the beginning of the file."""
         row = bisect_right(self._key_frames, number, key=lambda entry: entry[0])
         return self._key_frames[row - 1] if row > 0 else (0, None)
 
     def _jump(self, key: int, seek_to: int | None) -> bool:
-        """Stand where frame `key` or an earlier one comes next; False when the file cannot be made to."""
+        """Seek so that frame `key` or an earlier one comes next; False if that fails."""
         self._last = None
         if self._open is None or seek_to is None:
             if self._open is not None:
@@ -417,7 +417,7 @@ def _pixels(frame: VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _one_field(frame: VideoFrame, *, bottom: bool) -> UInt8[np.ndarray, "height width 3"]:
-    """One field of an interlaced frame, its rows where they are in the frame and those between interpolated."""
+    """One field of an interlaced frame at full height, missing rows interpolated."""
     graph = av.filter.Graph()
     source = graph.add_buffer(
         width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base or Fraction(1, 1000)
@@ -439,7 +439,7 @@ def _one_field(frame: VideoFrame, *, bottom: bool) -> UInt8[np.ndarray, "height 
 
 
 def _display_matrix(frame: VideoFrame) -> Float[np.ndarray, "2 2"]:
-    """From stored to shown columns and rows, without the shift; the identity for a frame that has none."""
+    """Rotation and mirroring from stored to displayed columns and rows; the identity by default."""
     for entry in cast(Iterable[SideData], frame.side_data):
         if entry.type.name == "DISPLAYMATRIX" and entry.buffer_size == 36:
             values = np.frombuffer(bytes(entry), np.int32).reshape(3, 3)[:2, :2].T
@@ -448,7 +448,7 @@ def _display_matrix(frame: VideoFrame) -> Float[np.ndarray, "2 2"]:
 
 
 def _is_square(matrix: Float[np.ndarray, "2 2"]) -> bool:
-    """Whether it turns by right angles, and mirrors, and nothing else."""
+    """Whether the matrix only rotates by right angles and mirrors."""
     return np.array_equal(np.abs(matrix), np.eye(2)) or np.array_equal(np.abs(matrix), np.eye(2)[::-1])
 
 
@@ -462,7 +462,7 @@ def _turned(image: np.ndarray, matrix: Float[np.ndarray, "2 2"]) -> np.ndarray:
 
 
 class _Kept:
-    """The frames that were decoded last, as many as fit into a number of bytes, in YUV, which is half of RGB."""
+    """Least-recently-used cache of decoded frames (YUV, half of RGB) with a limit in bytes."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit

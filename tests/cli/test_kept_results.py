@@ -118,8 +118,9 @@ def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(optimize: Out
 
 
 def test_kept_results_are_recognized_without_decoding_images(
-    optimize: Outcome, monkeypatch: pytest.MonkeyPatch
+    optimize: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    replaced(tmp_path / "sequence.toml", 'name = "left"', 'name = "left"\nbackground = "regular/left/001.png"')
     optimize()
     monkeypatch.setattr(ImageFiles, "read", lambda source, index: pytest.fail(f"{source.name(index)} was decoded"))
     assert "3 of 3 frames already there" in optimize()

@@ -1,4 +1,4 @@
-"""Masks and keypoints that others made, read from their own formats."""
+"""Import of masks and keypoints from annotation formats."""
 
 from .formats import Annotations as Annotations
 from .formats import FrameAnnotation as FrameAnnotation

@@ -20,51 +20,51 @@ from ...wording import shown
 from ..images import read_labels
 
 MOST_LABELS = 255
-"""Of a layer, whose pixels have 8 bits."""
+"""Largest number of labels of a layer, whose pixels have 8 bits."""
 MOST_IMAGES = 100_000
-"""In one source."""
+"""Largest number of images of a source."""
 MOST_KEYPOINTS = 200
-"""In one image."""
+"""Largest number of keypoints of an image."""
 
 
 @dataclass(frozen=True)
 class ForeignImage:
-    """One image of a source, with what is marked in it."""
+    """An annotated image of a source."""
 
     name: str
-    """Its file, as the source calls it."""
+    """File name in the source."""
     parts: Callable[[], Iterable[tuple[str, Bool[np.ndarray, "height width"]]]] = tuple
-    """Labels and their pixels, decoded when asked for; later ones lie above earlier ones. One without a name says that
-    nothing else is marked; an image without any has no mask."""
+    """Labels and their pixels, decoded on demand; later ones are on top. An empty label means that the rest is
+    unlabelled; an image without parts has no mask."""
     keypoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Name -> column and row [px], from the upper left corner."""
+    """Name -> column and row [px], from the upper left corner of the image."""
     frame: str = ""
-    """Id of the frame, where the source says it."""
+    """Id of the frame, where the source has it."""
     camera: str = ""
-    """The same of the camera."""
+    """Name of the camera, where the source has it."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameAnnotation:
-    """What is marked in one frame through one camera."""
+    """Annotations of one frame in one camera."""
 
     frame: int
     """Position in the sequence."""
     camera: str
     labels: UInt8[np.ndarray, "height width"] | None
-    """Of each pixel of the undistorted image the label, counted from 1; 0 elsewhere. None without masks."""
+    """Label of each pixel of the undistorted image, from 1; 0 elsewhere. None without masks."""
     keypoints: Mapping[str, tuple[float, float]]
     """Name -> column and row in the undistorted image [px]."""
 
 
 class Labels:
-    """Names of labels, numbered as they come."""
+    """Names of labels, numbered in order of appearance."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
 
     def number(self, name: str) -> int:
-        """Of a label, from 1.
+        """Number of a label, from 1.
 
         Raises:
             SequenceError: there are too many.
@@ -78,22 +78,21 @@ class Labels:
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """All that a source marks in a sequence. The frames are decoded while they are gone through, which is done once."""
+    """Annotations of a source for a sequence. Frames are decoded while iterating, which is possible once."""
 
     kind: str
-    """The source's format, for people."""
+    """Name of the source's format."""
     frames: Iterator[FrameAnnotation]
     label_names: list[str]
-    """Of label 1 and so on; complete once all frames were gone through."""
+    """Names of the labels from 1; complete after the iteration."""
     unknown: list[str]
-    """Names of images that belong to no frame; complete likewise."""
+    """Names of images that belong to no frame; complete after the iteration."""
     remarks: Counter[str] = field(default_factory=Counter)
-    """What was decided about masks, and annotations that were left out with the reason, and how often; complete
-    likewise."""
+    """Decisions on masks and reasons for omitted annotations, with their counts; complete after the iteration."""
 
 
 _BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
-"""Of COCO's text: five bits a character, from "0" on."""
+"""COCO's run-length text: five bits a character, offset "0"."""
 
 
 def runs_of_text(text: str) -> list[int]:
@@ -121,7 +120,7 @@ def runs_of_text(text: str) -> list[int]:
 
 
 def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bool) -> Bool[np.ndarray, "height width"]:
-    """A mask of run lengths, in turn outside and inside; the first is outside.
+    """A mask from alternating run lengths; the first run is outside.
 
     Raises:
         ValueError: they are not as many pixels as the mask has.
@@ -155,7 +154,7 @@ _FEWEST_CORNERS = 3
 
 
 def is_coco(path: Path) -> bool:
-    """Whether a file can be one: it ends with .json."""
+    """Whether the file name ends with .json."""
     return path.suffix.lower() == ".json"
 
 
@@ -275,7 +274,7 @@ def _why(error: Exception) -> str:
 
 
 def is_cvat(path: Path) -> bool:
-    """Whether a file can be one: it ends with .xml."""
+    """Whether the file name ends with .xml."""
     return path.suffix.lower() == ".xml"
 
 
@@ -355,7 +354,7 @@ def _cvat_points(shape: Element) -> np.ndarray:
 
 
 def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Points with their labels; several of one shape are numbered."""
+    """Points by label; several points of one shape are numbered."""
     for shape in image.iter("points"):
         if shape.get("outside") == "1":
             continue
@@ -365,12 +364,12 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
 
 
 def is_surgpose(path: Path) -> bool:
-    """Whether a file can be one: it ends with .yaml."""
+    """Whether the file name ends with .yaml."""
     return path.suffix.lower() in (".yaml", ".yml")
 
 
 def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The frames of a file of keypoints; nothing is remarked about them.
+    """The frames of a file of keypoints; without remarks.
 
     Raises:
         SequenceError: it is none.
@@ -405,27 +404,28 @@ def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
 
 _SUFFIXES = (".png", ".bmp")
 _OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
-"""Looked for where there are none of these, since masks lie beside images."""
+"""Suffixes that are used only where a folder has no files with the preferred ones, since images may lie beside
+masks."""
 _DEEPEST = 4
 _MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
 _MOST_UNNAMED = 32
-"""Values of one image; more come from interpolation."""
+"""Largest number of unnamed values in an image; more are artefacts of interpolation."""
 _BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
-"""How EndoVis 2018 begins the names of what belongs to an instrument; everything else is anatomy or thread."""
+"""Prefixes of EndoVis 2018 labels that belong to an instrument; all others are anatomy or thread."""
 
 _Colours = Mapping[tuple[int, int, int], str]
 
 
 def is_mask_folder(path: Path) -> bool:
-    """Whether it is a folder."""
+    """Whether the path is a folder."""
     return path.is_dir()
 
 
 def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:
-    """The images below a folder; files of one name in folders beside one another belong to one frame.
+    """The images below a folder; files of the same name in sibling folders belong to the same frame.
 
     Args:
         path: of the folder.
@@ -452,7 +452,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
 
 
 def _finest(path: Path) -> Path:
-    """Of an export of carts, the folder with links."""
+    """The folder with links, for an export of carts; else the folder itself."""
     return path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
 
 
@@ -471,7 +471,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
-    """What says what the values mean: in the mask's folder or one above, up to the top."""
+    """File with the names of the values: in the mask's folder or above, up to the top."""
     for folder in file.parents:
         for name in _MEANINGS:
             if is_regular(folder / name) and not (confined and (folder / name).is_symlink()):
@@ -547,7 +547,7 @@ def _by_value(
 
 
 def _names(meaning: Any, folder: str) -> dict[int, str]:
-    """Grey value -> name, of a file that says either of both first."""
+    """Grey value -> name, from a file that may list either first."""
     if not isinstance(meaning, dict):
         return {}
     if isinstance(inner := meaning.get(folder), dict):

@@ -1,4 +1,4 @@
-"""Foreign annotations as frames of a sequence."""
+"""Annotations matched with the frames of a sequence."""
 
 import re
 from collections import Counter
@@ -30,7 +30,7 @@ from .formats import (
 )
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
-"""Of a folder that is an export: the file that matters."""
+"""File to read inside a folder that is an export."""
 _OWN_EXPORT = "export.json"
 
 
@@ -52,7 +52,7 @@ _FORMATS = (
 def read_annotations(
     source: Path, sequence: Sequence, camera: str | None = None, *, confined: bool = False
 ) -> Annotations:
-    """Masks and keypoints of others, for the frames of a sequence that they belong to.
+    """Read masks and keypoints for the frames of a sequence.
 
     Frames are found by their ids, or the numbers in the names of images; cameras by their names, or by left and right.
     What was marked in images with distortion is undistorted, unless carts exported it.
@@ -85,7 +85,7 @@ def read_annotations(
 
 
 class _FrameReader:
-    """Turns images of a source into frames of a sequence.
+    """Converts images of a source into frames of a sequence.
 
     Args:
         sequence, camera: see `read_annotations`.
@@ -112,7 +112,7 @@ class _FrameReader:
         self._numbers = {int(name): index for name, index in self._ids.items() if name.isdecimal()}
 
     def frames(self, images: Iterator[ForeignImage]) -> Iterator[FrameAnnotation]:
-        """One annotation per frame and camera; images that follow each other are joined."""
+        """One annotation per frame and camera; consecutive images of the same frame are merged."""
         at: tuple[int, str] | None = None
         joined: list[ForeignImage] = []
         done: set[tuple[int, str]] = set()

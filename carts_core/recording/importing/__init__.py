@@ -1,4 +1,4 @@
-"""Recordings of other people's formats, and what they know of themselves."""
+"""Import of recordings from foreign formats."""
 
 from .calibrations import DvrkBaseFrame as DvrkBaseFrame
 from .calibrations import read_base_frames as read_base_frames

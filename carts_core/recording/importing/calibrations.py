@@ -29,27 +29,27 @@ _DISTORTIONS = ("distortion_coefficients", "distortion_coeffs", "distortion", "D
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("nx", "ny"), ("res_x", "res_y"))
 _PAIRS = ("imageSize", "image_size", "resolution", "img_size")
 _METRES_TO = 1.0
-"""[m] Longer baselines are millimetres."""
+"""Baseline above which lengths are millimetres [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a file or message states of one camera."""
+    """Calibration of one camera from a file or message."""
 
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]; the first pixel's centre is at 0."""
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients."""
     size: tuple[int, int] | None = None
-    """Width and height of the images it was made from [px]."""
+    """Width and height of the calibrated images [px]."""
     T_right_left: Float[np.ndarray, "4 4"] | None = None
-    """[m] Of the right camera of a pair, where it is stated."""
+    """Pose of the left camera in the right one [m]; None if not given."""
     R: Float[np.ndarray, "3 3"] | None = None
     """Rectification: from the camera's frame to the pair's common one."""
     P: Float[np.ndarray, "3 4"] | None = None
     """Projection of the rectified camera [px], whose last column is -focal length * baseline [px m]."""
     remarks: tuple[str, ...] = ()
-    """What was decided about the values, in sentences."""
+    """Decisions on the values, as sentences."""
 
 
 def read_calibration(path: Path, side: str) -> Calibration:
@@ -82,7 +82,7 @@ def read_calibration(path: Path, side: str) -> Calibration:
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
-    """The calibration of a `sensor_msgs/CameraInfo`; None of a camera that is not calibrated.
+    """The calibration of a `sensor_msgs/CameraInfo`; None for an uncalibrated camera.
 
     Raises:
         ValueError: a distortion model that is not OpenCV's pinhole.
@@ -101,7 +101,7 @@ def calibration_from_info(info: Any) -> Calibration | None:
 
 
 def check_model(model: str, camera_model: str = "") -> None:
-    """Check that a camera model is OpenCV's pinhole.
+    """Check that a camera model is OpenCV's pinhole model.
 
     Raises:
         ValueError: it is another one.
@@ -127,7 +127,7 @@ def _content(path: Path) -> Any:
 
 
 def _opencv_xml(text: str) -> dict[str, Any]:
-    """The values of an XML file of OpenCV's FileStorage."""
+    """Values of an XML file of OpenCV's FileStorage."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it declares a document type or entities")
     try:
@@ -148,7 +148,7 @@ def _opencv_xml(text: str) -> dict[str, Any]:
 
 
 def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
-    """ROS, OpenCV, Kalibr, camodocal and JSON, by the names of their values."""
+    """Calibration from named values: ROS, OpenCV, Kalibr, camodocal and JSON."""
     if isinstance(kalibr := content.get("cam1" if side == "right" else "cam0"), dict):
         return _from_kalibr(kalibr)
     if isinstance(own := content.get(side), dict):
@@ -185,7 +185,7 @@ def _with_extrinsics(found: Calibration, content: Mapping[str, Any]) -> Calibrat
 
 
 def _placed(found: Calibration, R: np.ndarray, T: np.ndarray) -> Calibration:
-    """With a rotation and a translation in metres or, where it is longer than a metre, millimetres."""
+    """The calibration with an extrinsic rotation and translation; translations above a metre are millimetres."""
     pose = np.eye(4)
     translation = np.asarray(T, np.float64).reshape(3)
     distance = float(np.linalg.norm(translation))
@@ -216,7 +216,7 @@ def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
 
 
 def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
-    """With a matrix of 9 numbers, or fx, fy, cx, cy.
+    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy.
 
     Raises:
         ValueError: it is no matrix of a camera, or has another number of coefficients than OpenCV's models.
@@ -246,7 +246,7 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
 
 
 def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Width and height of the images; None where they are not stated."""
+    """Width and height of the images; None if not given."""
     for wide, high in _SIZES:
         if wide in content and high in content:
             return int(float(content[wide])), int(float(content[high]))
@@ -269,7 +269,7 @@ def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[s
 
 
 def _rotation(values: np.ndarray | None) -> np.ndarray | None:
-    """A rectification, None where a camera has none (zeros)."""
+    """Rectification; None for a zero matrix, which means none."""
     if values is None or values.size != 9 or not np.abs(values).max() > 0:
         return None
     return values.reshape(3, 3)
@@ -280,7 +280,7 @@ def _projection(values: np.ndarray | None) -> np.ndarray | None:
 
 
 def _from_ini(path: Path, side: str) -> Calibration:
-    """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are millimetres."""
+    """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are in millimetres."""
     parser = parse_ini(read_text(path, CALIBRATION))
     section = parser["StereoRight" if side == "right" else "StereoLeft"]
 
@@ -296,7 +296,7 @@ def _from_ini(path: Path, side: str) -> Calibration:
 
 
 def _from_matlab(content: Any, side: str) -> Calibration:
-    """Parameters as structs of MATLAB's toolbox, whose pixels count from 1, or plain matrices, which count from 0."""
+    """MATLAB structs, whose pixels count from 1, or plain matrices, whose pixels count from 0."""
     while len(content) == 1 and isinstance(only := next(iter(content.values())), dict):
         content = only
     right = side == "right"
@@ -327,7 +327,7 @@ def _plain(value: Any) -> Any:
 
 
 def _from_one(found: Calibration) -> Calibration:
-    """MATLAB counts pixels from 1, OpenCV from 0."""
+    """Intrinsics with pixels from 0 (OpenCV) from those with pixels from 1 (MATLAB)."""
     fx, fy, cx, cy = found.intrinsics
     return replace(found, intrinsics=(fx, fy, cx - 1.0, cy - 1.0))
 
@@ -340,18 +340,18 @@ _BASE_FRAME_KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class DvrkBaseFrame:
-    """Where one arm's base is."""
+    """Base frame of an arm."""
 
     arm: str
-    """Name of the arm; empty where neither the file nor its name says it."""
+    """Name of the arm; empty if neither the file nor its name gives it."""
     reference: str
-    """Name of the frame that the transform is given in; empty where the file has none."""
+    """Name of the reference frame of the transform; empty if not given."""
     T_camera_base: Float[np.ndarray, "4 4"]
     """[m], with OpenCV's axes of the camera: `T_world_base` where the world is the camera."""
 
 
 def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFrame, ...]:
-    """The base frames that a file of the dVRK holds.
+    """Base frames in a configuration file of the dVRK.
 
     Args:
         path: a JSON file of one of the kinds above.
@@ -378,7 +378,7 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
 
 
 def _entries(content: Any, path: Path) -> list[tuple[str, str, Any, str]]:
-    """Arm, reference, transform and place of every base frame."""
+    """Arm, reference, transform and location of every base frame."""
     if not isinstance(content, dict):
         return []
     if (frame := _either(content, "base_frame")) is not None:

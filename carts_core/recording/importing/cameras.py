@@ -18,11 +18,11 @@ from .calibrations import Calibration, calibration_from_info, read_calibration
 from .found import FoundCamera, Note
 
 _SAME_SHAPE = 0.01
-"""Difference of aspects that rounding of an image's size makes at most [1]."""
+"""Largest difference of aspect ratios due to rounding of image sizes [1]."""
 
 
 def side_of(name: str) -> str | None:
-    """`left` or `right`, where a topic's or folder's name says it."""
+    """`left` or `right`, if part of a topic's or folder's name; else empty."""
     words = re.split(r"[^a-z0-9]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower())
     for side in ("left", "right"):
         short = (side, f"{side}s", f"{side}img", f"img{side}", f"camera{side[0]}", f"cam{side[0]}", f"l{side}")
@@ -36,7 +36,7 @@ def side_of(name: str) -> str | None:
 def camera_from_info(
     camera: FoundCamera, info: Any, options: ImportOptions, notes: list[Note], *, rectified: bool
 ) -> FoundCamera:
-    """The camera with the calibration of a `sensor_msgs/CameraInfo`, as it is for one without.
+    """The camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is uncalibrated.
 
     Args:
         camera: with its images.
@@ -59,7 +59,7 @@ def camera_from_info(
 
 
 def calibration_of(camera: FoundCamera, options: ImportOptions, notes: list[Note], **changes: Any) -> FoundCamera:
-    """The camera with the calibration that a person gave for it, and further changes.
+    """The camera with the calibration given in the options, and further changes.
 
     Raises:
         SequenceError: the file is missing or of an unknown kind.
@@ -122,7 +122,7 @@ def _given_size(camera: FoundCamera, options: ImportOptions) -> tuple[int, int] 
 
 
 def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: list[Note]) -> FoundCamera:
-    """The camera whose intrinsics are for images of `size`, for its own images.
+    """The camera with intrinsics for images of `size` scaled to its own images.
 
     Raises:
         SequenceError: the images have another shape.
@@ -145,7 +145,7 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: list[N
 
 
 def check_intrinsics(camera: FoundCamera, options: ImportOptions, note: Callable[[Note], None]) -> None:
-    """Compare a calibration with the size of the images.
+    """Check that a calibration is plausible for the size of the images.
 
     Raises:
         SequenceError: it is implausible, and the size of the calibrated images was not given.
@@ -168,7 +168,7 @@ def check_intrinsics(camera: FoundCamera, options: ImportOptions, note: Callable
 
 
 def placed_cameras(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -> tuple[FoundCamera, ...]:
-    """Cameras with their poses; the world is the frame of the first, or of the left one of a pair.
+    """Cameras with their poses; the world is the frame of the first camera, or of the left one of a pair.
 
     Where the pose of another one is not stated, it follows from the rectification of both:
     T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera whose pose stays unknown stands
@@ -201,7 +201,7 @@ def _placed(camera: FoundCamera, first: FoundCamera, note: Callable[[Note], None
 
 
 def _from_rectification(left: FoundCamera, right: FoundCamera) -> np.ndarray:
-    """T_right_left [m]; ROS: P[:, 3] is (-fx * baseline, 0, 0), or (0, -fy * baseline, 0) for one above the other."""
+    """T_right_left [m] from ROS' P[:, 3]: (-fx * baseline, 0, 0), or (0, -fy * baseline, 0) for one above the other."""
     assert left.projection is not None and right.projection is not None
     assert left.rectification is not None and right.rectification is not None
     T = np.eye(4)
@@ -220,26 +220,26 @@ _NUMBER = re.compile(r"^(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)$")
 
 @dataclass(frozen=True)
 class Images:
-    """The images of a camera."""
+    """Images of a camera."""
 
     path: Path
-    """Folder or video."""
+    """Folder or video file."""
     pattern: str
-    """Name of a frame's image in the folder; empty for a video."""
+    """File name pattern of a frame in the folder; empty for a video."""
     ids: tuple[str, ...]
-    """Of the frames; the numbers in the names, in their order."""
+    """Ids of the frames: the numbers in the file names, sorted."""
     size: tuple[int, int]
     """Width and height [px]."""
     times: Float[np.ndarray, " frames"] | None = None
     """Presentation times of a video [s]."""
     bits: int | None = None
-    """Of the values of images with 16; None for 8."""
+    """Bit depth of images of 16 bits; None for 8."""
     remarks: tuple[str, ...] = ()
-    """What is changed about stored images before they are used."""
+    """Remarks on changes to stored images before they are used."""
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images directly in a folder, in no order, without hidden files (`._001.jpg` of macOS)."""
+    """Images directly in a folder, unsorted, without hidden files (`._001.jpg` of macOS)."""
     try:
         files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
         return [path for path in files if not path.name.startswith(".")]
@@ -270,7 +270,7 @@ def find_images(path: Path, only: str = "") -> Images:
 
 
 def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
-    """Pattern and ids of files that differ in one number."""
+    """Pattern and ids of file names that differ in one number."""
     kinds: dict[tuple[str, str], list[str]] = {}
     for file in files:
         match = _NUMBER.match(file.name.removesuffix(file.suffix))
@@ -302,7 +302,7 @@ def _video(path: Path) -> Images:
 
 
 def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
-    """Ids of the frames that every camera has, in the first one's order."""
+    """Ids of the frames that all cameras have, in the first one's order."""
     shared = set.intersection(*(set(each.ids) for each in kinds))
     return tuple(frame for frame in kinds[0].ids if frame in shared)
 
@@ -310,7 +310,7 @@ def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
 def cameras_of(
     images: dict[str, Images], options: ImportOptions, notes: list[Note], calibrations: dict[str, Path] | None = None
 ) -> tuple[FoundCamera, ...]:
-    """Cameras with their images, each with the calibration that was given or found for it.
+    """Cameras with their images and their given or found calibrations.
 
     Raises:
         SequenceError: a calibration file is not usable.

@@ -1,4 +1,4 @@
-"""Which columns of a table are an arm's joints, its tip's pose, and times; and in which units. All of it is guesses."""
+"""Heuristics for the columns of a table: joints of an arm, poses of its tip, times, and their units."""
 
 import re
 from collections.abc import Callable
@@ -62,7 +62,7 @@ _STATE = {
     "value",
     "action",
 }
-"""Words beside the name of a joint."""
+"""Words beside the name of a joint that name the kind of value."""
 _POSE_ORDER = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = (
     "timestamp",
@@ -81,25 +81,25 @@ _FRAMES = (
     *("picture", "file", "filename", "index", "id", ""),
 )
 _GENERAL = set("motor no nr number axis dof actuator encoder instrument tool robot arm arms channel ch".split())
-"""Words of numbered columns that can be joints of a PSM; another word is another robot's name."""
+"""Words of numbered columns that can be joints of a PSM; other words are names of other robots."""
 _REACH = 0.5
-"""[m] Largest distance of a tip from its base or camera."""
+"""Largest distance of a tip from its base or camera [m]."""
 
 
 @dataclass(frozen=True)
 class ColumnMeanings:
-    """Columns by what they mean."""
+    """Columns by meaning."""
 
     time: str | None
     frame: str | None
     arms: dict[str, dict[str, str]]
     """Arm -> joint or part of a pose -> column."""
     stated: frozenset[str] = frozenset()
-    """Columns that were chosen, or whose names state their meaning; other meanings are guesses."""
+    """Columns that were chosen, or whose names are unambiguous; other meanings are guesses."""
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
-    """What the columns of a table mean; a person's choice comes before names, and names before places.
+    """Meanings of the columns of a table: user's choices first, then names, then positions.
 
     Raises:
         SequenceError: a chosen column is not there, or columns are joints of a robot of which some are missing.
@@ -136,7 +136,7 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
 
 
 def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
-    """Arm -> joints, of the robots that were given and are no PSM.
+    """Arm -> joints, of the given robots that are no PSM.
 
     Raises:
         RobotError: a robot is missing or no URDF.
@@ -156,7 +156,7 @@ def _check_chosen(table: ForeignTable, options: ImportOptions, others: dict[str,
 
 @lru_cache(maxsize=64)
 def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> tuple[int, ...] | None:
-    """Where the joints are among positions that have names; None where they have none of their own.
+    """Order of the joints among named positions; None without usable names.
 
     Args:
         names: beside the positions, in their order; `outer_yaw` is yaw.
@@ -181,7 +181,7 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
 def rows_of(
     groups: list[tuple[list[str], np.ndarray]], role: str, joints: tuple[str, ...] = JOINT_NAMES
 ) -> Float[np.ndarray, "rows 1+values"] | None:
-    """Logged times [s] and values of a topic, with joint positions in the order of `joints`; None without any.
+    """Logged times [s] and values of a topic, joint positions in the order of `joints`; None if empty.
 
     Args:
         groups: of `decoders.bags.rows`: names in the messages, times and values.
@@ -202,12 +202,12 @@ def rows_of(
 
 
 def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:
-    """Whether positions have names that say nothing of the joints."""
+    """Whether positions have names that match no joints."""
     return len(set(names)) > 1 and order_of_names(names, joints) is None
 
 
 def arm_in(text: str) -> str:
-    """The PSM that a name speaks of, in capitals; empty without one."""
+    """Name of the PSM in a text, in capitals; empty without one."""
     match = _ARM.search(text.replace("_", " "))
     return match.group(1).upper() if match else ""
 
@@ -219,7 +219,7 @@ def _words(column: str) -> str:
 def _joints_by_name(
     table: ForeignTable, words: dict[str, str], joints: tuple[Joint, ...], chosen: dict[str, str]
 ) -> dict[str, str]:
-    """Joint of another robot -> the column with its name."""
+    """Joint of another robot -> column of the same name."""
     found: dict[str, str] = {}
     for joint in joints:
         own = _words(joint.name)
@@ -249,7 +249,7 @@ def _name_columns(table: ForeignTable) -> dict[str, re.Match[str]]:
 
 
 def _named_places(table: ForeignTable) -> dict[str, str]:
-    """Column of a position -> the name that the column of names gives it.
+    """Column of a position -> joint name from the column of names.
 
     Raises:
         SequenceError: a name changes from row to row.
@@ -271,7 +271,7 @@ def _named_places(table: ForeignTable) -> dict[str, str]:
 
 
 def _file_names(table: ForeignTable) -> str | None:
-    """The column whose cells are names of image files."""
+    """Column whose cells are names of image files."""
     for column, cells in table.columns.items():
         if cells.dtype.kind in "UO" and len(cells):
             hits = sum(str(cell).strip().lower().endswith(IMAGE_SUFFIXES) for cell in cells)
@@ -281,13 +281,13 @@ def _file_names(table: ForeignTable) -> str | None:
 
 
 def _dated(table: ForeignTable) -> str | None:
-    """The only column of dates, which are nanoseconds since 1970."""
+    """The only column of dates (nanoseconds since 1970)."""
     found = [column for column in table.dates]
     return found[0] if len(found) == 1 else None
 
 
 def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
-    """What the rows of a table say about images.
+    """References from the rows of a table to images.
 
     Raises:
         SequenceError: a cell of the times is no number.
@@ -303,19 +303,19 @@ def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
 
 
 def samples(table: ForeignTable, most: int = 30) -> str:
-    """The columns of a table with a value of each, for errors."""
+    """Columns of a table with a sample value of each, for errors."""
     columns = list(table.columns.items())
     text = ", ".join(f"{name} ({sample(values[0])})" for name, values in columns[:most])
     return f"{text} and {len(columns) - most} more" if len(columns) > most else text
 
 
 def sample(value: object) -> str:
-    """A value of a column, for people."""
+    """Sample value of a column, for errors."""
     return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> dict[str, dict[str, str]]:
-    """The only six or seven columns that differ in nothing but a number: joints under a name of their own."""
+    """The only family of six or seven columns that differ in a number, which are joints under another name."""
     families: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         number = re.fullmatch(r"(.*?)(\d+)(\D*)", text)
@@ -343,7 +343,7 @@ def _mentions_pose(column: str) -> bool:
 
 
 def _meaning(text: str, pose: bool) -> str | None:
-    """Joint, `#n` for the n-th one, or part of a pose."""
+    """Joint, `#n` for the n-th joint, or component of a pose."""
     tokens = [token for token in text.split() if token not in _FILLER]
     bare = " ".join(token for token in tokens if token not in ("pose", "cp", "local", "ee"))
     if bare in _POSE and (pose or bare[0] == "q" or len(bare) == 1):
@@ -359,7 +359,7 @@ def _meaning(text: str, pose: bool) -> str | None:
 
 
 def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
-    """The n-th joint by its name; numbers begin with 0 or 1."""
+    """Joint names in place of numbers, which begin with 0 or 1."""
     numbers = sorted(int(key[1:]) for key in found if key.startswith("#"))
     if not numbers:
         return found
@@ -390,7 +390,7 @@ def arm_log(
     note: Callable[[Note], None],
     stated: frozenset[str] = frozenset(),
 ) -> ArmLog:
-    """The log of one arm from its columns, in radians and metres.
+    """The log of one arm, in radians and metres.
 
     Args:
         table: with the columns.
@@ -435,7 +435,7 @@ def _pose_log(
     note: Callable[[Note], None],
     stated: frozenset[str],
 ) -> ArmLog:
-    """The log of an arm whose tip's pose is in the table."""
+    """The log of an arm from poses of its tip."""
     columns = [found[name] for name in _POSE_ORDER]
     values = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
     given = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])

@@ -1,4 +1,4 @@
-"""Tables of other programs: CSV, Parquet and NumPy files as named columns of numbers."""
+"""Tables of other programs (CSV, Parquet, NumPy) as named columns of numbers."""
 
 import csv
 import re
@@ -20,24 +20,24 @@ _LONGEST_UNIT = 12
 """Longest word that is taken for a unit."""
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _LONGEST_NUMBER = 100
-"""Longer cells are texts; arrays of texts take the length of the longest for each [characters]."""
+"""Longest numeric cell [characters]; arrays of texts allocate the longest length for each cell."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
 @dataclass(frozen=True, eq=False)
 class ForeignTable:
-    """Named columns of equal length; texts that are no numbers are kept as texts."""
+    """Named columns of equal length; columns with non-numeric texts stay texts."""
 
     path: Path
     columns: dict[str, np.ndarray]
     units: Mapping[str, str] = field(default_factory=dict)
-    """Column -> its unit, where a row of units has it."""
+    """Column -> unit, from a row of units."""
     dates: tuple[str, ...] = ()
     """Columns of dates, as nanoseconds since 1970."""
     remarks: tuple[str, ...] = ()
-    """What was unusual and how it was read, for people."""
+    """Remarks on unusual content and its interpretation."""
     lines: tuple[int, ...] = ()
-    """Line of the file of each row, from 1; empty where there are no lines."""
+    """Line of each row in the file, from 1; empty for binary files."""
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
@@ -147,7 +147,7 @@ def _begins_with_digit(line: str) -> bool:
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """What separates cells; None for blanks. Semicolons and tabs come before commas, which may be decimal."""
+    """Separator of cells; None for blanks. Semicolons and tabs come before commas, which may be decimal."""
     for mark in ";\t":
         if all(mark in line for line in lines):
             return mark
@@ -155,7 +155,7 @@ def _delimiter(lines: list[str]) -> str | None:
 
 
 def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], list[str]]:
-    """Rows of one length, without empty cells behind the last column; and what was unusual."""
+    """Rows of equal length, without empty trailing cells; and remarks."""
     width, remarks = len(rows[0]), []
     if width > 1 and not rows[0][-1] and all(len(row) == width and not row[-1] for row in rows):
         rows, width = [row[:-1] for row in rows], width - 1
@@ -169,7 +169,7 @@ def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], l
 
 
 def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
-    """Whether a row under the header has units: words where the row after has numbers."""
+    """Whether a row under the header has units: words above numbers."""
     numeric = [index for index, cell in enumerate(after) if cell and _is_number(cell, commas)]
     return (
         len(numeric) >= 0.5 * len(after)

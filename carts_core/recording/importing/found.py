@@ -14,7 +14,7 @@ NoteKind = Literal["found", "guessed", "missing", "warning"]
 
 
 def recording_name(path: Path) -> str:
-    """What a recording is called by default: its folder's name, or its file's without the suffix."""
+    """Default name of a recording: its folder's name, or its file's without the suffix."""
     path = path.absolute()
     return path.name if path.is_dir() else path.stem
 
@@ -25,12 +25,12 @@ class Note:
 
     kind: NoteKind
     text: str
-    """A sentence for people; guesses and what is missing say how to change it."""
+    """A sentence; notes on guesses and missing values name the option that changes them."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera and where its images lie."""
+    """A camera and the location of its images."""
 
     name: str
     size: tuple[int, int]
@@ -38,30 +38,30 @@ class FoundCamera:
     images: Path
     """Folder, video or bag; absolute."""
     pattern: str = ""
-    """Name of every frame's image below `images`; empty for a video or bag."""
+    """File name pattern of a frame below `images`; empty for a video or bag."""
     intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy [px], None where not known."""
+    """fx, fy, cx, cy [px]; None if not known."""
     pixel_center: float = 0.0
-    """Where the first pixel's centre is in these: 0 in OpenCV's convention, 0.5 in ours."""
+    """Position of the first pixel's centre: 0 in OpenCV's convention, 0.5 in ours."""
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients."""
     T_camera_world: Float[np.ndarray, "4 4"] | None = None
-    """[m]; None where not known. The world is the frame of the first camera."""
+    """[m]; None if not known. The world is the frame of the first camera."""
     rectification: Float[np.ndarray, "3 3"] | None = None
-    """R of ROS: from the camera's frame to the common one of a rectified pair."""
+    """R of ROS: from the camera's frame to the common frame of a rectified pair."""
     projection: Float[np.ndarray, "3 4"] | None = None
-    """P of ROS [px], whose last column has the baseline."""
+    """P of ROS [px]; its last column contains the baseline."""
     masks: str = ""
-    """Pattern of its masks, below `images.parent` or absolute; empty without masks."""
+    """File name pattern of its masks, below `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False
     bits: int | None = None
-    """Of the values of images with 16; None for 8."""
+    """Bit depth of images of 16 bits; None for 8."""
     crop: tuple[int, int, int, int] | None = None
-    """Left, top, width, height of its part of each image [px]."""
+    """Left, top, width, height of its part of each image [px]; None for the whole image."""
     topic: str = ""
-    """In a bag."""
+    """Topic in a bag; empty for other sources."""
     numbers: Int[np.ndarray, " frames"] | None = None
-    """Frame of its video, or record time of its message [ns], for every frame; None where frames are counted."""
+    """Video frame number, or record time of the message [ns], of every frame; None where frames are counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,66 +70,66 @@ class FoundArm:
 
     name: str
     columns: tuple[str, ...] = ()
-    """Joints of the robot that are measured."""
+    """Names of the measured joints."""
     values: Float[np.ndarray, "rows columns"] | None = None
     """[rad], [m]; None without kinematics."""
     times: Float[np.ndarray, " rows"] | None = None
-    """In the recording's seconds, increasing; None where row n belongs to frame n."""
+    """Times in the recording's clock, increasing [s]; None where row n belongs to frame n."""
     robot: str = "builtin:psm_lnd"
     T_world_base: Float[np.ndarray, "4 4"] | None = None
-    """[m]; None where not known."""
+    """[m]; None if not known."""
     base_from: str = ""
-    """What it was taken from, for people."""
+    """Source of the base frame, for the report."""
     fixed: tuple[str, ...] = ()
-    """Further joints of the robot, which stay at 0."""
+    """Further joints of the robot, constant at 0."""
     beyond_limits: bool = False
-    """Whether positions exceed the robot's limits all the same, so that the sequence file has to name their units."""
+    """Whether positions exceed the robot's limits, so that the sequence file has to name their units."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundMotion:
-    """Where what carries the cameras was over time."""
+    """Time series of the camera mount's pose."""
 
     times: Float[np.ndarray, " rows"]
-    """In the recording's seconds, increasing."""
+    """Times in the recording's clock, increasing [s]."""
     Ts_world_mount: Float[np.ndarray, "rows 4 4"]
     """[m]"""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundRecording:
-    """All that a source holds."""
+    """Content of a recording, as found by a source."""
 
     kind: str
-    """The source's name for people."""
+    """Name of the source."""
     name: str
     cameras: tuple[FoundCamera, ...]
     arms: tuple[FoundArm, ...]
     frame_ids: tuple[str, ...]
     frame_times: Float[np.ndarray, " frames"] | None
-    """In the recording's seconds; None where rows of the tables are frames."""
+    """Times in the recording's clock [s]; None where rows of the tables are frames."""
     notes: tuple[Note, ...] = ()
     time_offset: float = 0.0
     """Time in the kinematics minus time of the image [s]."""
     motion: FoundMotion | None = None
-    """Of all cameras; None for cameras that stay."""
+    """Motion of the mount that carries all cameras; None for static cameras."""
     domains: Mapping[str, str] = field(default_factory=dict)
-    """Domain -> what stands for {domain} in patterns; empty for one domain."""
+    """Domain -> value of {domain} in patterns; empty for one domain."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A kind of recording that can be imported."""
+    """A recording format that can be imported."""
 
     name: str
-    """As `--source` calls it."""
+    """Value of `--source`."""
     label: str
-    """For people."""
+    """Label of the format."""
     looked_for: str
-    """What shows that a folder or file is of this kind, for people."""
+    """Files by which the format is detected, as a phrase."""
     detect: Callable[[Path], bool]
-    """Whether a path is of this kind; quick, and without an error whatever the path is."""
+    """Whether a path is of this format; quick, never raises."""
     uses: tuple[str, ...]
-    """Names of the `ImportOptions` that it uses beside those of arms, robots and calibrations, which all do."""
+    """Names of the `ImportOptions` that it uses, besides those of arms, robots and calibrations, which all use."""
     read: Callable[[Path, ImportOptions], FoundRecording]
-    """Everything that is found; raises a `CartsError` for what is damaged or contradicts itself."""
+    """Reads the recording; raises a `CartsError` for damaged or contradictory content."""

@@ -1,4 +1,4 @@
-"""From a path of any kind to a sequence file."""
+"""Import of a recording of any known format as a sequence file."""
 
 import os
 from dataclasses import replace
@@ -17,16 +17,16 @@ _UNFINISHED = {
     ".mcap.zstd": "it is compressed as a whole. Unpack it with `zstd -d`, and give what comes out.",
     ".db3.zstd": "it is one file of a bag. Give the folder with its metadata.yaml.",
 }
-"""Ends of names of bags that need another program first."""
+"""Suffixes of incomplete bags, which another program has to finish first."""
 
 
 def known_kinds() -> str:
-    """The kinds of recordings, in the order in which they are looked for, one a line."""
+    """Known formats in order of detection, one a line."""
     return "\n".join(f"  {source.name}: {source.label} ({source.looked_for})" for source in SOURCES)
 
 
 def detect(path: Path, name: str | None = None) -> Source:
-    """The kind of a recording.
+    """Format of a recording.
 
     Args:
         path: file or folder.
@@ -54,7 +54,7 @@ def detect(path: Path, name: str | None = None) -> Source:
 
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
-    """What a recording holds, with stand-ins for what it lacks; nothing is written.
+    """Content of a recording, completed with stand-ins; nothing is written.
 
     Raises:
         CartsError: it is of no known kind, damaged, or contradicts itself.
@@ -79,7 +79,7 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
 
 
 def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
-    """Options whose relative paths are seen from the working directory, else from the recording."""
+    """Options with relative paths resolved against the working directory, else the recording."""
     folder = path if path.is_dir() else path.parent
 
     def placed(given: Path | str) -> str | None:
@@ -97,7 +97,7 @@ def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
 
 
 def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
-    """See that all names that were given are those of arms and cameras that were found.
+    """Check that all given names are those of found arms and cameras.
 
     Raises:
         SequenceError: one is not; it lists those that are.
@@ -131,7 +131,7 @@ def _is_given(options: ImportOptions, name: str) -> bool:
 def import_recording(
     path: Path, folder: Path, options: ImportOptions | None = None, *, overwrite: bool = False
 ) -> tuple[Path, FoundRecording]:
-    """Write a sequence file for a recording, which stays where it is.
+    """Write a sequence file for a recording, which is not copied.
 
     Args:
         path: file or folder of the recording.

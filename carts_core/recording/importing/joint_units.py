@@ -1,4 +1,4 @@
-"""Joint positions of a log in radians and metres: units that were given, that names say, or that fit the limits."""
+"""Conversion of logged joint positions to radians and metres: units given, named in columns, or fitting the limits."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from ..kinematics_table import ANGLE_UNITS, LENGTH_UNITS, Joint, fits_roughly, j
 from .found import FoundArm, Note
 
 _INSERTED = 0.03
-"""[m] Joints that move along the instrument are beyond this in most recordings, since the tip is in view."""
+"""Insertion [m] that the insertion axis exceeds in most recordings, since the tip is in view."""
 
 
 def in_si(
@@ -26,7 +26,7 @@ def in_si(
     columns: Sequence[str] = (),
     instrument: bool = True,
 ) -> Float[np.ndarray, "rows joints"]:
-    """Positions as a log has them, in radians and metres and with the signs of the robot.
+    """Logged positions in radians and metres, with the signs of the robot.
 
     Args:
         values: of each joint, by rows.
@@ -72,7 +72,7 @@ def in_si(
 
 
 def joints_of_arm(arm: str, options: ImportOptions) -> tuple[Joint, ...]:
-    """The joints of the robot that was given for an arm, else of the default one.
+    """Joints of the robot given for an arm, else of the default one.
 
     Raises:
         SequenceError: the robot is missing.
@@ -134,7 +134,7 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
 
 
 def length_unit(highest: float, limit: float, arm: str, what: str, orders: Sequence[str] = ()) -> str:
-    """The unit in which a length is possible.
+    """The unit in which a length is plausible.
 
     Args:
         highest: largest magnitude, as logged.
@@ -160,7 +160,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
 
 
 def check_limits(arm: FoundArm, note: Callable[[Note], None]) -> bool:
-    """Compare an arm's positions with its robot's limits; a note says what is beyond, and what would fit.
+    """Compare an arm's positions with its robot's limits; a note names violations and remedies.
 
     Returns:
         Whether all are within.
@@ -181,7 +181,7 @@ def check_limits(arm: FoundArm, note: Callable[[Note], None]) -> bool:
 
 
 def _option(joint: str, remedy: str) -> str:
-    """The option that takes a remedy."""
+    """The command line option for a remedy."""
     if remedy == "the other sign":
         return f"--flip {joint}"
     if "order" in remedy or "way round" in remedy:

@@ -20,11 +20,11 @@ from .found import FoundArm, FoundMotion, Note
 from .joint_units import in_si, joints_of_arm
 
 SAME_CYCLE = 2e-3
-"""[s] Rows of two topics this near to each other were written in the same cycle of a controller."""
+"""Largest time between rows of two topics of the same controller cycle [s]."""
 
 
 def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> float:
-    """By how much rows of `times` are stamped later than the rows of `other` of the same cycle [s].
+    """Time stamp difference between rows of `times` and of `other` from the same cycle [s].
 
     Topics of one cycle are stamped one after the other, so their stamps differ by a constant, which is not motion. It
     is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between topics
@@ -38,7 +38,7 @@ def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " o
 def at_times(
     wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "wanted columns"]:
-    """Values at other times, linear between the rows before and after; NaN before the first and after the last row."""
+    """Values interpolated linearly at other times; NaN outside the range of the rows."""
     columns = [np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T]
     return np.stack(columns, axis=1)
 
@@ -52,33 +52,33 @@ def nearest(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_
 
 
 ACCEPTED = 2e-5
-"""[m] The base of the right instrument moves by no more than this, in the median row."""
+"""Largest deviation of the base for the right instrument, in the median row [m]."""
 _AMBIGUOUS = 2.0
-"""The best lengths must be this many times as good as the next ones."""
+"""Factor by which the best lengths must be better than the next ones."""
 _FEWEST_ROWS = 20
 
 WRIST_LENGTHS = (0.0091, 0.0093, 0.0100, 0.0107, 0.0112)
-"""[m] From wrist pitch to wrist yaw, of all wristed 8 mm instruments."""
+"""Wrist length of wristed 8 mm instruments, from wrist pitch to wrist yaw [m]."""
 
 CANDIDATES: Mapping[str, PsmGeometry] = {
     f"{1e3 * length:.1f} mm wrist": replace(CLASSIC, wrist_length=length) for length in WRIST_LENGTHS
 }
-"""Lengths of the known instruments on their own arm; classic and Si come out the same, since only shaft length minus
+"""Lengths of the known instruments on their own arm. Classic and Si are the same, since only shaft length minus
 distance to the remote centre counts (-15.6 mm for both)."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseFrame:
-    """The arm's base as a recording with joints and poses gives it."""
+    """Base frame of an arm, estimated from joint positions and poses."""
 
     T_reference_base: Float[np.ndarray, "4 4"]
-    """[m] The reference is the frame that the poses are given in."""
+    """Base frame in the reference frame of the poses [m]."""
     deviation: float
-    """How far the base is from there in the median row [m]."""
+    """Distance of the base from the estimate in the median row [m]."""
     largest_deviation: float
-    """In the worst row [m]."""
+    """Distance in the worst row [m]."""
     rotation_deviation: float
-    """How far it is turned in the median row [rad]."""
+    """Rotation from the estimate in the median row [rad]."""
 
 
 def fit_base_frame(
@@ -86,7 +86,7 @@ def fit_base_frame(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> BaseFrame:
-    """The base frame that joint positions [rad, m] and the tip's poses [m] at the same times agree on.
+    """Base frame that fits joint positions [rad, m] to poses of the tip [m] at the same times.
 
     Raises:
         CartsError: there are no rows with both.
@@ -112,7 +112,7 @@ def fit_tool_point(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Where the point of poses is, seen from the tip, and how far the base moves with it in the median row [m].
+    """Position of the point of poses in the tip's frame, and the remaining deviation of the base in the median row [m].
 
     With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the places of the point at d from the tip are
     p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
@@ -132,28 +132,28 @@ def fit_tool_point(
 
 @dataclass(frozen=True, eq=False)
 class InstrumentCheck:
-    """How well instruments explain a recording."""
+    """Fit of the known instruments to a recording."""
 
     fits: Mapping[str, BaseFrame]
     """Name -> fit, the best first."""
 
     @property
     def best(self) -> str:
-        """Name of the instrument that explains the recording best."""
+        """Name of the best fitting instrument."""
         return next(iter(self.fits))
 
     def accepts(self, name: str) -> bool:
-        """Whether a recording can be of this instrument."""
+        """Whether a recording is compatible with this instrument."""
         return self.fits[name].deviation <= ACCEPTED
 
     @property
     def decides(self) -> bool:
-        """Whether the best instrument is accepted and clearly better than every other one."""
+        """Whether the best instrument is accepted and clearly better than all others."""
         deviations = [fit.deviation for fit in self.fits.values()]
         return self.accepts(self.best) and all(_AMBIGUOUS * deviations[0] < other for other in deviations[1:])
 
     def warning(self, name: str) -> str | None:
-        """What to tell whoever chose an instrument; None when it fits."""
+        """Warning about a chosen instrument; None when it fits."""
         fit = self.fits[name]
         if self.accepts(name):
             return None
@@ -173,7 +173,7 @@ def check_instrument(
     joints: Float[np.ndarray, "rows 6"],
     candidates: Mapping[str, PsmGeometry] = CANDIDATES,
 ) -> InstrumentCheck:
-    """Compare instruments by how still the arm's base stands with each.
+    """Rank instruments by how constant the arm's base is with each.
 
     Args:
         Ts_reference_tip: poses of the tip in any frame that does not move against the base [m].
@@ -191,25 +191,25 @@ def check_instrument(
 
 
 _SAME_BASE = 1e-3
-"""[m], [rad] A base frame nearer to the identity than this was not set in the dVRK."""
+"""Distance from the identity [m], [rad] below which a base frame counts as not set in the dVRK."""
 _CHECKED_ROWS = 5000
 _FEWEST_REACHABLE = 0.5
 _SAME_POINT = 1e-4
-"""[m] A point nearer to the tip than this is the tip."""
+"""Distance from the tip below which a point counts as the tip [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Rows of numbers with times."""
+    """Time series of numbers."""
 
     times: Float[np.ndarray, " rows"]
-    """In the recording's seconds, increasing."""
+    """Times in the recording's clock, increasing [s]."""
     values: Float[np.ndarray, "rows columns"]
 
 
 @dataclass(frozen=True, eq=False)
 class ArmLog:
-    """What a recording has of one arm."""
+    """Logged values of one arm."""
 
     name: str
     joints: Track | None = None
@@ -225,15 +225,15 @@ class ArmLog:
     tool: str = ""
     """The dVRK's `tool_type`."""
     opencv_axes: bool = False
-    """Whether `poses` and `setup` are in a camera with OpenCV's axes instead of the dVRK's."""
+    """Whether `poses` and `setup` use OpenCV's camera axes instead of the dVRK's."""
     names: tuple[str, ...] = ()
-    """Joints of another robot than a PSM, which `joints` has instead of six."""
+    """Joints in `joints` of another robot than a PSM; empty for a PSM."""
     si: bool = False
-    """Whether units and signs that were given are applied already."""
+    """Whether given units and signs are already applied."""
 
 
 def track(rows: ArrayLike | None) -> Track | None:
-    """Rows of (time, values ...) in order of time; rows that are not finite or repeat a time are left out."""
+    """Rows of (time, values ...) sorted by time; rows that are not finite or repeat a time are dropped."""
     table = np.array(rows, np.float64)
     if table.ndim != 2 or not len(table):
         return None
@@ -255,7 +255,7 @@ def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4
 
 
 def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> FoundArm:
-    """Joint positions and base frame of an arm; notes say where they come from.
+    """Joint positions and base frame of an arm; notes name their sources.
 
     Raises:
         SequenceError: the log has neither joints nor poses, or no joints reach most of its poses.
@@ -297,7 +297,7 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
 
 
 def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> ArmLog:
-    """The log with the units and signs that were given for it."""
+    """The log in SI units, by the given units and signs."""
     robot = {joint.name: joint for joint in joints_of_arm(log.name, options)}
 
     def applied(logged: Track | None, names: tuple[str, ...]) -> Track | None:
@@ -310,7 +310,7 @@ def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) ->
 
 
 def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """Poses and joints of some rows that have both; None where they are too few to compare."""
+    """Poses and joints of sampled rows that have both; None if they are too few."""
     poses = log.poses or log.local_poses
     if log.joints is None or poses is None:
         return None
@@ -366,7 +366,7 @@ def _inverse_of(poses: Track | None) -> Track | None:
 
 
 def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> PsmGeometry:
-    """The instrument's lengths: as given, as the recording itself shows, or those of a Large Needle Driver."""
+    """Lengths of the instrument: as given, as estimated from the recording, or those of a Large Needle Driver."""
     if log.tool:
         note(Note("found", f"{log.name}: tool_type is {log.tool}."))
     chosen = replace(CLASSIC, wrist_length=options.wrist_length) if options.wrist_length is not None else CLASSIC
@@ -402,7 +402,7 @@ def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None])
 def _base_frame(
     log: ArmLog, options: ImportOptions, geometry: PsmGeometry, note: Callable[[Note], None]
 ) -> tuple[np.ndarray | None, str]:
-    """The arm's base in the camera, with OpenCV's axes, and where it comes from; None where nothing says it."""
+    """Base frame of the arm in the camera with OpenCV's axes, and its source; None if not known."""
     if (path := options.base.get(log.name)) is not None:
         frames = read_base_frames(path, options.axes)
         chosen = [frame for frame in frames if frame.arm == log.name] or ([frames[0]] if len(frames) == 1 else [])
@@ -453,7 +453,7 @@ def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | No
 def _solved(
     log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, note: Callable[[Note], None]
 ) -> Track:
-    """Joint positions by inverse kinematics of the poses."""
+    """Joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:
         raise SequenceError(
@@ -480,13 +480,13 @@ def _solved(
 
 
 _MOVES = 5e-4, 0.1
-"""[m], [deg] An endoscope that moves by less stands still."""
+"""Motion [m], [deg] below which an endoscope counts as static."""
 
 
 def endoscope_motion(
     poses: Track | None, joints: Track | None, start: float, note: Callable[[Note], None]
 ) -> FoundMotion | None:
-    """The pose of the camera over time, in the world whose origin it is at the first image; None if it stands still.
+    """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
 
     The tip of the ECM counts as the camera, with the dVRK's axes; what the camera's place on the tip differs from that,
     `carts calibrate` finds.
@@ -528,6 +528,6 @@ def endoscope_motion(
 
 
 def _extent(Ts: Float[np.ndarray, "rows 4 4"]) -> tuple[float, float]:
-    """How far poses are at most from the first image's [m], [deg]."""
+    """Largest distance of poses from the first image's [m], [deg]."""
     turns = Rotation.from_matrix(Ts[:, :3, :3]).magnitude()
     return float(np.linalg.norm(Ts[:, :3, 3], axis=1).max()), float(np.degrees(turns.max()))

@@ -20,15 +20,15 @@ from .joint_units import check_limits
 
 _ROWS = 200
 _NEAREST, _FARTHEST = 0.01, 0.6
-"""[m] Depths at which an endoscope sees an instrument."""
+"""Depths at which an endoscope sees an instrument [m]."""
 _BORDER = 0.5
 """Share of the image's size by which a tip may be outside, since base frames are some centimetres off."""
 _IN_VIEW, _OUT = 0.5, 0.1
-"""Shares of rows with the tip in view that are enough, and that are too few."""
+"""Share of rows with the tip in view that is sufficient, and share that is too small."""
 
 
 def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
-    """Places of the tip, or of the last link of another robot, in the base frame [m]."""
+    """Positions of the tip, or of the last link of another robot, in the base frame [m]."""
     assert arm.values is not None
     if arm.columns[: len(JOINT_NAMES)] == JOINT_NAMES:
         return forward(arm.values[:, : len(JOINT_NAMES)], CLASSIC)[:, :3, 3]
@@ -40,7 +40,7 @@ def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
 
 
 def check_in_view(arm: FoundArm, camera: FoundCamera, note: Callable[[Note], None]) -> None:
-    """Say where a base frame puts the tip out of view, and another reading of it puts it in view."""
+    """Warn if a base frame puts the tip out of view and another reading of it puts it in view."""
     if arm.values is None or arm.T_world_base is None or camera.intrinsics is None:
         return
     tips = tips_of(arm)[:: max(1, len(arm.values) // _ROWS)]
@@ -65,7 +65,7 @@ def _scaled(T: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -> float:
-    """Share of tips that a camera sees."""
+    """Share of the tips in view of a camera."""
     assert camera.intrinsics is not None
     points = tips @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
     depth = points[:, 2]
@@ -78,7 +78,7 @@ def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -
 
 
 def check_pair(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -> None:
-    """Say where the right camera of a pair stands at the left of the left one."""
+    """Warn if the right camera of a pair is on the left of the left one."""
     by_name = {camera.name: camera for camera in cameras}
     if not {"left", "right"} <= set(by_name):
         return
@@ -93,17 +93,17 @@ def check_pair(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -
 
 
 MAX_GAP = 0.1
-"""[s] As in the sequence format: rows that are used may be this far away."""
+"""Largest time between a frame and the rows used for it, as in the sequence format [s]."""
 FOCAL_WIDTHS = 1.2
-"""Stand-in for a focal length: that of an endoscope of some 45 degrees, in widths of the image."""
+"""Default focal length of an endoscope of about 45 degrees, in image widths."""
 _DISTANCE = 0.12
-"""[m] Stand-in for the distance from the camera to the tips."""
+"""Default distance from the camera to the tips [m]."""
 _BEHIND = -1.0
-"""[m] Where an arm without kinematics stands: behind the camera, where no image shows it."""
+"""Default position of an arm without kinematics: behind the camera, so that no image shows it [m]."""
 
 
 def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecording:
-    """The recording with only the frames that have kinematics, and with stand-ins; notes say which.
+    """The recording restricted to frames with kinematics and completed with defaults; notes list them.
 
     Joints are compared with the limits of their robots, and base frames with what the cameras see.
 

@@ -1,4 +1,4 @@
-"""Which image each row of a log belongs to: by times, a frame rate, file names, numbers, or order.
+"""Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
 Times win, then a frame rate that was given, then a column with the images' file names or numbers, then the order of
 rows that are as many as the images. A video's own times are only its nominal rate: one row for each image comes before
@@ -20,65 +20,65 @@ from .cameras import Images
 from .found import FoundArm, Note
 
 _STAMPED_DIGITS = 13
-"""Names of images with numbers this long are times."""
+"""Digits from which numbers in image names are times."""
 _LONGEST = 1e6
-"""[s] No recording lasts longer."""
+"""Longest recording [s]."""
 _LEAST: Mapping[Clock, tuple[float, float]] = {
     "ns": (1e17, 9e5),
     "us": (1e14, 9e2),
     "ms": (1e11, 0.9),
     "s": (1e8, 0.0),
 }
-"""Unit -> least time since 1970, and least spacing of rows, in that unit."""
+"""Unit -> smallest time since 1970, and smallest spacing of rows, in that unit."""
 _FEW = 0.1
-"""Share of rows without an image up to which a column of numbers is taken for numbers of images."""
+"""Share of rows without an image up to which a column of numbers counts as image numbers."""
 _INDEX = ("index", "id", "", "unnamed 0", "row", "seq", "sequence")
 """Names of columns that may count rows instead of images."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTimes:
-    """The images of a recording and the times at which they were taken."""
+    """Images of a recording and their times."""
 
     ids: tuple[str, ...]
     stems: tuple[str, ...]
     """File names without suffix; the ids for a video."""
     times: Float[np.ndarray, " frames"] | None
-    """[s]; None where not known."""
+    """[s]; None if not known."""
     source: str
-    """What the times are from, for people."""
+    """Source of the times, for the report."""
     nominal: bool = False
-    """Whether they are a video's constant rate."""
+    """Whether the times are those of a video's constant rate."""
     given: bool = False
-    """Whether they are the frame rate that was given."""
+    """Whether the times are from the given frame rate."""
     counted: bool = False
     """Whether the ids are counted from 0, as those of a video, instead of read from names."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogRows:
-    """What the rows of a log say about images."""
+    """References from the rows of a log to images."""
 
     name: str
-    """Of the log, for people."""
+    """Name of the log, for the report."""
     count: int
     times: np.ndarray | None = None
-    """Raw values of the column of times; None without one."""
+    """Raw times; None without a column of times."""
     time_column: str = ""
     images: np.ndarray | None = None
-    """Cells of the column with file names or numbers of images; None without one."""
+    """File names or numbers of images; None without such a column."""
     image_column: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class RowMatch:
-    """How rows meet images."""
+    """Result of matching rows with images."""
 
     rows: Float[np.ndarray, " rows"]
-    """Time of each row [s], or where `by_image` the position of its image, NaN for none."""
+    """Time of each row [s]; with `by_image` the index of its image, NaN for none."""
     by_image: bool
     frame_times: Float[np.ndarray, " frames"] | None
-    """[s]; None where rows are images and nothing has times."""
+    """[s]; None where rows are images and there are no times."""
     time_offset: float = 0.0
     """Time in the log minus time of the image [s]."""
 
@@ -86,7 +86,7 @@ class RowMatch:
 def frame_times(
     images: Images, ids: tuple[str, ...], options: ImportOptions, note: Callable[[Note], None]
 ) -> FrameTimes:
-    """The times of images: those in their names, the frame rate that was given, or those of a video.
+    """Times of images: from their names, from the given frame rate, or from a video.
 
     Args:
         images: of the leading camera.
@@ -137,7 +137,7 @@ def _without_rate(found: FrameTimes, options: ImportOptions, note: Callable[[Not
 
 
 def _numbered(ids: tuple[str, ...], note: Callable[[Note], None]) -> np.ndarray:
-    """Images counted from 0, with the gaps that single numbers leave in their names."""
+    """Images counted from 0, with gaps where single numbers are missing in their names."""
     numbers = np.array([int(frame) for frame in ids], np.float64)
     steps = np.diff(numbers)
     step = float(np.median(steps)) if len(steps) else 1.0
@@ -151,7 +151,7 @@ def _numbered(ids: tuple[str, ...], note: Callable[[Note], None]) -> np.ndarray:
 
 
 def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
-    """The unit of times: by their size where they count from 1970, else by spacing and by what they should last.
+    """Unit of times: by their magnitude if they count from 1970, else by spacing and expected duration.
 
     Args:
         values: of one column.
@@ -181,7 +181,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 def row_seconds(
     rows: LogRows, clock: Clock | None, note: Callable[[Note], None], span: float | None = None
 ) -> Float[np.ndarray, " rows"] | None:
-    """The times of rows [s]; their unit is guessed where it is not given.
+    """Times of rows [s]; their unit is guessed if it is not given.
 
     Raises:
         SequenceError: times go back.
@@ -206,7 +206,7 @@ def row_seconds(
 
 
 def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: Callable[[Note], None]) -> RowMatch:
-    """Find how rows meet images.
+    """Match rows with images.
 
     Args:
         frames: with their times, where known.
@@ -308,7 +308,7 @@ def _by_image(
 
 
 def _counts_rows(named: np.ndarray, rows: LogRows, times: np.ndarray | None) -> bool:
-    """Whether a column of numbers may count rows: it has a general name, and many rows have no image."""
+    """Whether a column may count rows: it has a generic name, and many rows have no image."""
     assert rows.images is not None
     general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
     return general and rows.images.dtype.kind in "iuf" and (named < 0).mean() > _FEW
@@ -320,7 +320,7 @@ def _is_one_each(named: np.ndarray, frames: FrameTimes) -> bool:
 
 
 def _named(frames: FrameTimes, rows: LogRows, note: Callable[[Note], None]) -> Int[np.ndarray, " rows"] | None:
-    """The position of each row's image, -1 for none; None where fewer than half of the rows or images are found."""
+    """Index of each row's image, -1 for none; None if fewer than half of the rows or images are matched."""
     if rows.images is None:
         return None
     by_stem = {stem: index for index, stem in enumerate(frames.stems)}
@@ -336,7 +336,7 @@ def _stem(cell: str) -> str:
 
 
 def _number(cell: object) -> int | None:
-    """A whole number, or the last one in a file name."""
+    """A whole number, or the last number in a file name."""
     if isinstance(cell, str):
         found = re.findall(r"\d+", _stem(cell))
         return int(found[-1]) if found else None
@@ -373,7 +373,7 @@ def by_rows(
     notes: list[Note],
     times: Float[np.ndarray, " frames"] | None = None,
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
-    """Arms whose times are numbers of frames, for the frames that all of them have.
+    """Arms whose times are frame numbers, restricted to the frames that all of them have.
 
     Args:
         arms: `times` are positions in `ids`.

@@ -1,4 +1,4 @@
-"""A sequence file with comments, and the small tables beside it, from what was found."""
+"""Writing of a sequence file with comments, and of its tables."""
 
 import io
 import json
@@ -25,7 +25,7 @@ _HANDLE = "frame"
 
 
 def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write FOLDER/sequence.toml with its tables, whole or not at all; images and videos stay where they are.
+    """Write FOLDER/sequence.toml with its tables, whole or not at all; images and videos are not copied.
 
     Args:
         recording: completed (`placing.completed`).
@@ -56,7 +56,7 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
 
 
 def _of_recording(text: str, trial: str, recording: FoundRecording) -> str:
-    """An error about the files of the trial, which are gone, as one about the recording."""
+    """An error about temporary files, rephrased as one about the recording."""
     tables = {FRAMES: "", **{_table_of(arm): f" in the log of {arm.name}" for arm in recording.arms}}
     for table, where in tables.items():
 
@@ -71,7 +71,7 @@ def _of_recording(text: str, trial: str, recording: FoundRecording) -> str:
 
 
 def _write(recording: FoundRecording, target: Path | OutputPath, place: Path) -> None:
-    """Write all files into `target`, with paths as seen from `place`."""
+    """Write all files into `target`, with paths relative to `place`."""
     tables = _tables(recording)
     for name, content in tables.items():
         write_bytes(target / name, content)
@@ -111,7 +111,7 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
 
 
 def _moves(recording: FoundRecording) -> bool:
-    """Whether where the cameras are is written; only logs with times have a place for it."""
+    """Whether camera motion is written, which needs logs with times."""
     return recording.motion is not None and any(arm.times is not None for arm in recording.arms)
 
 
@@ -254,7 +254,7 @@ def _relative(path: Path, place: Path) -> str:
 
 
 def _text(value: object) -> str:
-    """Text, or a list of texts, as TOML writes it: its strings are those of JSON."""
+    """Text, or a list of texts, as TOML, whose strings are those of JSON."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

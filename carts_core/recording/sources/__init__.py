@@ -1,4 +1,4 @@
-"""One module per foreign format; the first one that detects a path reads it."""
+"""Foreign recording formats, one module each; the first that detects a path reads it."""
 
 from ..importing.found import Source as Source
 from .bag import SOURCE as _BAG
@@ -26,4 +26,4 @@ SOURCES: tuple[Source, ...] = (
     _JIGSAWS,
     _FOLDER,
 )
-"""In the order in which they are tried: those with clear signs first, what fits nearly everything last."""
+"""Sources in order of detection: the most specific first, the generic folder last."""

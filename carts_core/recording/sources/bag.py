@@ -26,7 +26,7 @@ _JOINTS = ("measured_js", "state_joint_current")
 
 
 def read_endoscope(bag: Bag, start: float, note: Callable[[Note], None]) -> FoundMotion | None:
-    """Where the endoscope was, if it moves.
+    """Motion of the endoscope; None if it is static.
 
     Args:
         bag: the recording.
@@ -55,16 +55,16 @@ def _is_of_ecm(topic: str, name: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SeparateImages:
-    """Cameras whose images lie in files, and the frames that all of them have."""
+    """Cameras whose images are files, and the frames that all of them have."""
 
     cameras: tuple[FoundCamera, ...]
     ids: tuple[str, ...]
     times: Float[np.ndarray, " frames"]
-    """[s], in a clock of their own."""
+    """Times in the clock of the images [s]."""
 
     def offset(self, arms: tuple[FoundArm, ...], notes: list[Note]) -> float:
-        """Time in the kinematics minus time of the images [s], where nobody has said it: 0 in one clock, and else as
-        if both had begun together."""
+        """Default time in the kinematics minus time of the images [s]: 0 for overlapping clocks, else with a common
+        start."""
         begin = [float(arm.times[0]) for arm in arms if arm.times is not None]
         end = [float(arm.times[-1]) for arm in arms if arm.times is not None]
         apart = not begin or self.times[0] > max(end) or self.times[-1] < min(begin)
@@ -75,7 +75,7 @@ class SeparateImages:
 
 
 def separate_images(path: Path, topics: list[str], options: ImportOptions, notes: list[Note]) -> SeparateImages | None:
-    """The images that were named as files or folders; None where they are topics of the bag, or nobody named any.
+    """Images given as files or folders; None if none are given or they are topics of the bag.
 
     Args:
         path: of the bag; names are relative to where the command is run, or to its folder.
@@ -130,7 +130,7 @@ def _detect(path: Path) -> bool:
 
 
 def read_arm_logs(bag: Bag, options: ImportOptions, notes: list[Note]) -> list[ArmLog]:
-    """What a bag has logged of its arms, by the arms' names; notes say of joints in another order.
+    """Logs of the arms in a bag by name; notes report joints in another order.
 
     Raises:
         SequenceError: a message is damaged, or an arm that was asked for is not there.
@@ -244,7 +244,7 @@ def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple
 
 
 def _camera_info(bag: Bag, topic: str) -> Any:
-    """The camera_info that belongs to an image topic: beside it, or of the same side; None without one."""
+    """The camera_info of an image topic: beside it, or of the same side; None without one."""
     infos = [info for info, kind in bag.topics if kind == _INFO_TYPE]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3)]
     chosen = [info for parent in parents for info in infos if info.rsplit("/", 1)[0] == parent]

@@ -1,4 +1,4 @@
-"""The layouts of the CaRTS paper (CTS), of its simulated videos (AMBF) and of the SegSTRONG-C challenge.
+"""Layouts of the CaRTS paper (CTS), of its simulated videos (AMBF) and of the SegSTRONG-C challenge.
 
 CTS           SET/DOMAIN/images_l/I.png, SET/green_screen/{ground_truth_l/I.png, psm1_js.npy, psm2_js.npy}
 AMBF          VIDEO/{images,segmentations}/I.png, VIDEO/kinematics.npy (eight columns an arm, the jaw twice)
@@ -26,9 +26,9 @@ _TRUTH = "green_screen"
 _FIRST = ("regular",)
 _AMBF_COLUMNS = 8
 _AMBF_FIELD_OF_VIEW = 1.2
-"""[rad] Vertical, of the simulated camera."""
+"""Vertical field of view of the simulated camera [rad]."""
 _DECIMETRES_FROM = 0.3
-"""[m] No instrument is inserted that far; older simulations count in decimetres."""
+"""Insertion above which a simulation counts in decimetres [m]."""
 
 
 def _subfolders(path: Path) -> list[Path]:
@@ -39,14 +39,14 @@ def _subfolders(path: Path) -> list[Path]:
 
 
 def _ordered(names: Iterable[str]) -> list[str]:
-    """Domains with the regular one first."""
+    """Domains, the regular one first."""
     return sorted(names, key=lambda name: (name not in _FIRST, name))
 
 
 def _domain_images(
     path: Path, domains: list[str], folder: str, notes: list[Note]
 ) -> tuple[Images, tuple[str, ...]] | None:
-    """Images of one camera in all domains, under one pattern, and the frames that all domains have."""
+    """Images of one camera in all domains under one pattern, and the frames that all domains have."""
     places = [path / domain / folder for domain in domains]
     if not all(image_files(place) for place in places):
         return None
@@ -65,7 +65,7 @@ def _domain_images(
 
 
 def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: list[Note]) -> FoundCamera:
-    """The camera with the masks of a folder, where these are white on black."""
+    """The camera with the masks of a folder, if they are white on black."""
     if not image_files(folder):
         return camera
     masks = find_images(folder)
@@ -136,7 +136,7 @@ def _domains(names: list[str]) -> dict[str, str]:
 def _timed(
     arms: list[FoundArm], ids: tuple[str, ...], images: Images, options: ImportOptions, notes: list[Note]
 ) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
-    """Arms whose rows have the times of their images, where a frame rate was given, and these times [s]."""
+    """Arms with rows at the times of their images if a frame rate is given, and these times [s]."""
     times = frame_times(images, ids, options, notes.append).times
     rows = np.arange(len(ids), dtype=float)
     found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, notes, times)
@@ -146,7 +146,7 @@ def _timed(
 def _arm(
     name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions, notes: list[Note]
 ) -> FoundArm:
-    """Rows of the frames: row n is frame n by its number where all rows are there, else by its place."""
+    """Joint positions of the frames: row n is frame n if no row is missing, else rows are matched in order."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
         raise SequenceError(f"{file} does not hold six finite joint positions a row. Copy it again.")
     numbers = np.array([int(frame) for frame in ids])

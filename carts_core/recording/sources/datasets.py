@@ -24,16 +24,16 @@ from ..importing.row_matching import by_rows, frame_times
 
 _JIGSAWS_COLUMNS = 76
 _JIGSAWS_ARMS = {"PSM_left": 38, "PSM_right": 57}
-"""Arm -> its first column, from 0; each has x y z, R by rows, two velocities and the gripper's angle."""
+"""Arm -> its first column, from 0: x y z, R by rows, two velocities and the gripper's angle."""
 _JIGSAWS_RATE = 30.0
 _LISTED = 12
-"""Most trials that an error names."""
+"""Largest number of trials listed in an error."""
 _ENDOVIS_PART = (320, 28, 1280, 1024)
-"""Left, top, width and height of the picture inside EndoVis' frames of 1920 x 1080."""
+"""Left, top, width and height of the picture inside EndoVis frames of 1920 x 1080 [px]."""
 
 
 def _surgpose_folder(path: Path) -> Path | None:
-    """Where a trajectory's videos are."""
+    """Folder with the videos of a trajectory."""
     for folder in (path / "regular", path / "green", path):
         if (folder / "left_video.mp4").is_file():
             return folder
@@ -151,7 +151,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, notes: list[Note]) -> 
 
 
 def jigsaws_trials(folder: Path) -> tuple[Path, ...]:
-    """Kinematics of the trials of JIGSAWS in a folder, in the order of their names.
+    """Kinematics of the JIGSAWS trials in a folder, sorted by name.
 
     Args:
         folder: the root of the data set, one of its tasks, or a folder of a task.

@@ -26,7 +26,7 @@ from .bag import read_arm_logs, read_endoscope
 _SIDES = {"LR": ("left", "right"), "RL": ("right", "left")}
 _OLD_UNITS = {"timestamps_ns": 1e-9, "timestamps_ms": 1e-3, "timestamps": 1.0}
 _FAR = 0.02
-"""[s] Images of two cameras further apart than this are said."""
+"""Time between images of two cameras above which a warning is given [s]."""
 _JOINT_COLUMNS = tuple(f"position.{index}" for index in range(6))
 _POSE_COLUMNS = (
     *(f"pose.position.{axis}" for axis in "xyz"),
@@ -46,7 +46,7 @@ class _Stream:
     """[s]"""
     side_by_side: str
     latency: float
-    """Estimated, of the images [s]."""
+    """Estimated latency of the images [s]."""
 
 
 def _json(path: Path, what: str) -> Any:
@@ -127,7 +127,7 @@ def _numbers(values: list[Any], path: Path) -> np.ndarray:
 
 
 def _frame_time(frame: dict[str, Any]) -> float:
-    """The time of a frame by the rule of the recorder's documentation [s]."""
+    """Time of a frame by the recorder's documentation [s]."""
     real = frame["cpu"]["realtime"]
 
     def known(key: str) -> int | None:
@@ -146,7 +146,7 @@ def _frame_time(frame: dict[str, Any]) -> float:
 
 
 def _checked(stream: _Stream, sidecar: Path, notes: list[Note]) -> _Stream:
-    """The stream without frames that the video does not have, in the order of their times."""
+    """The stream without frames that are missing in the video, sorted by time."""
     count = len(find_images(stream.video).ids)
     if stream.numbers.max() >= count or len(stream.numbers) < count:
         text = (
@@ -209,7 +209,7 @@ def _logs(
 
 
 def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
-    """Logs from CSV files called by their topic, `_PSM1_measured_js.csv`."""
+    """Logs from CSV files named by topic, `_PSM1_measured_js.csv`."""
     roles = {
         "jaw_measured_js": "jaw",
         "local_measured_cp": "local_poses",

@@ -1,4 +1,4 @@
-"""Anything else: folders of images or videos, a table of kinematics, and calibration files, found by their names."""
+"""Generic recordings: folders of images or videos, a table of kinematics, and calibration files, found by name."""
 
 import re
 from dataclasses import replace
@@ -31,7 +31,7 @@ def _detect(path: Path) -> bool:
 
 
 def _folders(path: Path) -> list[Path]:
-    """The folder and what lies in it, two levels down, without hidden ones."""
+    """Visible folders down to two levels below a folder, itself included."""
     found, level = [path], [path]
     for _ in range(_DEPTH):
         try:
@@ -62,7 +62,7 @@ def _tables(path: Path) -> list[Path]:
 
 
 def _image_places(path: Path) -> list[Path]:
-    """Folders of images, and videos; masks and the like are not among them."""
+    """Folders of images, and videos, except masks and the like."""
     places = [folder for folder in _folders(path) if image_files(folder)] + _files(path, SUFFIXES)
     return [
         place
@@ -90,7 +90,7 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
 
 
 def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes: list[Note]) -> dict[str, Path]:
-    """Calibration files by camera, of those without a given one: of the same side, or the only one."""
+    """Calibration files of the cameras without a given one: of the same side, or the only one."""
     files = [file for file in _files(path, _CALIBRATION_SUFFIXES) if _looks_like_calibration(file)]
     found: dict[str, Path] = {}
     for camera in cameras:
@@ -120,7 +120,7 @@ def _looks_like_calibration(file: Path) -> bool:
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
-    """The table that is read as kinematics or asked about: as named, with an arm, or else with many numbers.
+    """The table of kinematics: as named, with an arm, or else with many numbers.
 
     Raises:
         SequenceError: the table that was named is missing or damaged, or a chosen column is not there.
@@ -142,12 +142,12 @@ def _readable(file: Path) -> ForeignTable | None:
 
 
 def _is_wide(table: ForeignTable) -> bool:
-    """Whether a table whose columns are not known may have joints."""
+    """Whether a table with unknown columns may contain joints."""
     return len(table) > 1 and sum(values.dtype.kind in "iuf" for values in table.columns.values()) >= len(JOINT_NAMES)
 
 
 def _kinematics(path: Path, options: ImportOptions, notes: list[Note]) -> list[tuple[ForeignTable, ColumnMeanings]]:
-    """The tables that have an arm, each of another one, and what their columns mean.
+    """Tables that contain an arm, each another one, with the meanings of their columns.
 
     Raises:
         SequenceError: a table was named or may have joints, but its columns are not recognized; or it is damaged.
@@ -193,7 +193,7 @@ def _not_recognized(table: ForeignTable) -> SequenceError:
 
 
 def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
-    """An arm that no column names is called as the file is, where that is a PSM."""
+    """Name of an arm from the file's name, if that is a PSM."""
     name = arm_in(table.path.stem)
     if not name or "" not in meanings.arms:
         return meanings
@@ -203,7 +203,7 @@ def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
 def _frames(
     path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], options: ImportOptions, notes: list[Note]
 ) -> FrameTimes:
-    """The images with their times: a table with as many rows as images comes before a video's rate."""
+    """Images with their times: from a table with as many rows as images, else from a video's rate."""
     for file in _tables(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
@@ -253,7 +253,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
 
 
 def _without_kinematics(path: Path, options: ImportOptions) -> Note:
-    """Why there are images alone; tables that were looked at are named with their columns."""
+    """Why no kinematics were found, with the columns of the tables that were considered."""
     if options.kinematics == NO_TABLE:
         return Note("found", "kinematics are left out, as given.")
     tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
@@ -270,7 +270,7 @@ def _without_kinematics(path: Path, options: ImportOptions) -> Note:
 def _matched(
     found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: list[Note]
 ) -> tuple[tuple[FoundArm, ...], RowMatch]:
-    """The arms of all tables, and how their rows meet images, which is one way for all.
+    """Arms of all tables, and the common matching of their rows with images.
 
     Raises:
         SequenceError: it is not, or does not say.
@@ -302,7 +302,7 @@ def _matched(
 def _arms(
     table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, options: ImportOptions, notes: list[Note]
 ) -> tuple[FoundArm, ...]:
-    """Arms with a time for each row; rows of no image have a negative one and are left out."""
+    """Arms with a time for each row; rows without an image are dropped."""
     rename = {recorded: name for name, recorded in options.arms.items()}
     arms = []
     for recorded, found in meanings.arms.items():

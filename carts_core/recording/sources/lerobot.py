@@ -24,13 +24,13 @@ _EPISODE = re.compile(r"episode_(\d+)\.parquet$")
 
 @dataclass(frozen=True, eq=False)
 class _Episode:
-    """One episode: its rows, and where its images are in the videos."""
+    """One episode: its rows, and its location in the videos."""
 
     index: int
     table: ForeignTable
     """The episode's rows."""
     videos: dict[str, tuple[Path, int]]
-    """Feature -> video, and the episode's first frame in it."""
+    """Feature -> video, and the number of the episode's first frame in it."""
 
 
 def _detect(path: Path) -> bool:
@@ -38,7 +38,7 @@ def _detect(path: Path) -> bool:
 
 
 def _root(path: Path) -> Path:
-    """The data set's folder, also for one of its episode files."""
+    """The data set's folder, also given one of its episode files."""
     if path.is_file() and _EPISODE.search(path.name):
         return next((parent for parent in path.parents if (parent / "meta/info.json").is_file()), path)
     return path
@@ -84,7 +84,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
 
 
 def _times(root: Path, episode: _Episode, rate: float, notes: list[Note]) -> np.ndarray:
-    """The times of an episode's rows, which are its images [s]: their column, else by the rate."""
+    """Times of an episode's rows, which are its images [s]: from their column, else from the rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
         return even
@@ -152,7 +152,7 @@ def _parquet(path: Path) -> ForeignTable:
 
 
 def _names(value: Any) -> list[str]:
-    """Names of a feature's columns, which may be nested in lists or under a key."""
+    """Names of a feature's columns, possibly nested in lists or under a key."""
     if isinstance(value, str):
         return [value]
     if isinstance(value, dict):

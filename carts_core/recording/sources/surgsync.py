@@ -81,7 +81,7 @@ def _registrations(path: Path) -> dict[str, Path]:
 
 
 def _with_extrinsics(camera: FoundCamera, file: Path, notes: list[Note]) -> FoundCamera:
-    """The right camera where the stereo calibration puts it, if the file has R and T by these names."""
+    """The right camera at its pose of the stereo calibration, if the file has R and T."""
     if camera.name != "right":
         return camera
     content = _json(file)
@@ -104,7 +104,7 @@ def _json(file: Path) -> Any:
 
 
 def _packed(path: Path, arm: str) -> dict[str, Any]:
-    """Tracks of an arm by rows of its table; times are numbers of rows."""
+    """Time series of an arm by rows of its table; times are row numbers."""
     file = path / f"{arm}.parquet"
     if not file.is_file():
         return dict.fromkeys(_TRACKS)
@@ -132,7 +132,7 @@ def _packed(path: Path, arm: str) -> dict[str, Any]:
 
 
 def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
-    """Tracks of an arm from a JSON file per frame; times are positions in `ids`."""
+    """Time series of an arm from a JSON file per frame; times are positions in `ids`."""
     folder = path / "kinematic" / arm
     rows: dict[str, list[tuple[float, ...]]] = {role: [] for role in _TRACKS}
     for position, frame in enumerate(ids):
@@ -162,7 +162,7 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _named_positions(state: dict[str, Any]) -> list[float] | None:
-    """Joint positions in the order of the PSM, by their names where these are there."""
+    """Joint positions in the order of the PSM, by their names if present."""
     positions = state.get("position")
     order = order_of_names(tuple(map(str, state.get("name") or ())))
     return positions if positions is None or order is None else [positions[index] for index in order]
