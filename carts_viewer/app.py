@@ -4,16 +4,15 @@ import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Unpack
 
 from carts_core.errors import CartsError
 from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
 from carts_core.project import ReviewState
 from carts_core.recording import Sequence
-from carts_core.segmentation import Segmenter
-from carts_core.settings.optimization import Inference
 from carts_viewer.actions import intents
-from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
 from carts_viewer.panels.help import key_groups
 from carts_viewer.panels.layout import choose_theme
 from carts_viewer.panels.timeline import Thumbnails
@@ -163,13 +162,10 @@ class ViewerApp:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        device: str = "cpu",
-        inference: Inference = "auto",
-        weights: tuple[Path, ...] = (),
-        segmenter: Segmenter | None = None,
         report: Report = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
+        **networks: Unpack[NetworkOptions],
     ) -> None:
         """Start serving an open sequence with its project, which is closed with the viewer; the rest as in `open`."""
         self._report = report
@@ -181,9 +177,7 @@ class ViewerApp:
         self._storage = storage
         renderer = OverlayRenderer(sequence)
         queue: IntentQueue[Tab] = IntentQueue()
-        self._optimizers = OptimizerFactory(
-            weights=weights, device=device, inference=inference, segmenter=segmenter, report=self._say
-        )
+        self._optimizers = OptimizerFactory(report=self._say, **networks)
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (the first time takes a few seconds)")
@@ -206,13 +200,10 @@ class ViewerApp:
         project: Path | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
-        device: str = "cpu",
-        inference: Inference = "auto",
-        weights: tuple[Path, ...] = (),
-        segmenter: Segmenter | None = None,
         report: Report = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
+        **networks: Unpack[NetworkOptions],
     ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
 
@@ -221,13 +212,10 @@ class ViewerApp:
             project: The project file, begun if it is not there; None for the default place.
             host: The address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
-            device: Where the networks run, say `cpu` or `cuda`.
-            inference: Who runs the surface network.
-            weights: Weights files; a network that none is given of is the shipped one.
-            segmenter: Segments what people point at; None for the one that ships.
             report: Called with a line about what takes long.
             page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
             folders: From where masks may be imported, besides the sequence's own folder.
+            networks: Options of the networks.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
@@ -241,19 +229,7 @@ class ViewerApp:
         if storage.notice is not None:
             report(storage.notice)
         try:
-            return cls(
-                sequence,
-                storage,
-                host=host,
-                port=port,
-                device=device,
-                inference=inference,
-                weights=weights,
-                segmenter=segmenter,
-                report=report,
-                page=page,
-                folders=folders,
-            )
+            return cls(sequence, storage, host=host, port=port, report=report, page=page, folders=folders, **networks)
         except BaseException:
             storage.close()
             raise

@@ -12,14 +12,13 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar, Unpack
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
 from carts_core.files import write_text
-from carts_core.segmentation import Segmenter
-from carts_core.settings.optimization import Inference
 from carts_viewer.app import ViewerApp
+from carts_viewer.jobs.optimizers import NetworkOptions
 from carts_viewer.transport.guard import check_address
 
 if TYPE_CHECKING:
@@ -36,11 +35,8 @@ def serve(
     folders: Sequence[Path] = (),
     host: str = "127.0.0.1",
     port: int = 8080,
-    device: str = "cpu",
-    inference: Inference = "auto",
-    weights: tuple[Path, ...] = (),
-    segmenter: Segmenter | None = None,
     open_browser: bool = False,
+    **networks: Unpack[NetworkOptions],
 ) -> None:
     """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
@@ -50,11 +46,8 @@ def serve(
         folders: From where masks may be imported, besides the sequence's own folder.
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
-        device: Where the networks run, say `cpu` or `cuda`.
-        inference: Who runs the surface network.
-        weights: Weights files; a network that none is given of is the shipped one.
-        segmenter: Segments what people point at; None for the one that ships.
         open_browser: Open the page in the default browser.
+        networks: Options of the networks.
 
     Raises:
         SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
@@ -67,12 +60,9 @@ def serve(
             project=project,
             host=host,
             port=port,
-            device=device,
-            inference=inference,
-            weights=weights,
-            segmenter=segmenter,
             report=_say_doing,
             folders=tuple(folders),
+            **networks,
         ),
         lambda: f"Ready after {time.monotonic() - began:.1f} s.",
         lambda app: app.project.incident,
@@ -85,12 +75,9 @@ def serve_site(
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
-    device: str = "cpu",
-    inference: Inference = "auto",
-    weights: tuple[Path, ...] = (),
-    segmenter: Segmenter | None = None,
     open_browser: bool = False,
     batch: Path | None = None,
+    **networks: Unpack[NetworkOptions],
 ) -> None:
     """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
@@ -98,12 +85,9 @@ def serve_site(
         folders: What the page may look into, and nothing outside.
         host: The address to listen on; one that other computers can reach makes the url carry a token.
         port: 0 picks a free port; a busy one moves up to the next free one.
-        device: Where the networks run, say `cpu` or `cuda`.
-        inference: Who runs the surface network.
-        weights: Weights files; a network that none is given of is the shipped one.
-        segmenter: Segments what people point at; None for the one that ships.
         open_browser: Open the page in the default browser.
         batch: Folder of the batch that is shown first; None for the start page.
+        networks: Options of the networks.
 
     Raises:
         SystemExit: as `serve`.
@@ -113,17 +97,7 @@ def serve_site(
 
     def opened() -> Site:
         check_address(host, port)
-        return Site(
-            folders,
-            host=host,
-            port=port,
-            device=device,
-            inference=inference,
-            weights=weights,
-            segmenter=segmenter,
-            report=_say_doing,
-            batch=batch,
-        )
+        return Site(folders, host=host, port=port, report=_say_doing, batch=batch, **networks)
 
     _serve(opened, lambda: "Ready.", lambda site: site.incident, open_browser=open_browser)
 

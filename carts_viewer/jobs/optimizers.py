@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -197,31 +197,33 @@ REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
 """What people can do where the network does not know what it sees."""
 
 
-class NetworkLoader:
-    """Has the networks; they are loaded once, when they are first needed."""
+class NetworkOptions(TypedDict, total=False):
+    """Options of the networks."""
 
-    def __init__(
-        self,
-        *,
-        weights: Sequence[Path] = (),
-        device: str = "cpu",
-        inference: Inference = "auto",
-        segmenter: Segmenter | None = None,
-        report: Callable[[str], None],
-    ) -> None:
+    weights: tuple[Path, ...]
+    """Weights files; a network without one is the shipped network."""
+    device: str
+    """Device of the networks, such as `cpu`, the default, or `cuda`."""
+    inference: Inference
+    """Runtime of the surface network; `auto` by default."""
+    segmenter: Segmenter | None
+    """Segmenter of the tool *Prompt*; the shipped one by default."""
+
+
+class OptimizerFactory:
+    """Makes optimizers; networks are loaded once, when they are first needed."""
+
+    def __init__(self, *, report: Callable[[str], None], **options: Unpack[NetworkOptions]) -> None:
         """
         Args:
-            weights: Weights files; a network that none is given of is the shipped one.
-            device: Where the networks run.
-            inference: Who runs the surface network.
-            segmenter: Segments what people point at; None for the one that ships.
-            report: Called with a line for people about what takes long.
+            report: Called with a line for the user about long operations.
+            options: Of the networks.
         """
-        self._segmenter = segmenter
+        self._segmenter = options.get("segmenter")
         self._own_segmenter: tuple[FeatureExtractor, Segmenter] | None = None
-        self._weights = weights
-        self._device = device
-        self._inference: Inference = inference
+        self._weights = options.get("weights", ())
+        self._device = options.get("device", "cpu")
+        self._inference: Inference = options.get("inference", "auto")
         self.report = report
         self._surface: Path | None = None
         self._extractor: FeatureExtractor | None = None
@@ -289,10 +291,6 @@ class NetworkLoader:
             background = Backgrounds.of(sequence, cameras, domain).covers(scene)
             self._unfamiliar[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
         return self._unfamiliar[known]
-
-
-class OptimizerFactory(NetworkLoader):
-    """Makes optimizers."""
 
     def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
         """What says what images show; with masks alone no network is loaded.

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from carts_core.errors import SettingsError
-from carts_core.settings.optimization import Inference
+from carts_core.networks import FeatureExtractor
 from carts_viewer.start.roots import MOST_ENTRIES, Entry, Roots
 from carts_viewer.transport.document import Document, button, escaped
 from carts_viewer.transport.page import Page
@@ -37,12 +37,17 @@ class Host(Protocol):
     page: Page
     document: Document
     roots: Roots
-    device: str
-    inference: Inference
-    weights: tuple[Path, ...]
 
     def post(self, job: Callable[[], None]) -> None:
         """Do something on the site's thread, after everything that was asked for before. Any thread may ask."""
+
+    def load_networks(self) -> FeatureExtractor:
+        """Load the networks. Any thread may ask.
+
+        Raises:
+            WeightsError: they cannot be loaded.
+        """
+        ...
 
     def show_start(self, problem: str = "") -> None:
         """Go to the start page."""

@@ -7,16 +7,17 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Unpack
 
 import viser
 
 from carts_core.errors import CartsError
+from carts_core.networks import FeatureExtractor
 from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
-from carts_core.segmentation import Segmenter
-from carts_core.settings.optimization import Inference
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
+from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
 from carts_viewer.start.batch_page import BatchPage
 from carts_viewer.start.host import Place
 from carts_viewer.start.roots import Roots
@@ -47,12 +48,9 @@ class Site:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        device: str = "cpu",
-        inference: Inference = "auto",
-        weights: tuple[Path, ...] = (),
-        segmenter: Segmenter | None = None,
         report: Callable[[str], None] = lambda line: None,
         batch: Path | None = None,
+        **networks: Unpack[NetworkOptions],
     ) -> None:
         """Start serving the start page, or a batch.
 
@@ -61,19 +59,14 @@ class Site:
             batch: folder of the batch that is shown first.
             host: the address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
-            device: where the networks run.
-            inference: who runs the surface network.
-            weights: weights files.
-            segmenter: segments what people point at; None for the one that ships.
-            report: called with a line about what takes long.
+            report: called with a line about long operations.
+            networks: options of the networks.
 
         Raises:
             SettingsError: a folder is not there, or the address is not usable.
         """
         self.roots = Roots(folders)
-        self.device, self.weights = device, weights
-        self.inference: Inference = inference
-        self._segmenter = segmenter
+        self._networks = networks
         self._report = report
         self.page = Page(host=host, port=port, title="CaRTS")
         self.document = Document(self.page)
@@ -124,6 +117,10 @@ class Site:
         finally:
             self.page.close()
 
+    def load_networks(self) -> FeatureExtractor:
+        """Load the networks; see `Host.load_networks`."""
+        return OptimizerFactory(report=self._report, **self._networks).prepare()
+
     def show_start(self, problem: str = "") -> None:
         """Go to the start page."""
         self._go(lambda: StartPage(self, problem))
@@ -153,13 +150,10 @@ class Site:
             app = ViewerApp.open(
                 path,
                 project=project,
-                device=self.device,
-                inference=self.inference,
-                weights=self.weights,
-                segmenter=self._segmenter,
                 report=self._report,
                 page=self.page,
                 folders=self.roots.folders,
+                **self._networks,
             )
         except CartsError as error:
             self._report(str(error))

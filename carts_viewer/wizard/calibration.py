@@ -28,7 +28,6 @@ from carts_core.recording import Sequence, spread
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.settings import CALIBRATION
-from carts_core.settings.optimization import Inference
 from carts_core.wording import counted
 from carts_viewer.start.roots import Roots
 from carts_viewer.wizard.points import Clicking
@@ -67,9 +66,7 @@ class CalibrationJob:
         scene: Scene,
         *,
         known: HandEyePrior,
-        weights: tuple[Path, ...],
-        device: str,
-        inference: Inference,
+        load_networks: Callable[[], FeatureExtractor],
         report: Callable[[Progress], None],
     ) -> None:
         """Begin.
@@ -78,14 +75,11 @@ class CalibrationJob:
             sequence: the recording.
             scene: its arms and cameras, with the calibration to begin with.
             known: what that calibration leaves open.
-            weights: weights files.
-            device: where the networks run.
-            inference: who runs the surface network.
+            load_networks: called on the job's thread.
             report: called on the job's thread with every progress, the last one `ended`.
         """
         self._sequence, self._scene, self._known = sequence, scene, known
-        self._weights, self._device = weights, device
-        self._inference: Inference = inference
+        self._load_networks = load_networks
         self._report = report
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="carts-calibration", daemon=True)
@@ -120,7 +114,7 @@ class CalibrationJob:
 
     def _calibrate(self) -> Progress:
         self._report(Progress("Loading the networks", 0.0))
-        extractor = FeatureExtractor.load(*self._weights, device=self._device, inference=self._inference)
+        extractor = self._load_networks()
         self._report(Progress("Reading images", 0.0))
         frames = []
         for index in spread(len(self._sequence), FRAMES):

@@ -500,9 +500,7 @@ class HandEyeStep:
             self._sequence,
             self._clicking.result.scene,
             known=HandEyePrior(self._clicking.result.base_covariances, unknown_cameras(self._sequence.scene)),
-            weights=self._host.weights,
-            device=self._host.device,
-            inference=self._host.inference,
+            load_networks=self._host.load_networks,
             report=report,
         )
 
