@@ -45,16 +45,16 @@ class Listening:
     def __init__(self, page: Page, tabs: Tabs, worker: Worker, sequence: Sequence) -> None:
         self._page, self._tabs, self._worker, self._sequence = page, tabs, worker, sequence
         self._classes = max((one.number for one in part_classes(sequence.scene.arms)), default=0)
-        page.on_asked(self._answer)
+        page.on("asked", self._answer)
         page.on_disconnect(lambda client_id: worker.call(lambda: tabs.detach(client_id)))
-        page.on_drawn(self._drawn)
-        page.on_released(lambda client_id: self._put(client_id, intents.Released()))
-        page.on_pointed(self._pointed)
-        page.on_dragged(self._dragged)
-        page.on_activated(self._activated)
-        page.on_painted(self._painted)
-        page.on_pressed(self._pressed)
-        page.on_picked(self._picked)
+        page.on("drawn", self._drawn)
+        page.on("released", lambda client_id: self._put(client_id, intents.Released()))
+        page.on("pointed", self._pointed)
+        page.on("dragged", self._dragged)
+        page.on("activated", self._activated)
+        page.on("painted", self._painted)
+        page.on("pressed", self._pressed)
+        page.on("picked", self._picked)
 
     def _put(self, client_id: int, intent: intents.Intent) -> None:
         tab = self._tabs.of_client(client_id)

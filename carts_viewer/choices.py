@@ -81,6 +81,19 @@ class JointRange:
     """[rad] or [m]; a joint without limits may turn once round either way."""
     upper: float
 
+    @property
+    def unit(self) -> str:
+        """Unit in the page, ° or mm."""
+        return "°" if self.revolute else "mm"
+
+    def to_shown(self, value: float) -> float:
+        """A joint position [rad, m] in the unit of the page [deg, mm]."""
+        return math.degrees(value) if self.revolute else 1e3 * value
+
+    def from_shown(self, shown: float) -> float:
+        """A joint position [rad, m] from a value in the unit of the page [deg, mm]."""
+        return math.radians(shown) if self.revolute else shown / 1e3
+
 
 def joint_range(arm: Arm, joint: int) -> JointRange:
     """Of the joint with this index."""

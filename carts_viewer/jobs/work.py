@@ -27,6 +27,7 @@ from carts_core.project import (
     ReviewState,
     Source,
 )
+from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import spread
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_core.stopping import PARENT
@@ -127,7 +128,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     if not edits:
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
-    if session.editor.view.records.get(-1) is not before.records.get(-1):
+    if session.editor.view.records.get(WHOLE_PROJECT) is not before.records.get(WHOLE_PROJECT):
         raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
     context.save()
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))

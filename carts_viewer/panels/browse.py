@@ -12,11 +12,12 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
 from carts_viewer.actions.frame_filter import SOLVED, copied
 from carts_viewer.choices import Against
-from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, swatch, write
+from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
 from carts_viewer.state import Scores, ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _SOURCES = {

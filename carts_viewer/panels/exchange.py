@@ -6,9 +6,10 @@ from carts_core.export import FORMATS, FormatName
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_viewer.actions import intents
 from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings, frames_within
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
+from carts_viewer.panels.inputs import Emit, on_click, on_input
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}

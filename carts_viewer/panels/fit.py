@@ -5,9 +5,10 @@ import viser
 from carts_core.optimization import Verdict, fit_words, undetermined_joints
 from carts_core.project import FitVerdict
 from carts_viewer.actions import intents
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input
+from carts_viewer.panels.inputs import Emit, on_click, on_input
 from carts_viewer.session import Session
 from carts_viewer.state import LiveState, Phase, ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _REPLAY, _SOCKET, _CAMERA = "Replay", "Socket", "Camera"

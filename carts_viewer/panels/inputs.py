@@ -1,15 +1,14 @@
 """The traffic between widgets and intents: what a browser sends is checked, what we write is not taken for input."""
 
-import html
 import math
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
 import viser
 
-from carts_core.console import visible
 from carts_viewer.actions.intents import Intent, Refresh
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.viser_private import on_sent
 
 Emit = Callable[[Intent], None]
@@ -58,11 +57,6 @@ def write(handle: Any, value: Any) -> None:
     """Set a widget's value if it is another one; a number that was not finite counts as another one."""
     if handle.value != value:
         handle.value = value
-
-
-def escaped(text: str) -> str:
-    """Text for use inside HTML."""
-    return html.escape(visible(text), quote=True)
 
 
 def swatch(color: tuple[int, int, int], name: str) -> str:

@@ -8,9 +8,10 @@ from carts_core.wording import spoken_time
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
 from carts_viewer.jobs.networks import STARTED
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, on_click, on_input, write
 from carts_viewer.panels.sequence import newest_calibration, whole_label
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"

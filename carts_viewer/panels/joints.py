@@ -9,10 +9,11 @@ from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
 from carts_viewer.actions.posing import LARGEST_PERTURBATION
 from carts_viewer.choices import JointRange, Reach
-from carts_viewer.panels.inputs import Emit, Waits, escaped, humanized, on_click, on_input, valid, write
+from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
 from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _STEP = 0.05
@@ -84,7 +85,7 @@ class JointsPanel:
             for (arm, joint), (limits, slider) in self._sliders.items():
                 # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
                 if not self._waits((intents.SetJoint, arm, joint)):
-                    measured, shown = (to_shown(limits, float(of[arm][joint])) for of in (state.frame.measured, joints))
+                    measured, shown = (limits.to_shown(float(of[arm][joint])) for of in (state.frame.measured, joints))
                     self._place(slider, limits, state, measured, shown)
         write(self._reach, str(state.reach))
         if state.joint is not None:
@@ -94,9 +95,9 @@ class JointsPanel:
         gui = page.gui
         joints = self._session.joints(state.pose.scene)[arm]
         for joint, limits in enumerate(limits for limits in self._session.ranges if limits.arm == arm):
-            low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
-            value = to_shown(limits, float(joints[joint]))
-            unit = "°" if limits.revolute else "mm"
+            low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
+            value = limits.to_shown(float(joints[joint]))
+            unit = limits.unit
             label = f"{humanized(limits.joint)} [{unit}]"
             ends = f"limits {low:.0f} to {high:.0f} {unit}"
             hint = f"{'Angle' if limits.revolute else 'Position'} of this joint of {arm} [{unit}], {ends}"
@@ -115,7 +116,7 @@ class JointsPanel:
             on_click(reset, lambda _: intents.BackToMeasured(arm), emit)
 
     def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], intents.Intent]:
-        return lambda shown: intents.SetJoint(arm, joint, from_shown(limits, shown))
+        return lambda shown: intents.SetJoint(arm, joint, limits.from_shown(shown))
 
     @staticmethod
     def _place(
@@ -126,33 +127,19 @@ class JointsPanel:
         The ends reach as far as the shown value, and come back when it does; not while somebody drags, or what is under
         the pointer would be another value.
         """
-        low, high = to_shown(limits, limits.lower), to_shown(limits, limits.upper)
+        low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
         middle, width = max(low, min(measured, high)), state.reach.width
         first = _tidy(min(max(low, middle - width), math.floor(shown)))
         last = _tidy(max(min(high, middle + width), math.ceil(shown)))
         if state.unsaved:
             first, last = min(first, slider.min), max(last, slider.max)
-        write_end(slider, "min", first)
-        write_end(slider, "max", last)
+        if slider.min != first:
+            slider.min = first
+        if slider.max != last:
+            slider.max = last
         near = math.isfinite(slider.value) and abs(slider.value - shown) < _STEP / 2
         if not near:
             slider.value = round(shown, 2)
-
-
-def write_end(slider: viser.GuiSliderHandle[float], end: str, value: float) -> None:
-    """Set an end of a slider if it is another one."""
-    if getattr(slider, end) != value:
-        setattr(slider, end, value)
-
-
-def to_shown(limits: JointRange, value: float) -> float:
-    """A joint position [rad, m] as people read it [deg, mm]."""
-    return math.degrees(value) if limits.revolute else 1e3 * value
-
-
-def from_shown(limits: JointRange, shown: float) -> float:
-    """A joint position [rad, m] from what people type [deg, mm]."""
-    return math.radians(shown) if limits.revolute else shown / 1e3
 
 
 def _tidy(value: float) -> float:
@@ -193,8 +180,8 @@ class ValuesPanel:
             rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
             ranges = [limits for limits in self._session.ranges if limits.arm == arm.name]
             for joint, limits in enumerate(ranges):
-                measured = to_shown(limits, float(state.frame.measured[arm.name][joint]))
-                now = to_shown(limits, float(shown[arm.name][joint]))
+                measured = limits.to_shown(float(state.frame.measured[arm.name][joint]))
+                now = limits.to_shown(float(shown[arm.name][joint]))
                 cells = [
                     f"{measured:.2f}",
                     f"{now:.2f}",
@@ -202,8 +189,8 @@ class ValuesPanel:
                     _deviation(limits, known.get(arm.name), joint),
                 ]
                 if arm.name in truth:
-                    cells.append(_signed(now - to_shown(limits, float(truth[arm.name][joint]))))
-                unit = "°" if limits.revolute else "mm"
+                    cells.append(_signed(now - limits.to_shown(float(truth[arm.name][joint]))))
+                unit = limits.unit
                 name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
                 rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
         body = "".join(f"<tr>{row}</tr>" for row in rows)
@@ -220,7 +207,7 @@ def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint
     value = known[joint] if known else None
     if value is None:
         return ""
-    shown = to_shown(limits, value)
+    shown = limits.to_shown(value)
     return _marked(f"{shown:.2f}", shown > _UNSURE)
 
 

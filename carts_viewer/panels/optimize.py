@@ -16,10 +16,11 @@ from carts_core.settings import DescentSolver, SolverName, SurfaceSolver
 from carts_core.settings.serialization import field_docstrings
 from carts_viewer.actions import intents
 from carts_viewer.choices import PRESETS
-from carts_viewer.panels.inputs import Emit, escaped, humanized, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, humanized, on_click, on_input, write
 from carts_viewer.panels.sequence import CalibrationHint
 from carts_viewer.session import Session
 from carts_viewer.state import Curves, Phase, ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 SOLVER_LABELS = {
@@ -148,9 +149,9 @@ def _moved(unknown: str, state: ViewState, session: Session) -> str:
     if not places or state.run.start is None:
         return ""
     before, now = (session.joints(scene)[arm][places[0]] for scene in (state.run.start, state.pose.scene))
-    revolute = found[places[0]].revolute
-    by = math.degrees(now - before) if revolute else 1e3 * (now - before)
-    return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{'°' if revolute else ' mm'})"
+    limits = found[places[0]]
+    by, unit = limits.to_shown(now - before), "°" if limits.revolute else " mm"
+    return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{unit})"
 
 
 def _spoken(unknown: str) -> str:

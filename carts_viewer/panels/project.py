@@ -4,10 +4,11 @@ import viser
 
 from carts_viewer.actions import intents
 from carts_viewer.editing import LONGEST_NAME
-from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.panels.jobs import jobs_question, network_question
 from carts_viewer.session import Storage
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _LISTED = 60

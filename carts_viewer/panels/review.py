@@ -17,9 +17,10 @@ from carts_viewer.actions.frame_filter import (
     found,
     review_name,
 )
-from carts_viewer.panels.inputs import Emit, Waits, escaped, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _COLORS = {

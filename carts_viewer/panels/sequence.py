@@ -7,9 +7,10 @@ from carts_core.project import ProjectState, between_kept
 from carts_core.settings import Direction
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import Job, JobState
-from carts_viewer.panels.inputs import Emit, escaped, on_click, on_input, write
+from carts_viewer.panels.inputs import Emit, on_click, on_input, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from websockets.http11 import Response
@@ -20,14 +19,13 @@ from carts_core.model.scene import Scene
 from carts_core.optimization import undetermined_joints
 from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
 from carts_core.project.state import Record
-from carts_core.project.values import VERDICTS
+from carts_core.project.values import VERDICTS, WHOLE_PROJECT
 from carts_core.recording import Sequence
 from carts_core.recording.images import ImageSource
 from carts_core.recording.video import Video
 from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, review_name
-from carts_viewer.choices import JointRange
 from carts_viewer.panels.inputs import humanized
-from carts_viewer.panels.joints import to_shown
+from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.guard import response
@@ -45,7 +43,7 @@ class Traces:
         self._sequence: Sequence | None = None
         self._figures = np.full((len(_FIGURES), frames), np.nan, np.float32)
         self._joints = {
-            f"{limits.arm} {humanized(limits.joint)} [{'°' if limits.revolute else 'mm'}]": (limits, number)
+            f"{limits.arm} {humanized(limits.joint)} [{limits.unit}]": (limits, number)
             for arm in session.scene.arms
             for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
         }
@@ -102,11 +100,8 @@ class Traces:
         if name not in self._joints or self._sequence is None:
             return None
         limits, joint = self._joints[name]
-        return [_shown(limits, rows[limits.arm][:, joint]) for rows in (self._sequence.measured, self._corrected)]
-
-
-def _shown(limits: JointRange, values: np.ndarray) -> np.ndarray:
-    return values * to_shown(limits, 1.0)
+        scale = limits.to_shown(1.0)
+        return [rows[limits.arm][:, joint] * scale for rows in (self._sequence.measured, self._corrected)]
 
 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]:
@@ -176,9 +171,7 @@ class Thumbnails:
             image = self._source(camera, domain).read(frame)
         except CartsError:
             return None
-        width = max(round(HEIGHT * image.shape[1] / image.shape[0]), 1)
-        small = cv2.resize(image, (width, HEIGHT), interpolation=cv2.INTER_AREA)
-        content = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        content = small_jpeg(image, height=HEIGHT, quality=_QUALITY)
         with self._lock:
             self._kept[path] = content
             while len(self._kept) > _MOST:
@@ -277,7 +270,7 @@ class TimelineData:
             return []
         before, self._records = self._records, project.records
         touched = [i for i, record in project.records.items() if i >= 0 and before.get(i) is not record]
-        whole = before.get(-1) is not project.records.get(-1)
+        whole = before.get(WHOLE_PROJECT) is not project.records.get(WHOLE_PROJECT)
         # What the calibration changes makes figures and verdicts of all frames void.
         indices = {i for i in project.records if i >= 0} if whole else set(touched)
         indices |= {i for i in before if i >= 0 and i not in project.records}

@@ -44,6 +44,20 @@ Rgba = UInt8[np.ndarray, "height width 4"]
 ArmIds = Int[np.ndarray, "height width"]
 
 
+def small_jpeg(
+    image: UInt8[np.ndarray, "height width 3"], *, height: int = 0, width: int = 0, quality: int = 80
+) -> bytes:
+    """An RGB image as a JPEG file of this height or width [px], in the image's proportions."""
+    if width:
+        height = max(1, round(image.shape[0] * width / image.shape[1]))
+    else:
+        width = max(1, round(image.shape[1] * height / image.shape[0]))
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[
+        1
+    ].tobytes()
+
+
 def nothing(height: int, width: int) -> Rgba:
     """A picture that hides nothing."""
     return np.zeros((height, width, 4), np.uint8)

@@ -14,7 +14,7 @@ from carts_core.files import output_path
 from carts_core.files.reading import IMAGE, read_bytes
 from carts_core.recording import Sequence
 from carts_viewer.start.host import Host
-from carts_viewer.transport.document import button, escaped
+from carts_viewer.transport.document import alert, button, escaped
 
 _SECONDS = 5.0
 """How often jobs are looked at again while some run."""
@@ -45,7 +45,7 @@ class BatchPage:
         known = most_urgent_first(known_jobs(self._batch, self._jobs))
         counts = Counter(entry.status for entry in known)
         summary = ", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status])
-        problem = f'<div class="problem" role="alert">{escaped(self._problem)}</div>' if self._problem else ""
+        problem = alert(self._problem)
         more = f"<p>{len(known) - _SHOWN} more are not listed.</p>" if len(known) > _SHOWN else ""
         rows = "".join(map(_row, known[:_SHOWN]))
         self._site.document.show(

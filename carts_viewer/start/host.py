@@ -8,7 +8,7 @@ from typing import Protocol
 from carts_core.errors import SettingsError
 from carts_core.networks import FeatureExtractor
 from carts_viewer.start.roots import MOST_ENTRIES, Entry, Roots
-from carts_viewer.transport.document import Document, button, escaped
+from carts_viewer.transport.document import Document, alert, button, escaped
 from carts_viewer.transport.page import Page
 
 
@@ -129,14 +129,14 @@ class FileBrowser:
 
     def html(self) -> str:
         """The list; its choices are `browse` and `pick`, each with a path."""
-        problem = f'<div class="problem" role="alert">{escaped(self.problem)}</div>' if self.problem else ""
+        problem = alert(self.problem)
         if self.folder is None:
             rows = [_row("browse", str(root), str(root), "") for root in self._roots.folders]
             return f'{problem}<p>{escaped(self._purpose)}</p><div class="files">{"".join(rows)}</div>'
         try:
             entries = self._roots.entries(self.folder)
         except SettingsError as error:
-            entries, problem = [], f'<div class="problem" role="alert">{escaped(error)}</div>'
+            entries, problem = [], alert(error)
         rows = [
             _row("browse", str(entry.path), f"{entry.name}/", "folder")
             if entry.is_folder

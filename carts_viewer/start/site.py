@@ -178,7 +178,9 @@ class Site:
             gui = self.page.server.gui
             gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
             self.document.on_chosen(lambda name, value: self.post(lambda: self._chosen(name, value)))
-            self.page.on_clicked(lambda _, u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v))))
+            self.page.on(
+                "clicked", lambda _, u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v)))
+            )
             self._listening = True
         self.place = make()
         self.place.show()
@@ -187,6 +189,9 @@ class Site:
 
     def _chosen(self, name: str, value: str) -> None:
         self._with_place(lambda place: place.choose(name, value))
+
+    def _clicked(self, u: float, v: float) -> None:
+        self._with_place(lambda place: place.click(u, v))
 
     def _with_place(self, work: Callable[[Place], None]) -> None:
         place = self.place

@@ -4,14 +4,12 @@ import json
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import msgspec
-import numpy as np
 
 from carts_core.errors import CartsError
 from carts_core.files import write_bytes, write_text
@@ -23,9 +21,10 @@ from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.companions import damage
+from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
-from carts_viewer.transport.document import button, escaped
+from carts_viewer.transport.document import alert, button, escaped
 from carts_viewer.wizard.draft import DraftSummary, delete_draft, drafts
 
 _KEPT = 24
@@ -145,23 +144,12 @@ def remember(app: ViewerApp) -> None:
         changed=time.time(),
     )
     _write([entry, *(each for each in recent_projects() if each.sequence != entry.sequence)])
-    if (picture := _picture(app)) is not None:
-        write_bytes(entry.thumbnail, picture)
+    write_bytes(entry.thumbnail, small_jpeg(app.state.frame.images[app.state.camera], width=_WIDTH))
 
 
 def forget(sequence: str) -> None:
     """Take a sequence off the list; its files stay."""
     _write(each for each in recent_projects() if each.sequence != sequence)
-
-
-def _picture(app: ViewerApp) -> bytes | None:
-    """The image that is shown, small."""
-    state = app.state
-    image = state.frame.images[state.camera]
-    height = max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
-    small = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
-    good, content = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return content.tobytes() if good else None
 
 
 def _write(projects: Iterable[RecentProject]) -> None:
@@ -177,9 +165,6 @@ def _list() -> Path:
     return _folder() / "recent.json"
 
 
-_JPEG_QUALITY = 80
-
-
 class StartPage:
     """Cards of recent recordings, half-made imports, the sample, and a file browser."""
 
@@ -193,7 +178,7 @@ class StartPage:
         projects = recent_projects()
         cards = "".join(self._card(project) for project in projects)
         shown = f'<h2>Recent</h2><div class="cards">{cards}</div>' if projects else ""
-        problem = f'<div class="problem" role="alert">{escaped(self._problem)}</div>' if self._problem else ""
+        problem = alert(self._problem)
         half_made = drafts()
         unfinished = "".join(_draft_row(draft) for draft in half_made)
         unfinished = f'<h2>Not finished</h2><div class="files">{unfinished}</div>' if half_made else ""
@@ -291,19 +276,12 @@ def _draft_row(draft: DraftSummary) -> str:
     return f'<div class="bar" style="padding: 0 10px">{go_on}<small>{_ago(draft.changed)}</small>{delete}</div>'
 
 
-def _first_image(path: Path) -> bytes | None:
-    """The sample's first image, small."""
-    image = _SAMPLE.get(path)
-    if image is None:
-        sequence = Sequence.open(path)
-        frame = next(iter(sequence.frame(0, cameras=[sequence.scene.cameras[0].name]).images.values()))
-        small = cv2.resize(frame, (320, round(320 * frame.shape[0] / frame.shape[1])), interpolation=cv2.INTER_AREA)
-        image = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        _SAMPLE[path] = image
-    return image
-
-
-_SAMPLE: dict[Path, bytes] = {}
+@cache
+def _first_image(path: Path) -> bytes:
+    """The first image of a sequence, small."""
+    sequence = Sequence.open(path)
+    frame = sequence.frame(0, cameras=[sequence.scene.cameras[0].name])
+    return small_jpeg(next(iter(frame.images.values())), width=_WIDTH)
 
 
 def _is_toml(entry: Entry) -> bool:

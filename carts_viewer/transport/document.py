@@ -74,6 +74,11 @@ def escaped(value: Any) -> str:
     return html.escape(visible(str(value)), quote=True)
 
 
+def alert(problem: object) -> str:
+    """A problem as HTML; nothing for an empty one."""
+    return f'<div class="problem" role="alert">{escaped(problem)}</div>' if problem else ""
+
+
 def button(name: str, label: str, value: str = "", *, kind: str = "", disabled: bool = False) -> str:
     """A button as HTML; `kind` is a class: "main" or "quiet" or "card"."""
     off = " disabled" if disabled else ""

@@ -16,7 +16,7 @@ import mimetypes
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,36 +28,6 @@ from carts_core.resources import static_dir
 from carts_viewer.transport.guard import PAGES, Guard, check_address, gated, refusal, response
 from carts_viewer.transport.tab_page import call
 from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, queue_safely, value_of
-
-
-def on_numbers(field: viser.GuiTextHandle, count: int, callback: Callable[..., None]) -> None:
-    """Call back with a tab's number and the finite numbers that it has written behind its own name and a counter."""
-
-    @field.on_update
-    async def _(event: viser.GuiEvent) -> None:
-        try:
-            numbers = [float(part) for part in str(field.value).split()[2:]]
-        except ValueError:
-            return
-        if event.client_id is not None and len(numbers) == count and all(map(math.isfinite, numbers)):
-            callback(event.client_id, *numbers)
-
-
-def said(value: Any) -> str:
-    """What a tab has written behind its own name and a counter."""
-    parts = str(value).split(maxsplit=2)
-    return parts[2] if len(parts) == 3 else ""
-
-
-def on_text(field: viser.GuiTextHandle, callback: Callable[[int, str], None]) -> None:
-    """Call back with the tab's number and what it has written into a field behind its own name and a counter."""
-
-    @field.on_update
-    async def _(event: viser.GuiEvent) -> None:
-        parts = str(field.value).split(maxsplit=2)
-        if event.client_id is not None and len(parts) == 3:
-            callback(event.client_id, parts[2])
-
 
 _TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="module";'
 """What is replaced in it: its title, the script that unpacks the client, and there the client's own element."""
@@ -127,20 +97,20 @@ OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
 
 _THUMBNAIL = "/thumbnail/"
-_FIELDS = {
-    "drawn": "it has drawn a new overlay",
-    "released": "somebody let go of a slider or left a field",
-    "picked": "the index of a frame that somebody picked",
-    "painted": "strokes over the picture",
-    "pressed": "keys that viser's shortcuts do not know",
-    "pointed": "where somebody points in the picture",
-    "dragged": "where a link of an arm was taken and is dragged to",
-    "activated": "which camera's image somebody has chosen",
-    "asked": "what is asked for in words",
-    "chosen": "what somebody has chosen in a document over the page",
-    "clicked": "where somebody has clicked in the picture",
+_FIELDS: dict[str, int | None] = {
+    "drawn": 0,  # A new overlay was drawn.
+    "released": 0,  # A slider was let go of, or a field left.
+    "picked": 1,  # Index of a frame.
+    "activated": 1,  # Index of the camera whose image was chosen.
+    "clicked": 2,  # u, v: shares of the image's width and height, from its upper left corner.
+    "pointed": 3,  # u, v, index of the camera.
+    "dragged": 6,  # Number of the gesture, the same while the pointer is down; u, v at its start and now; camera.
+    "painted": None,  # A stroke as JSON.
+    "pressed": None,  # A key of `OWN_KEYS`.
+    "asked": None,  # A request in words.
+    "chosen": None,  # A choice in a document over the page.
 }
-"""Invisible fields, and what a tab says in them."""
+"""Invisible fields for the events of a tab: how many numbers an event has, None for a text."""
 
 _SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
 """Files of `static/`, in the order in which they run."""
@@ -240,64 +210,23 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    def on_drawn(self, callback: Callable[[int], None]) -> None:
-        """Call `callback(client_id)` on the event loop whenever a tab has drawn a newer overlay."""
+    def on(self, event: str, callback: Callable[..., None]) -> None:
+        """Call `callback(client_id, *values)` on the event loop for an event of a tab.
 
-        @self._fields["drawn"].on_update
-        async def _(event: viser.GuiEvent) -> None:
-            if event.client_id is not None:
-                callback(event.client_id)
-
-    def on_released(self, callback: Callable[[int], None]) -> None:
-        """Call `callback(client_id)` on the event loop when somebody lets go of a slider or leaves a field."""
-
-        @self._fields["released"].on_update
-        async def _(event: viser.GuiEvent) -> None:
-            if event.client_id is not None:
-                callback(event.client_id)
-
-    def on_pointed(self, callback: Callable[[int, float, float, float], None]) -> None:
-        """Call `callback(client_id, u, v, camera)` on the event loop when somebody points at a place of an image.
-
-        u and v are shares of its width and height, from its upper left corner, and the camera is an index; any numbers,
-        if the tab is none of ours.
+        The values are finite numbers or a text, as `_FIELDS` says; a tab can send any.
         """
-        on_numbers(self._fields["pointed"], 3, callback)
+        field, count = self._fields[event], _FIELDS[event]
 
-    def on_dragged(self, callback: Callable[..., None]) -> None:
-        """Call `callback(client_id, gesture, u, v, to_u, to_v, camera)` on the event loop when a link is dragged.
-
-        A gesture keeps its number while the pointer is down; places and camera are as in `on_pointed`.
-        """
-        on_numbers(self._fields["dragged"], 6, callback)
-
-    def on_activated(self, callback: Callable[[int, float], None]) -> None:
-        """Call `callback(client_id, camera)` on the event loop when somebody chooses a camera's image; any number."""
-        on_numbers(self._fields["activated"], 1, callback)
-
-    def on_painted(self, callback: Callable[[int, str], None]) -> None:
-        """Call `callback(client_id, text)` on the event loop whenever a tab says that it has painted; any text."""
-        on_text(self._fields["painted"], callback)
-
-    def on_pressed(self, callback: Callable[[int, str], None]) -> None:
-        """Call `callback(client_id, key)` on the event loop when a key of `OWN_KEYS` is pressed; any text, as above."""
-        on_text(self._fields["pressed"], callback)
-
-    def on_asked(self, callback: Callable[[int, str], None]) -> None:
-        """Call `callback(client_id, text)` on the event loop when a tab asks for something in words; any text."""
-        on_text(self._fields["asked"], callback)
-
-    def on_picked(self, callback: Callable[[int, float], None]) -> None:
-        """Call `callback(client_id, index)` on the event loop when somebody picks a frame; any number, as above."""
-        on_numbers(self._fields["picked"], 1, callback)
+        @field.on_update
+        async def _(update: viser.GuiEvent) -> None:
+            text = _payload(field.value)
+            values = _values(text, count)
+            if update.client_id is not None and values is not None:
+                callback(update.client_id, *values)
 
     def on_chosen(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(text)` on the event loop for everything that somebody chooses in a document; any text."""
-        on_sent(self._fields["chosen"], lambda value: callback(said(value)))
-
-    def on_clicked(self, callback: Callable[[int, float, float], None]) -> None:
-        """Call `callback(client_id, u, v)` on the event loop when somebody clicks in the image, as in `on_pointed`."""
-        on_numbers(self._fields["clicked"], 2, callback)
+        """Call `callback(text)` on the event loop for every choice in a document; any text."""
+        on_sent(self._fields["chosen"], lambda value: callback(_payload(value)))
 
     @property
     def drawn_id(self) -> str:
@@ -362,3 +291,20 @@ class Page:
         )
         scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
         return index_of_viser(head + scripts, nonce).encode()
+
+
+def _values(text: str, count: int | None) -> Sequence[str | float] | None:
+    """The values of an event, see `_FIELDS`; None where it has none such."""
+    if count is None:
+        return [text] if text else None
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        return None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
+def _payload(value: object) -> str:
+    """Content of a field behind the tab's own name and a counter."""
+    parts = str(value).split(maxsplit=2)
+    return parts[2] if len(parts) == 3 else ""

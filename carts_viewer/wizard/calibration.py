@@ -26,7 +26,6 @@ from carts_core.optimization.hand_eye import (
 )
 from carts_core.recording import Sequence, spread
 from carts_core.recording.importing.found import FoundRecording, Note
-from carts_core.recording.importing.writing import write_sequence
 from carts_core.settings import CALIBRATION
 from carts_core.wording import counted
 from carts_viewer.start.roots import Roots
@@ -327,12 +326,3 @@ def target_folder(roots: Roots, source: Path, name: str) -> Path:
         folder = parent / f"{name}_sequence_{number}"
         number += 1
     return folder
-
-
-def write_saved(recording: FoundRecording, folder: Path, name: str) -> Path:
-    """Write the sequence file with its tables; gives the file.
-
-    Raises:
-        CartsError: it cannot be written; nothing is there then.
-    """
-    return write_sequence(replace(recording, name=name), folder)

@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import get_args
 
-import cv2
 import numpy as np
 
 from carts_core.errors import CartsError
@@ -23,7 +22,8 @@ from carts_core.recording.importing.writing import write_sequence
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
 from carts_core.recording.sources.folder import kinematics_table
 from carts_core.settings.interchange import NO_TABLE, AngleUnit, ImportOptions, LengthUnit
-from carts_viewer.transport.document import button, check_box, choices, escaped, text_field
+from carts_viewer.picture.layers import small_jpeg
+from carts_viewer.transport.document import alert, button, check_box, choices, escaped, text_field
 from carts_viewer.wizard.draft import Draft
 
 COLORS = ("#2dd4a7", "#60a5fa", "#facc15", "#e879f9", "#fb923c", "#f87171", "#a3a3a3")
@@ -79,16 +79,8 @@ def previews(sequence: Sequence, camera: str) -> list[tuple[str, bytes]]:
     found = []
     for index in dict.fromkeys((0, len(sequence) // 2, len(sequence) - 1)):
         frame = sequence.frame(index, cameras=[camera])
-        found.append((frame.frame_id, small_jpeg(frame.images[camera])))
+        found.append((frame.frame_id, small_jpeg(frame.images[camera], width=_PREVIEW_WIDTH, quality=_JPEG_QUALITY)))
     return found
-
-
-def small_jpeg(image: np.ndarray) -> bytes:
-    """An RGB image as a small JPEG file."""
-    height = max(1, round(image.shape[0] * _PREVIEW_WIDTH / image.shape[1]))
-    small = cv2.resize(image, (_PREVIEW_WIDTH, height), interpolation=cv2.INTER_AREA)
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    return cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), options)[1].tobytes()
 
 
 FOLDER = "folder"
@@ -203,11 +195,6 @@ def _place_of(message: str, options: ImportOptions) -> str:
         if word in message:
             return place
     return "recording"
-
-
-def joint_table(recording: FoundRecording) -> Mapping[str, np.ndarray]:
-    """Arm -> joint positions that are known [rows, joints], as they were recorded."""
-    return {arm.name: arm.values for arm in recording.arms if arm.values is not None}
 
 
 def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
@@ -458,7 +445,7 @@ def _times(draft: Draft, guess: Guess, delay: TimeOffsetEstimate | None) -> str:
 
 def _problem(guess: Guess, part: str) -> str:
     text = guess.problems.get(part)
-    return "" if text is None else f'<div class="problem" role="alert">{escaped(_for_page(text))}</div>'
+    return "" if text is None else alert(_for_page(text))
 
 
 def _notes(guess: Guess, about: str | None) -> str:

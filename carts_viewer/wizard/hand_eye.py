@@ -15,13 +15,14 @@ from carts_core.optimization import CalibrationResult, StopReason
 from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint, PoseDeviation
 from carts_core.recording import Sequence
 from carts_core.recording.importing.found import FoundRecording
+from carts_core.recording.importing.writing import write_sequence
 from carts_core.wording import counted
 from carts_viewer.picture import layers
 from carts_viewer.picture.layers import Rgba
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.start.host import Host
-from carts_viewer.transport.document import button, check_box, choices, escaped, text_field
+from carts_viewer.transport.document import alert, button, check_box, choices, escaped, text_field
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.calibration import (
     FRAMES,
@@ -33,7 +34,6 @@ from carts_viewer.wizard.calibration import (
     calibrated_scene,
     report_of,
     target_folder,
-    write_saved,
 )
 from carts_viewer.wizard.check import opened
 from carts_viewer.wizard.draft import Draft
@@ -119,11 +119,10 @@ def hand_eye_panel(
     """
     running = progress is not None and not progress.ended
     failed = problem or ("" if progress is None else progress.error)
-    alert = f'<div class="problem" role="alert">{escaped(failed)}</div>' if failed else ""
     undo = button("undo", "Undo", kind="quiet", disabled=not undoable or running)
     head = (
         f'<h1>Hand-eye</h1><div class="bar">{button("back", "← Check", kind="quiet", disabled=running)}{undo}'
-        f"{button('leave', 'All recordings', kind='quiet', disabled=running)}</div>{alert}"
+        f"{button('leave', 'All recordings', kind='quiet', disabled=running)}</div>{alert(failed)}"
     )
     if running:
         assert progress is not None
@@ -433,9 +432,9 @@ class HandEyeStep:
         elif self._clicking.result is not None:
             text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)
         else:
-            return write_saved(self._recording, folder, draft.name)
+            return write_sequence(replace(self._recording, name=draft.name), folder)
         recording = calibrated_recording(self._recording, self._sequence.scene, calibration, text)
-        return write_saved(recording, folder, draft.name)
+        return write_sequence(replace(recording, name=draft.name), folder)
 
     def _solve(self, draft: Draft) -> None:
         wanted = (draft.points, draft.focal_length)

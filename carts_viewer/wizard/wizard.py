@@ -11,7 +11,7 @@ from carts_core.recording import TimeOffsetEstimate
 from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
-from carts_viewer.transport.document import button, escaped
+from carts_viewer.transport.document import alert, button, escaped
 from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
@@ -197,7 +197,7 @@ class RecordingPlace:
         )
         assert self._browser is not None
         head = f"{_steps(Step.FILES)}<h1>New recording</h1><div class='bar'>{back}</div>"
-        return f"{head}{self._alert()}{self._browser.html()}"
+        return f"{head}{alert(self._problem)}{self._browser.html()}"
 
     def _checking(self) -> str:
         found = self._guessed()
@@ -216,8 +216,8 @@ class RecordingPlace:
         what = "" if recording is None else f"{recording.kind}, {len(recording.frame_ids)} frames"
         return (
             f"{_steps(Step.CHECK)}<h1>{escaped(self._draft.name)}</h1><p class='quiet-text'><code>"
-            f"{escaped(self._draft.source)}</code> · {escaped(what)}</p><div class='bar'>{bar}</div>{self._alert()}"
-            f"{check_form(self._draft, found, self._pictures, self._delay)}"
+            f"{escaped(self._draft.source)}</code> · {escaped(what)}</p><div class='bar'>{bar}</div>"
+            f"{alert(self._problem)}{check_form(self._draft, found, self._pictures, self._delay)}"
         )
 
     def _guessed(self) -> Guess:
@@ -250,9 +250,6 @@ class RecordingPlace:
                 images = previews(sequence, camera.name)
                 publish = self._host.page.media.publish
                 self._pictures[camera.name] = [(frame, publish(jpeg)) for frame, jpeg in images]
-
-    def _alert(self) -> str:
-        return f'<div class="problem" role="alert">{escaped(self._problem)}</div>' if self._problem else ""
 
     def _enter_hand_eye(self) -> bool:
         """Open the recording for the last step; False, with a problem, if that is not possible."""

@@ -199,7 +199,7 @@ def test_drafts_are_listed_newest_first_and_damaged_ones_can_be_deleted(tmp_path
     first, second = DraftFile(), DraftFile()
     first.write(Draft(source="/a/first"))
     second.write(Draft(source="/a/second", name="named"))
-    os.utime(tmp_path / "data" / "drafts" / f"{first.key}.json", (1, 1))
+    os.utime(Path(os.environ["CARTS_DATA"]) / "drafts" / f"{first.key}.json", (1, 1))
     assert [draft.name for draft in drafts()] == ["named", "first"]
     assert DraftFile(second.key).read().name == "named"
     (tmp_path / "data" / "drafts" / "bad.json").write_text("{")
