@@ -369,7 +369,7 @@ class BaselineTraining:
     steps: int = 20_000
     """Optimizer steps."""
     minutes: float | None = None
-    """Time for training [min]; a run that would take longer has fewer steps."""
+    """Processor time for training, per thread [min]; a run that would take longer has fewer steps."""
     batch_size: int = 4
     """Frames per step."""
     learning_rate: float = 1e-3

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from carts_core.lab.training.checkpoint import load_checkpoint
+from carts_core.lab.training.loop import load_checkpoint
 from carts_core.networks.weights import read_weights
 
 POLITE = [signal.SIGTERM, signal.SIGHUP]

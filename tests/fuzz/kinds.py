@@ -17,7 +17,7 @@ import trimesh
 from carts_core.batch.manifest import read_manifest
 from carts_core.cli.options import SolverOptions
 from carts_core.export.kinematics import KinematicsRow, kinematics_csv, read_kinematics_csv
-from carts_core.lab.training.checkpoint import History, load_checkpoint, save_checkpoint
+from carts_core.lab.training.loop import History, load_checkpoint, save_checkpoint
 from carts_core.live.messages import Assembler, FrameMessage, ImageMessage, packed, receive
 from carts_core.model.robot import Robot
 from carts_core.networks.network import FeatureNetwork

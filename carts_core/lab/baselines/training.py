@@ -4,11 +4,10 @@ The loss is the paper's; augmentations are those of CaRTS and of SegSTRONG-C.
 """
 
 import json
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,11 +26,9 @@ from ...networks.weights import tensor_bytes
 from ...resources import shipped_robot
 from ...settings import ImageSettings
 from ...settings.training import Augmentation, BaselineNetwork, BaselineTraining
-from ...stopping import finished_first
 from ..randomization import SURFACE_UNIT, SurfaceGenerator
-from ..training.checkpoint import History, load_checkpoint, save_checkpoint
+from ..training.loop import TrainingLoop
 from ..training.tasks import dice
-from ..training.training import schedule
 from .networks import Baseline, save_baseline, segmentation_models, start_from
 
 Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -304,12 +301,12 @@ def train_baseline(
         try:
             return run.finish(say)
         except KeyboardInterrupt:
-            run.save()
+            run.loop.save()
             raise
 
 
 class _Run:
-    """The state of one training run."""
+    """A training run of a baseline."""
 
     def __init__(
         self, network: BaselineNetwork, training: BaselineTraining, frames: TrainingFrames, output: Path
@@ -320,90 +317,44 @@ class _Run:
         if training.start is not None:
             start_from(self.network, training.start)
         channels_last(self.network.to(training.device))
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), training.learning_rate, weight_decay=training.weight_decay
-        )
         start = training.start.name if training.start else None
         self.config = json.dumps({"network": asdict(network), **asdict(training), "start": start})
-        self.step, self.history = 0, History()
-        checkpoint = load_checkpoint(output)
-        if checkpoint is not None:
-            before, now = json.loads(checkpoint.config_json), json.loads(self.config)
-            changed = [name for name in now if name not in _MAY_CHANGE and before.get(name) != now[name]]
-            if changed:
-                raise SettingsError(
-                    f"{output} holds a run with other settings ({', '.join(changed)}). Give the same settings to go "
-                    "on with it, or another output folder to start anew."
-                )
-            checkpoint.restore({"network": self.network}, self.optimizer)
-            self.step, self.history = checkpoint.step, checkpoint.history
-        self._before, self._began, self._processor = self.history.seconds, time.perf_counter(), time.process_time()
+        self.loop = TrainingLoop(output, self.network, training, self.config, _MAY_CHANGE)
 
     def finish(self, say: Callable[[str], None]) -> BaselineResult:
         """Do the steps that are left, validate, and write the weights."""
-        losses: list[float] = []
-        while self.step < self._planned():
-            with finished_first():
-                losses.append(self._train_step())
-            if self.step % _LOG_EVERY == 0:
-                self.history.losses.append({"step": self.step, "loss": float(np.mean(losses))})
-                say(f"step {self.step} of {self._planned()}: loss {np.mean(losses):.4f}")
-                losses = []
-            if self.step % self.training.checkpoint_every == 0:
-                self.save()
-        self.save()
-        score = self.validate()
-        path = output_path(self.output, WEIGHTS_FILE)
-        seconds = sum(entry.get("processor_seconds", 0.0) for entry in self.history.validations)
-        figures: dict[str, Any] = {"steps": self.step, "dice": score, "processor_seconds": round(seconds, 1)}
+        loop = self.loop
+
+        def logged(means: dict[str, float], _: float) -> None:
+            say(f"step {loop.step} of {loop.planned}: loss {means['loss']:.4f}")
+
+        if loop.step < loop.planned:
+            loop.run((self._batch() for _ in count()), self._loss, _LOG_EVERY, logged)
+        score, path = self.validate(), output_path(self.output, WEIGHTS_FILE)
+        seconds = loop.history.processor_seconds * self.training.threads
+        figures = {"steps": loop.step, "dice": score, "processor_seconds": round(seconds, 1)}
         save_baseline(self.network, path, {**json.loads(self.config), **figures})
-        return BaselineResult(path.path, self.step, score, seconds)
+        return BaselineResult(path.path, loop.step, score, seconds)
 
     @torch.no_grad()
     def validate(self) -> float:
-        """Mean Dice over the frames that are not learned from."""
+        """Mean Dice of the validation frames."""
         self.network.eval()
         found = []
-        count = len(self.frames)
-        for first in range(count - VALIDATION, count, 10):
-            images, given, masks = self.frames.batch(range(first, min(first + 10, count)))
+        frames = len(self.frames)
+        for first in range(frames - VALIDATION, frames, 10):
+            images, given, masks = self.frames.batch(range(first, min(first + 10, frames)))
             logits = self._logits(images.float() / 255, given)
             found.append(dice(logits[:, 0].cpu() > 0, masks[:, 0] > 0.5))
         return float(torch.cat(found).mean())
 
-    def save(self) -> None:
-        """Keep what was trained so far."""
-        now, processor = time.perf_counter(), time.process_time()
-        self.history.seconds = self._before + now - self._began
-        self.history.validations.append({"step": self.step, "processor_seconds": processor - self._processor})
-        self._processor = processor
-        modules: dict[str, torch.nn.Module] = {"network": self.network}
-        save_checkpoint(self.output, modules, self.optimizer, self.step, self.config, self.history)
-
-    def _planned(self) -> int:
-        """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
-        if self.training.minutes is None or self.step == 0:
-            return self.training.steps
-        seconds = self._before + time.perf_counter() - self._began
-        return min(self.training.steps, max(self.step, int(self.step * 60 * self.training.minutes / seconds)))
-
-    def _train_step(self) -> float:
-        training = self.training
-        for group in self.optimizer.param_groups:
-            group["lr"] = training.learning_rate * schedule(self.step, training.warmup, self._planned())
-        self.network.train()
-        images, given, masks = self._batch()
-        loss = functional.binary_cross_entropy_with_logits(self._logits(images, given), masks)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        self.optimizer.step()
-        self.step += 1
-        return float(loss.detach())
+    def _loss(self, batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        images, given, masks = batch
+        return functional.binary_cross_entropy_with_logits(self._logits(images, given), masks), {}
 
     def _batch(self) -> tuple[Tensor, Tensor, Tensor]:
         """The batch of the next step: it depends on the seed and the step's number only."""
-        rng = np.random.default_rng((self.training.seed, self.step))
+        rng = np.random.default_rng((self.training.seed, self.loop.step))
         torch.manual_seed(int(rng.integers(2**63)))
         numbers = rng.integers(len(self.frames) - VALIDATION, size=self.training.batch_size)
         images, given, masks = self.frames.batch(map(int, numbers))

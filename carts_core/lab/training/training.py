@@ -2,8 +2,7 @@
 
 import json
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -20,10 +19,10 @@ from ...files import OutputPath, locked_folder, output_path, output_stream, writ
 from ...networks.network import Network, UNet, channels_last
 from ...networks.weights import read_weights, save_weights
 from ...settings import Architecture, TrainingConfig
-from ...stopping import finished_first, when_stopped
+from ...stopping import when_stopped
 from ...wording import counted
-from .checkpoint import History, load_checkpoint, save_checkpoint
 from .loader import training_batches, validation_set
+from .loop import History, TrainingLoop
 from .tasks import Batch, task_of
 
 
@@ -261,52 +260,33 @@ def train(
             with when_stopped(run.kept):
                 return run.finish(progress or (lambda event: None))
         except KeyboardInterrupt:
-            run.save()
+            run.loop.save()
             raise
 
 
 class _Run:
-    """The state of one training run."""
+    """A training run: its loop, the exponential average of the weights, and the validations of that average."""
 
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         self.config, self.output, self.task = config, output, task_of(config.network)
         torch.manual_seed(config.seed)
         self.network = channels_last(_first_network(config).to(config.device))
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        self.loop = TrainingLoop(
+            output, self.network, config, config_json(config), _MAY_CHANGE, {"average": self.average}
         )
-        self.modules = {"network": self.network, "average": self.average}
-        self.step, self.history = 0, History()
-        self._resume()
-        self._saved = self.step
-        self._clock, self._worked = time.perf_counter(), time.process_time()
-
-    def _resume(self) -> None:
-        checkpoint = load_checkpoint(self.output)
-        if checkpoint is None:
-            return
-        before, now = json.loads(checkpoint.config_json), json.loads(config_json(self.config))
-        changed = [name for name in now if name not in _MAY_CHANGE and before.get(name) != now[name]]
-        if changed:
-            details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
-            raise SettingsError(
-                f"{self.output} holds a run with other settings: {details}. Give the same settings to go on with it, "
-                "or another output folder to start anew."
-            )
-        checkpoint.restore(self.modules, self.optimizer)
-        self.step, self.history = checkpoint.step, checkpoint.history
+        self.history = self.loop.history
 
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
+        """Do the steps that are left, validate, and write weights and report."""
         samples = validation_set(self.config)
-        validation = None
+        validation, loop = None, self.loop
         if self.config.patience is not None and not self.history.validations:
-            # What the start reaches is what has to be beaten.
+            # The validation of the start is the baseline for `patience`.
             validation = self._validate(samples)
-            progress(TrainingProgress(self.step, self._planned(), math.nan, math.nan, validation, validation))
-        if self.step < self._planned() and not self._has_ended_gaining():
-            with training_batches(self.config, self.step) as batches:
-                validation = self._train_on(batches, samples, validation, progress)
+            progress(TrainingProgress(loop.step, loop.planned, math.nan, math.nan, validation, validation))
+        if loop.step < loop.planned and not self._has_ended_gaining():
+            validation = self._train(samples, validation, progress)
         if self.config.patience is not None:
             validation = max(self.history.validations, key=self._score)
         elif validation is None:
@@ -318,107 +298,65 @@ class _Run:
         weights = weights_file(self.config, self.output)
         return TrainingResult(weights, report, validation, self.history.first, self.history.seconds)
 
-    def _train_on(
+    def _train(
         self,
-        batches: Iterator[Batch],
         samples: Batch,
         validation: dict[str, float] | None,
         progress: Callable[[TrainingProgress], None],
     ) -> dict[str, float] | None:
-        """Train to the end; gives the newest validation, which is the given one where there was no other."""
-        sums: dict[str, float] = {}
-        count, last = 0, False
-        self._clock, self._worked = time.perf_counter(), time.process_time()
-        while not last:
-            batch = next(batches)
-            with finished_first():
-                terms = self._train_step(batch)
-            for name, value in terms.items():
-                sums[name] = sums.get(name, 0.0) + value
-            count += 1
-            last = self.step == self._planned()
-            if last or self._validation_due():
+        """Train to the end; returns the newest validation, which is the given one if there was no other."""
+
+        def loss(batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+            return self.task.loss(self.config, self.network, tuple(part.to(self.config.device) for part in batch))
+
+        def ends(last: bool) -> bool:
+            nonlocal validation
+            if last or self.loop.step % self.config.validation_every == 0:
                 validation = self._validate(samples)
                 last = last or self._has_ended_gaining()
-            if last or count == _LOG_EVERY:
-                means = {name: value / count for name, value in sums.items()}
-                self.history.losses.append({"step": self.step, **means})
-                elapsed = self._take_time()
-                reached = means["loss"], elapsed / count, validation, self.history.first
-                progress(TrainingProgress(self.step, self._planned(), *reached))
-                sums, count = {}, 0
-            if last or self.step % self.config.checkpoint_every == 0:
-                self._checkpoint()
+            return last
+
+        def logged(means: dict[str, float], seconds_per_step: float) -> None:
+            reached = means["loss"], seconds_per_step, validation, self.history.first
+            progress(TrainingProgress(self.loop.step, self.loop.planned, *reached))
+
+        with training_batches(self.config, self.loop.step) as batches:
+            self.loop.run(
+                batches,
+                loss,
+                _LOG_EVERY,
+                logged,
+                updated=lambda: self.average.update_parameters(self.network),
+                ends=ends,
+            )
         return validation
 
-    def save(self) -> None:
-        """Keep what was trained since the last checkpoint; for a run that is stopped between two steps."""
-        if self.step > self._saved:
-            self._take_time()
-            self._checkpoint()
-
     def kept(self) -> str:
-        """What there is of a run that is stopped, for people."""
-        if self.step == 0:
+        """What a stopped run leaves, for the terminal."""
+        if self.loop.step == 0:
             return f"no step was made; weights in {self.output}, if there are any, are those of the start"
-        return f"{self.output} holds {counted(self.step, 'step')}; the same command goes on from there"
-
-    def _planned(self) -> int:
-        """Steps of the whole run: as many as asked for, or fewer if its time allows no more at the pace so far."""
-        if self.config.minutes is None or self.step == 0:
-            return self.config.steps
-        seconds = self.history.processor_seconds + self._processor_seconds()
-        return min(self.config.steps, max(self.step, int(self.step * 60 * self.config.minutes / max(seconds, 1e-6))))
-
-    def _processor_seconds(self) -> float:
-        """Processor time of each thread since it was last added to the history [s]."""
-        return (time.process_time() - self._worked) / self.config.threads
-
-    def _take_time(self) -> float:
-        """Add the time since the last call to the history; wall time [s]."""
-        elapsed = time.perf_counter() - self._clock
-        self.history.seconds += elapsed
-        self.history.processor_seconds += self._processor_seconds()
-        self._clock, self._worked = time.perf_counter(), time.process_time()
-        return elapsed
-
-    def _train_step(self, batch: Batch) -> dict[str, float]:
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * schedule(self.step, self.config.warmup, self._planned())
-        self.network.train()
-        on_device = tuple(part.to(self.config.device) for part in batch)
-        loss, terms = self.task.loss(self.config, self.network, on_device)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        self.optimizer.step()
-        self.average.update_parameters(self.network)
-        self.step += 1
-        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+        return f"{self.output} holds {counted(self.loop.step, 'step')}; the same command goes on from there"
 
     def _averaged(self) -> UNet:
         network = self.average.module
         assert isinstance(network, UNet)
         return network
 
-    def _validation_due(self) -> bool:
-        return self.step % self.config.validation_every == 0
-
     def _score(self, entry: dict[str, float]) -> float:
-        """What a validation is judged by, higher is better; the least where a figure is worse than at the start."""
+        """Score of a validation, higher is better; minus infinity where a metric is worse than at the start."""
         worse = self.history.first is not None and self.task.worse(entry, self.history.first)
         return -math.inf if worse else entry[self.task.score]
 
     def _validate(self, samples: Batch) -> dict[str, float]:
         validation = self.task.validate(self._averaged().folded(), samples)
         best = max(map(self._score, self.history.validations), default=-math.inf)
-        self.history.validations.append({"step": self.step, **validation})
+        self.history.validations.append({"step": self.loop.step, **validation})
         if self.config.patience is None or self._score(validation) > best:
             self._save(validation)
         return validation
 
     def _has_ended_gaining(self) -> bool:
-        """Whether the newest validations, as many as `patience` says, are no better than one before them."""
+        """Whether none of the newest `patience` validations is better than the best one before them."""
         patience = self.config.patience
         scores = [self._score(entry) for entry in self.history.validations]
         if patience is None or len(scores) <= patience:
@@ -426,14 +364,10 @@ class _Run:
         return max(scores[-patience:]) <= max(scores[:-patience])
 
     def _save(self, validation: dict[str, float]) -> None:
-        training = {"step": self.step, "validation": validation, "config": json.loads(config_json(self.config))}
+        training = {"step": self.loop.step, "validation": validation, "config": json.loads(config_json(self.config))}
         field = self.config.images.field_width
         # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
         save_weights(self._averaged(), weights_file(self.config, self.output), training, (field, field * 3 // 4))
-
-    def _checkpoint(self) -> None:
-        save_checkpoint(self.output, self.modules, self.optimizer, self.step, config_json(self.config), self.history)
-        self._saved = self.step
 
 
 def _first_network(config: TrainingConfig) -> UNet:
@@ -470,13 +404,6 @@ def _as_large_as_start(config: TrainingConfig) -> TrainingConfig:
 def weights_file(config: TrainingConfig, output: Path) -> Path:
     """Where a run leaves its weights."""
     return output / f"{config.network}.safetensors"
-
-
-def schedule(step: int, warmup: int, steps: int) -> float:
-    """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
-    rise = min(1.0, (step + 1) / max(warmup, 1))
-    done = min(1.0, max(0.0, (step - warmup) / max(steps - warmup, 1)))
-    return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
 def config_json(config: TrainingConfig) -> str:

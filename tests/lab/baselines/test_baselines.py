@@ -84,7 +84,7 @@ def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp
     result = train_baseline(_smallest("unet"), training(30), _Frames(110), tmp_path)
     assert (first.steps, result.steps) == (5, 30)
     assert result.dice > 0.9 and result.processor_seconds > first.processor_seconds
-    with pytest.raises(SettingsError, match=r"other settings .*batch_size"):
+    with pytest.raises(SettingsError, match=r"other settings: batch_size"):
         other = BaselineTraining(augmentation="none", frames=110, batch_size=3, warmup=0, learning_rate=1e-2)
         train_baseline(_smallest("unet"), other, _Frames(110), tmp_path)
 

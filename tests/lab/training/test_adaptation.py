@@ -22,7 +22,7 @@ from carts_core.lab.training.adaptation import (
     gain,
     made_images,
 )
-from carts_core.lab.training.checkpoint import load_checkpoint
+from carts_core.lab.training.loop import load_checkpoint
 from carts_core.lab.training.tasks import SurfaceTask, dice, pooled_dice, tip_error
 from carts_core.lab.training.training import train
 from carts_core.model.robot import Robot
@@ -170,7 +170,7 @@ def test_weights_that_see_masks_better_and_parts_or_tips_worse_are_not_kept(
 
 def test_a_busy_machine_takes_no_steps_from_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 10**9, 1000))
-    monkeypatch.setattr("carts_core.lab.training.training.time.perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr("carts_core.lab.training.loop.time.perf_counter", lambda: float(next(clock)))
     given = TrainingConfig(workers=0, threads=1, batch_size=1, steps=3, minutes=5.0)
     config = replace(adapted_to(sample_sequence(), tmp_path, given), validation_samples=1)
     train(config, tmp_path)

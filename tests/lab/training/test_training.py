@@ -14,9 +14,9 @@ import torch
 
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import ImageSettings
-from carts_core.lab.training.checkpoint import CHECKPOINT_FILE, load_checkpoint
 from carts_core.lab.training.loader import training_batches, validation_set
-from carts_core.lab.training.training import TrainingProgress, schedule, train
+from carts_core.lab.training.loop import CHECKPOINT_FILE, load_checkpoint, schedule
+from carts_core.lab.training.training import TrainingProgress, train
 from carts_core.networks import FeatureExtractor
 from carts_core.networks.weights import read_weights
 from carts_core.settings import Architecture, TrainingConfig

@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from carts_core.lab.training.checkpoint import CHECKPOINT_FILE, load_checkpoint
+from carts_core.lab.training.loop import CHECKPOINT_FILE, load_checkpoint
 
 _RUN = """
 import sys

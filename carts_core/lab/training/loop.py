@@ -1,0 +1,285 @@
+"""Training loop: optimizer steps with a learning-rate schedule, a time limit, a history, and checkpoints.
+
+A checkpoint is one safetensors file with the whole state of a run; it is replaced atomically.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from ...errors import SettingsError, WeightsError
+from ...files import output_path, write_bytes
+from ...files.reading import WEIGHTS, check_regular, parse_json
+from ...networks.weights import tensor_bytes
+from ...stopping import finished_first
+
+CHECKPOINT_FILE = "checkpoint.safetensors"
+
+
+@dataclass
+class History:
+    """Losses, validations and times of a run."""
+
+    losses: list[dict[str, float]] = field(default_factory=list)
+    """Per logged step: `step`, `loss` and each term, averaged since the last entry."""
+    validations: list[dict[str, float]] = field(default_factory=list)
+    """Per validation: `step` and the metrics of the task."""
+    seconds: float = 0.0
+    """Wall time spent in training steps [s]."""
+    processor_seconds: float = 0.0
+    """Processor time of each thread of the training process there [s]."""
+
+    @property
+    def first(self) -> dict[str, float] | None:
+        """The first validation; None before it."""
+        return next(iter(self.validations), None)
+
+
+def save_checkpoint(
+    folder: Path,
+    modules: dict[str, torch.nn.Module],
+    optimizer: torch.optim.Optimizer,
+    step: int,
+    config_json: str,
+    history: History,
+) -> None:
+    """Write `checkpoint.safetensors`; a kill at any moment leaves the old file or the new one.
+
+    Args:
+        folder: folder of the run.
+        modules: modules whose state is kept, by name.
+        optimizer: its moments and step counts are kept.
+        step: number of steps done.
+        config_json: the settings; `load_checkpoint` gives them back.
+        history: curves so far.
+    """
+    tensors = {f"{name}/{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
+    for index, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{index}/{key}": value for key, value in state.items()}
+    metadata = {"step": str(step), "config": config_json, "history": json.dumps(asdict(history))}
+    content = tensor_bytes({name: value.detach().clone().contiguous() for name, value in tensors.items()}, metadata)
+    write_bytes(output_path(folder, CHECKPOINT_FILE), content)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """State of a run as read from its checkpoint."""
+
+    step: int
+    config_json: str
+    history: History
+    tensors: dict[str, Tensor]
+
+    def restore(self, modules: dict[str, torch.nn.Module], optimizer: torch.optim.Optimizer) -> None:
+        """Load the state into modules and optimizer."""
+        for name, module in modules.items():
+            prefix = f"{name}/"
+            module.load_state_dict(
+                {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
+            )
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in self.tensors.items():
+            if key.startswith("optimizer/"):
+                _, index, name = key.split("/")
+                state.setdefault(int(index), {})[name] = value
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def load_checkpoint(folder: Path) -> Checkpoint | None:
+    """The checkpoint of a run, None if there is none yet.
+
+    Raises:
+        WeightsError: the file is there and cannot be read.
+    """
+    path = folder / CHECKPOINT_FILE
+    if not path.exists():
+        return None
+    try:
+        check_regular(path, WEIGHTS)
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        history = History(**parse_json(metadata["history"], finite=False))
+        return Checkpoint(int(metadata["step"]), metadata["config"], history, tensors)
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+        raise WeightsError(
+            f"checkpoint {path} cannot be read ({error}). Allowed is what `carts train` writes. Delete the file to "
+            "start this run again."
+        ) from error
+
+
+Batch = TypeVar("Batch")
+
+
+class LoopSettings(Protocol):
+    """Settings that every training run has; see `TrainingConfig` and `BaselineTraining`."""
+
+    @property
+    def steps(self) -> int: ...
+    @property
+    def minutes(self) -> float | None: ...
+    @property
+    def learning_rate(self) -> float: ...
+    @property
+    def weight_decay(self) -> float: ...
+    @property
+    def warmup(self) -> int: ...
+    @property
+    def checkpoint_every(self) -> int: ...
+    @property
+    def threads(self) -> int: ...
+
+
+class TrainingLoop:
+    """Trains a network with AdamW, or resumes the run whose checkpoint lies in a folder.
+
+    Args:
+        output: folder of the checkpoint.
+        network: the trained network, on its device.
+        settings: steps, time limit and learning rate.
+        config_json: settings of the run, stored in the checkpoint.
+        may_change: names in `config_json` that may differ when the run is resumed.
+        further: other modules whose state is stored, by name.
+
+    Attributes:
+        step: number of steps done.
+        history: losses, validations and times so far.
+
+    Raises:
+        SettingsError: the folder holds a run with other settings.
+        WeightsError: its checkpoint cannot be read.
+    """
+
+    def __init__(
+        self,
+        output: Path,
+        network: nn.Module,
+        settings: LoopSettings,
+        config_json: str,
+        may_change: tuple[str, ...],
+        further: Mapping[str, nn.Module] | None = None,
+    ) -> None:
+        self._output, self._network, self._settings, self._config_json = output, network, settings, config_json
+        self._modules = {"network": network, **(further or {})}
+        self._optimizer = torch.optim.AdamW(
+            network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+        )
+        self.step, self.history = 0, History()
+        self._resume(may_change)
+        self._saved = self.step
+        self._clock, self._worked = time.perf_counter(), time.process_time()
+
+    def _resume(self, may_change: tuple[str, ...]) -> None:
+        checkpoint = load_checkpoint(self._output)
+        if checkpoint is None:
+            return
+        before, now = json.loads(checkpoint.config_json), json.loads(self._config_json)
+        changed = [name for name in now if name not in may_change and before.get(name) != now[name]]
+        if changed:
+            details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
+            raise SettingsError(
+                f"{self._output} holds a run with other settings: {details}. Give the same settings to go on with it, "
+                "or another output folder to start anew."
+            )
+        checkpoint.restore(self._modules, self._optimizer)
+        self.step, self.history = checkpoint.step, checkpoint.history
+
+    def run(
+        self,
+        batches: Iterator[Batch],
+        loss: Callable[[Batch], tuple[Tensor, dict[str, Tensor]]],
+        log_every: int,
+        logged: Callable[[dict[str, float], float], None],
+        *,
+        updated: Callable[[], None] = lambda: None,
+        ends: Callable[[bool], bool] = lambda last: last,
+    ) -> None:
+        """Train until the planned steps are done or `ends` says so; a signal waits for the end of a step.
+
+        Args:
+            batches: training batches.
+            loss: of a batch: the weighted loss, and each term before weighting.
+            log_every: steps between entries of the history.
+            logged: called with the mean loss and terms since the last entry, and the wall time per step [s].
+            updated: called after each optimizer step.
+            ends: called after each step with whether it is the last planned one; returns whether the run ends.
+        """
+        sums: dict[str, float] = {}
+        count, last = 0, False
+        self._clock, self._worked = time.perf_counter(), time.process_time()
+        while not last:
+            batch = next(batches)
+            with finished_first():
+                terms = self._train_step(batch, loss)
+                updated()
+            for name, value in terms.items():
+                sums[name] = sums.get(name, 0.0) + value
+            count += 1
+            last = ends(self.step == self.planned)
+            if last or count == log_every:
+                means = {name: value / count for name, value in sums.items()}
+                self.history.losses.append({"step": self.step, **means})
+                logged(means, self._take_time() / count)
+                sums, count = {}, 0
+            if last or self.step % self._settings.checkpoint_every == 0:
+                self._checkpoint()
+
+    def _train_step(
+        self, batch: Batch, loss_of: Callable[[Batch], tuple[Tensor, dict[str, Tensor]]]
+    ) -> dict[str, float]:
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._settings.learning_rate * schedule(self.step, self._settings.warmup, self.planned)
+        self._network.train()
+        loss, terms = loss_of(batch)
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self._network.parameters(), 5.0)
+        self._optimizer.step()
+        self.step += 1
+        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+
+    @property
+    def planned(self) -> int:
+        """Steps of the whole run: those asked for, or fewer if the time limit allows no more at the pace so far."""
+        if self._settings.minutes is None or self.step == 0:
+            return self._settings.steps
+        seconds = self.history.processor_seconds + self._processor_seconds()
+        allowed = int(self.step * 60 * self._settings.minutes / max(seconds, 1e-6))
+        return min(self._settings.steps, max(self.step, allowed))
+
+    def save(self) -> None:
+        """Store the steps since the last checkpoint; for a run that is stopped between two steps."""
+        if self.step > self._saved:
+            self._take_time()
+            self._checkpoint()
+
+    def _processor_seconds(self) -> float:
+        """Processor time per thread since it was last added to the history [s]."""
+        return (time.process_time() - self._worked) / self._settings.threads
+
+    def _take_time(self) -> float:
+        """Add the time since the last call to the history; returns the wall time [s]."""
+        elapsed = time.perf_counter() - self._clock
+        self.history.seconds += elapsed
+        self.history.processor_seconds += self._processor_seconds()
+        self._clock, self._worked = time.perf_counter(), time.process_time()
+        return elapsed
+
+    def _checkpoint(self) -> None:
+        save_checkpoint(self._output, self._modules, self._optimizer, self.step, self._config_json, self.history)
+        self._saved = self.step
+
+
+def schedule(step: int, warmup: int, steps: int) -> float:
+    """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
+    rise = min(1.0, (step + 1) / max(warmup, 1))
+    done = min(1.0, max(0.0, (step - warmup) / max(steps - warmup, 1)))
+    return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
