@@ -1,4 +1,4 @@
-"""`carts batch`: an archive of recordings, job by job, on one machine or many."""
+"""`carts batch`: pipelines over many recordings, on one machine or several."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -19,32 +19,31 @@ if TYPE_CHECKING:
     from ..settings.optimization import Engine
 
 _NAMED = 5
-"""Failed jobs that are named in the end."""
+"""Number of failed jobs that the final message names."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Import, calibrate, optimize, evaluate and export many recordings, side by side; run it again to go on."""
+    """Import, calibrate, optimize, evaluate and export many recordings in parallel; rerun it to resume."""
 
     manifest: Annotated[Path, tyro.conf.Positional]
-    """Which recordings, cameras and domains, and what is done with each (docs: batch)."""
+    """Manifest of recordings, cameras, domains and steps (docs: batch)."""
     output: Path | None = None
     """Folder to write to; by default `runs/batch/NAME`, after the manifest. In `jobs`, each has a folder of its own."""
     workers: int = 0
-    """Jobs side by side; as many as there are cores by default."""
+    """Parallel jobs; by default the number of cores."""
     threads: int = 1
-    """Of each job. One is most efficient where there are more jobs than cores."""
+    """Threads of each job. One is most efficient with more jobs than cores."""
     shard: str = "1/1"
-    """Only every N-th job, from the I-th on: `I/N`. Shards may run anywhere that sees the same folder."""
+    """Every N-th job from the I-th on, as `I/N`. Shards may run on any machine that shares the folder."""
     scheduler: str | None = None
     """Give jobs to dask.distributed: address of its scheduler, or `local` for workers on this machine."""
     project: Literal["beside", "none"] = "beside"
-    """Jobs that correct nothing themselves evaluate and export their recording as the project beside it corrects it;
-    `none`: as measured."""
+    """Corrections in jobs that only evaluate or export: those of the project beside the recording, or `none`."""
     again: bool = False
-    """Take steps again that are done; each redoes what has changed since."""
+    """Repeat finished steps; each redoes what has changed since."""
     report_only: bool = False
-    """Run nothing; write the report over what is there."""
+    """Write the report on finished jobs without running any."""
 
     def __post_init__(self) -> None:
         if self.workers < 0:
@@ -53,7 +52,7 @@ class Batch:
             raise SettingsError(f"--threads is {self.threads}; allowed is 1 or more.")
 
     def run(self) -> None:
-        """Do the jobs of the shard, and write the report over all.
+        """Run the jobs of the shard, and write the report on all.
 
         Raises:
             CartsError: the manifest is not usable, or jobs have failed.
@@ -85,7 +84,7 @@ class Batch:
             )
 
     def _run(self, console: Terminal, jobs: "list[Job]", folder: "OutputPath") -> dict[str, str]:
-        """Do jobs; name and error of each that failed."""
+        """Run jobs; returns name and error of each failed one."""
         import os
 
         from ..batch.engines import Pool
@@ -122,7 +121,7 @@ class Batch:
 
 
 def _inference(folder: "OutputPath") -> "Engine":
-    """Who runs the surface network in all jobs: what was measured where the batch was begun."""
+    """Inference engine of all jobs: the one that was faster where the batch was started."""
     from ..files import write_new
     from ..files.reading import SETTINGS, read_text
     from ..networks.extractor import FeatureExtractor

@@ -1,4 +1,4 @@
-"""What a job of `carts batch` does: the plain commands, one after the other, into its own folder."""
+"""Jobs of `carts batch`: subcommands that run one after the other into the job's folder."""
 
 import contextlib
 import io
@@ -35,22 +35,21 @@ _COMMANDS: dict[Step, type] = {
     "export": Export,
 }
 _GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
-"""What a job sets itself."""
+"""Options that a job sets itself."""
 _CORRECTING: tuple[Step, ...] = ("import", "calibrate", "optimize", "sequence")
-"""After these, a job's evaluations and exports are of what it made itself."""
+"""Steps after which a job evaluates and exports its own results."""
 _CODE = ("**/*.py",)
 
 
 @dataclass(frozen=True)
 class BatchWork:
-    """Does jobs; goes to the processes that do.
+    """Runs jobs in worker processes.
 
     Args:
         folder: of the batch.
-        again: whether steps that are done are taken again, whatever they were made from.
-        inference: who runs the surface network where a step's options do not say; the same on all machines.
-        project: whether recordings are evaluated and exported as the project beside them corrects them; see
-            `with_project`.
+        again: whether finished steps are repeated.
+        inference: engine of the surface network, equal on all machines, unless a step's options name one.
+        project: whether the project beside a recording is applied; see `with_project`.
     """
 
     folder: OutputPath
@@ -59,7 +58,7 @@ class BatchWork:
     project: Literal["beside", "none"] = "beside"
 
     def __call__(self, job: Job) -> Outcome:
-        """Do a job; what is done of it is not done again."""
+        """Run the unfinished steps of a job."""
         began = time.perf_counter()
         folder = job_folder(self.folder, job)
         with running(folder) as state:
@@ -72,28 +71,28 @@ class BatchWork:
                 raise
             except CartsError as error:
                 return _failed(job, state, str(error), began)
-            except Exception as error:  # The other jobs go on, whatever happened to this one.
+            except Exception as error:  # A failed job does not stop the others.
                 return _failed(job, state, "".join(traceback.format_exception(error)), began)
             state.change(status="done", attempts=0)
         return Outcome(job.name, "done" if done else "known", seconds=time.perf_counter() - began)
 
 
 def job_folder(batch: OutputPath, job: Job) -> OutputPath:
-    """Where all of a job lies."""
+    """Folder of a job."""
     return batch / "jobs" / job.name
 
 
 def with_project(job: Job) -> Path | None:
-    """The project beside a job's recording, which the job evaluates or exports; None for a job that corrects itself."""
+    """Project beside the recording of a job that only evaluates or exports; None for other jobs."""
     used = {"evaluate", "export"} & set(job.steps) and not set(_CORRECTING) & set(job.steps)
     return FromProject().path(job.recording) if used else None
 
 
 def check_options(jobs: Sequence[Job]) -> None:
-    """See that every step's options are ones that its command has, before anything runs.
+    """Check the options of every step before anything runs.
 
     Raises:
-        SettingsError: one is not, or is set by the batch itself.
+        SettingsError: the command has no such option, or the batch sets it itself.
     """
     called: set[tuple[Step, tuple[str, ...]]] = set()
     for job in jobs:
@@ -122,7 +121,7 @@ def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
 
 
 def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> int:
-    """Take the steps that are not done; how many these were."""
+    """Run the unfinished steps; returns their number."""
     tune_process()
     log_to_stderr()
     done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
@@ -138,7 +137,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
-            # They are of what was there before; whoever is killed from here on makes them when the job goes on.
+            # They describe earlier results. After a kill they are made when the job resumes.
             remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
@@ -152,7 +151,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
 
 
 def _has_findings(folder: OutputPath) -> bool:
-    """Whether there are findings; damaged ones are set aside."""
+    """Whether findings exist; damaged ones are renamed."""
     try:
         return read_findings(folder) is not None
     except (OSError, ValueError):
@@ -161,7 +160,7 @@ def _has_findings(folder: OutputPath) -> bool:
 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
-    """The option that has every machine run the network alike, for steps that run it on a CPU."""
+    """Option that selects the same inference engine on every machine, for steps that run the network on a CPU."""
     if step in ("import", "export") or _given(job.options.get(step, ()), "--device"):
         return ()
     return ("--device", "cpu" if inference == "auto" else f"cpu:{inference}")
@@ -175,7 +174,7 @@ _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}
 
 
 def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list[str]:
-    """Of a step's command, besides its options."""
+    """Arguments of a step's command before its options."""
     chosen = ["--camera", job.camera, *(["--domain", job.domain] if job.domain else [])]
     match step:
         case "import":
@@ -196,10 +195,10 @@ def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list
 
 
 def _table(job: Job, folder: OutputPath) -> Path | None:
-    """The kinematics that the steps before have found; None where nothing was optimized.
+    """Kinematics table of an earlier step; None where nothing was optimized.
 
     Raises:
-        SettingsError: there are several, since several cameras worked alone.
+        SettingsError: there are several, one for each camera.
     """
     made = [step for step in ("sequence", "optimize") if step in job.steps]
     found = sorted((folder / made[0]).path.glob("*/*/kinematics.csv")) if made else []
@@ -212,7 +211,7 @@ def _table(job: Job, folder: OutputPath) -> Path | None:
 
 
 def _inputs(path: Path) -> list[str | int]:
-    """What tells whether a file was replaced; nothing for what is no file."""
+    """Path, size and modification time of a file; empty if there is none."""
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -222,7 +221,7 @@ def _inputs(path: Path) -> list[str | int]:
 
 @contextlib.contextmanager
 def _logged(path: OutputPath) -> Iterator[None]:
-    """What the block prints goes into a file."""
+    """Redirect the output of the block to a file."""
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):

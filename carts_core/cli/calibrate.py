@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HandEye:
-    """Find base frames from points that were found by eye in 3 to 6 images; no initial pose is needed.
+    """Find base frames from landmarks that were clicked in 3 to 6 images; no initial pose is needed.
 
-    In `carts view` (New recording) the points are clicked. Here they are in a table; docs/howto/own_recording.md.
+    The points are in a table (docs/howto/own_recording.md); `carts view` (New recording) does the same by clicks.
     """
 
     sequence: SequencePath
-    """Sequence file; base frames in it may be anything."""
+    """Sequence file; its base frames are not used."""
     points: Path
     """CSV file with the columns frame (its id), camera, arm, landmark (tip, wrist yaw joint, wrist pitch joint,
     shaft edge, shaft middle), u and v [px of the undistorted image, from its upper left corner]."""
@@ -40,14 +40,14 @@ class HandEye:
     overwrite: bool = False
     """Replace an earlier result there."""
     focal_length: bool = False
-    """Find the focal lengths, too. Needs points at several depths; see the deviation that is said."""
+    """Estimate the focal lengths, too. Needs points at several depths; their standard deviation is printed."""
     free_cameras: tuple[str, ...] = ()
     """Cameras whose pose relative to the others is not known."""
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
 
     def run(self) -> None:
-        """Solve and write; nothing is written after an error."""
+        """Solve, and write the result; an error leaves no files."""
         from ..files import MARKER, published, write_text
         from ..optimization.hand_eye import (
             RESULT_FILE,
@@ -99,26 +99,26 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate the delay between images and joint positions from how both move, and propose a time_offset.
+    """Estimate the delay between images and joint positions from their common motion, and propose a time_offset.
 
-    Neither a hand-eye calibration nor a network is needed. The sequence file stays as it is.
+    It needs neither a hand-eye calibration nor a network, and does not change the sequence file.
     """
 
     sequence: SequencePath
-    """Sequence file whose rows are matched with frames by time ([frames])."""
+    """Sequence file that matches rows with frames by time ([frames])."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder to make for a sequence file with the proposed time_offset; by default it is only said."""
+    """Folder to create for a sequence file with the proposed time_offset; by default it is only printed."""
     overwrite: bool = False
-    """Replace an earlier one there."""
+    """Replace an earlier result there."""
     camera: str | None = None
-    """Whose images count; by default the first camera's."""
+    """Camera whose images are used; by default the first one."""
     domain: str | None = None
-    """Of the images; by default the first one."""
+    """Domain of the images; by default the first one."""
     largest: float = 0.5
-    """How far from the present time_offset it is looked for first [s]; up to 3 s where that explains little."""
+    """Search range around the present time_offset [s]; extended up to 3 s where no delay explains the motion."""
 
     def run(self) -> None:
-        """Say what the motion says, and write a file where that was asked for."""
+        """Print the estimate, and write a sequence file if a folder is given."""
         from ..files import MARKER, published, write_text
         from ..recording import Sequence, calibrated_sequence_file, estimate_time_offset
 
@@ -167,21 +167,21 @@ class Calibrate:
     positions: str | None = None
     """Frames by position, counted from 1 as in the page, instead: `1-10,15`."""
     camera: tuple[str, ...] = Selection.camera
-    """Cameras, by name; all take part at once."""
+    """Cameras, by name; all are calibrated jointly."""
     domain: str | None = None
     """Domain, by name; the sequence's first one if none is named."""
     joint_prior_deg: float = 0.1
-    """With `--joints`: expected error of a joint in a frame [deg]. The calibration is found, joints stay as measured in
-    all that is written."""
+    """With `--joints`: standard deviation of a joint's error in a frame [deg]. Written files keep the measured
+    joints."""
     beyond_hand_eye: bool = False
-    """Write a calibration also where a base frame moves farther than `carts hand-eye`, which wrote the sequence file,
-    leaves open."""
+    """Write a calibration even if a base frame moves beyond the uncertainty of `carts hand-eye`, which wrote the
+    sequence file."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
     network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
 
     def run(self) -> None:
-        """Calibrate; on Ctrl-C or an error nothing is written."""
+        """Calibrate; Ctrl-C or an error leaves no files."""
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
         from ..files import MARKER, published, write_text
         from ..optimization import Backgrounds, CalibrationOptimizer
@@ -232,7 +232,7 @@ class Calibrate:
         print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
 
     def _summary(self, weights: str, frames: list[str], cameras: list[str]) -> dict:
-        """How the folder was made."""
+        """Description of the run, for the folder's marker file."""
         return {
             "format": "calibration",
             "sequence": str(self.sequence),
@@ -273,10 +273,10 @@ def _with_locked_cameras(free: FreeParameters, cameras: list[str], prior: "HandE
 
 
 def _check_moves(sequence: "Sequence", result: "CalibrationResult", prior: "HandEyePrior") -> None:
-    """See that no base frame has moved beyond its prior.
+    """Check that no base frame has moved beyond its prior.
 
     Raises:
-        SettingsError: one has.
+        SettingsError: a base frame has.
     """
     from ..evaluation.calibration import beyond_prior
 

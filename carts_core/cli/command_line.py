@@ -34,7 +34,7 @@ from .view import View
 
 
 def settings_reference() -> str:
-    """What a settings file can hold, with defaults and meanings."""
+    """All settings of a settings file, with defaults and meanings."""
     parts = [
         "Settings of `--settings FILE`, in the tables [solver] and [sequence]; --print-settings writes them all.",
         *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
@@ -51,7 +51,7 @@ _DESCRIPTION = (
 )
 
 BAD_INPUT = 2
-"""Exit status when a file or an option is not usable."""
+"""Exit status for an unusable file or option."""
 
 COMMANDS: dict[str, type] = {
     "view": View,
@@ -78,13 +78,13 @@ COMMANDS: dict[str, type] = {
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
 
 _AT_ONCE = (View, Live, RobotCommand, Robots)
-"""Commands that say at once what they do."""
+"""Commands without a message at the start."""
 _INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
-"""In what tyro says, without its frame."""
+"""Error message of tyro, without its frame."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; errors that are meant for people end it with one message and status 2."""
+    """Run the command line; a `CartsError` ends it with a message and status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if parent := os.environ.pop(PARENT, ""):
         end_with_parent(int(parent))
@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
                 print(_settings_of(command))
                 return
         if not isinstance(command, _AT_ONCE):
-            # Importing what a command needs takes seconds on a busy machine.
+            # Imports take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with uncollected():
             from ..process import tune_process
@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _parsed(arguments: list[str]) -> Any:
-    """The command of a command line; help and errors of tyro end the program.
+    """Parse a command line; help and errors of tyro end the program.
 
     Raises:
         SettingsError: there is no such command.
@@ -134,7 +134,7 @@ def _parsed(arguments: list[str]) -> Any:
     try:
         with contextlib.redirect_stderr(said):
             if name in COMMANDS:
-                # So that only options of this command are suggested for a misspelt one.
+                # Suggestions for a misspelt option are those of this command.
                 return tyro.cli(COMMANDS[name], prog=f"carts {name}", args=options)
             return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
@@ -155,10 +155,10 @@ def print_all_help(arguments: list[str]) -> None:
 
 
 def _settings_of(command: object) -> str:
-    """The settings that a command would use, as a settings file.
+    """Settings of a command as a settings file.
 
     Raises:
-        SettingsError: it has none.
+        SettingsError: the command has no settings.
     """
     solving = getattr(command, "solving", None)
     if solving is None:
@@ -168,7 +168,7 @@ def _settings_of(command: object) -> str:
 
 @contextmanager
 def _quiet_when_unread() -> Iterator[None]:
-    """End without a traceback where whoever reads the output, such as `head`, has seen enough."""
+    """Exit without a traceback when the reader of a pipe, such as `head`, has closed it."""
     try:
         try:
             yield

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Render the arms over the frames or alone, as the project beside the sequence corrects them, else as measured."""
+    """Render the arms over the frames or alone, with the corrections of the project beside the sequence."""
 
     sequence: SequencePath
     """Sequence file."""
@@ -29,7 +29,7 @@ class Render:
     style: Literal["overlay", "image", "mask"] = "overlay"
     """The rendering blended over the frame, alone, or its mask."""
     opacity: float = 0.6
-    """Of the rendering in an overlay, 0 to 1."""
+    """Opacity of the rendering in an overlay, 0 to 1."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
@@ -70,7 +70,7 @@ class Render:
 class Export:
     """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats.
 
-    Frames are as the project beside the sequence corrects them, or as measured without one.
+    The corrections of the project beside the sequence are applied; without one, frames are exported as measured.
     """
 
     sequence: SequencePath
@@ -80,21 +80,21 @@ class Export:
     format: FormatName
     """What to write."""
     kinematics: Path | None = None
-    """Export the frames of this table (what `carts optimize` wrote) instead of those of a project or as measured."""
+    """Kinematics table of `carts optimize` to export instead of a project's corrections."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     parts: Parts = "arms"
-    """Give every arm a category of its own, or every part of it (shaft, wrist, jaws), or every link."""
+    """Categories: one per arm, per part of it (shaft, wrist, jaws), or per link."""
     images: Images = "named"
     """`named`: labels name the recording's own images, and formats that need images beside their labels (bop, voc,
     yolo) get copies; `copied`: copies for every format; `none`: no images. Copies have the same bytes."""
     frame_rate: float | None = None
-    """Of a video [1/s]; by default that of the recording, or 25 where it has no times."""
+    """Frame rate of a video [1/s]; by default that of the recording, or 25 without times."""
     overwrite: bool = False
     """Replace an earlier export."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
     def run(self) -> None:
-        """Write the export; on Ctrl-C or an error nothing of it is left."""
+        """Write the export; Ctrl-C or an error leaves no files."""
         from ..export import FORMATS, Dataset, Monitor, export
         from ..recording import Sequence
 
@@ -128,7 +128,7 @@ class Export:
     def _frames(
         self, sequence: "Sequence", cameras: list[str], console: Terminal
     ) -> "tuple[Sequence, list[ExportFrame]]":
-        """What is exported, and the recording that it belongs to."""
+        """Frames to export, and their recording."""
         from ..export import corrected_frames, measured_frames, project_frame, read_kinematics_csv
 
         indices = self.select.frame_indices(sequence)

@@ -22,7 +22,7 @@ _STYLES = {"found": "green", "guessed": "yellow", "missing": "magenta", "warning
 
 @dataclass(frozen=True)
 class Import:
-    """Write a sequence file for a recording, which stays where it is; without SOURCE, list the kinds."""
+    """Write a sequence file for a recording, which is not copied; without SOURCE, list the supported formats."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """File or folder of the recording."""
@@ -33,7 +33,7 @@ class Import:
     options: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
 
     def run(self) -> None:
-        """Say what was found, and write the sequence file."""
+        """Print a report on the recording, and write the sequence file."""
         from ..files.decoding import prepare
 
         if self.source is not None:
@@ -54,7 +54,7 @@ class Import:
 
 
 def print_report(console: Console, recording: "FoundRecording") -> None:
-    """Say what a recording holds, and what was guessed or is missing."""
+    """Print the contents of a recording, and what was guessed or is missing."""
     frames, times = len(recording.frame_ids), recording.frame_times
     span = "" if times is None or frames < 2 else f", {times[-1] - times[0]:.1f} s, {_rate(times):.1f} images/s"
     console.print(f"{recording.name}: {recording.kind}, {frames} frames{span}", markup=False)
@@ -73,10 +73,10 @@ def _rate(times: "np.ndarray") -> float:
 
 @dataclass(frozen=True)
 class ImportMasks:
-    """Put masks and keypoints of others into the project of a sequence, as layers beside what was painted.
+    """Import masks and keypoints into the project of a sequence, as layers beside painted ones.
 
     Reads COCO (.json), CVAT for images (.xml), folders of PNG masks, EndoVis 2017 and 2018, and keypoints of SurgPose.
-    It is one step of undo in `carts view`.
+    The import is one undo step in `carts view`.
     """
 
     sequence: SequencePath
@@ -86,12 +86,12 @@ class ImportMasks:
     project: Path | None = None
     """Project file; by default that beside the sequence."""
     camera: str | None = None
-    """Whose images they are, where names of files and folders do not say it."""
+    """Camera of the images, where names of files and folders do not contain it."""
     replace: bool = False
-    """Replace what was imported before. What was painted is never touched."""
+    """Replace earlier imports. Painted layers are not changed."""
 
     def run(self) -> None:
-        """Import, and say what."""
+        """Import, and print a report."""
         from ..project import Project, import_annotations
         from ..recording import Sequence
         from ..recording.annotations import read_annotations

@@ -26,7 +26,7 @@ class Synthesize:
     measured kinematics, in all domains."""
 
     output: Annotated[Path, tyro.conf.Positional]
-    """Folder to make; it must not exist."""
+    """Folder to create; it must not exist."""
     synthesis: Annotated[SynthesisConfig, tyro.conf.arg(name="")] = field(default_factory=SynthesisConfig)
 
     def run(self) -> None:
@@ -46,15 +46,16 @@ class Synthesize:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network on synthetic images; run it again to go on after an interruption."""
+    """Train a network on synthetic images; rerun it to resume after an interruption."""
 
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
-    """Sequence file to adapt the shipped network to: its robots, cameras, distances and empty backgrounds. It ends when
-    it no longer gains, or after 400 --steps or --minutes of processor time. Weights are offered if no fit is worse."""
+    """Sequence file to adapt the shipped network to: its robots, cameras, distances, empty backgrounds. Training ends
+    without further improvement, or after 400 --steps or --minutes of processor time. Weights are kept if no fit is
+    worse."""
     fits: int = 8
-    """With `--for`: made images on which fits before and after are compared; half as many frames of the recording."""
+    """With `--for`: number of synthetic images to compare fits on; half as many frames of the recording are added."""
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
 
     def __post_init__(self) -> None:
@@ -81,7 +82,7 @@ class Train:
         console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")
 
     def _adapt(self, recording: Path, console: Terminal) -> None:
-        """Adapt the shipped network to a recording, printing each validation; offer the weights if no fit is worse."""
+        """Adapt the shipped network to a recording; keep the weights if no fit is worse."""
         from ..lab.training.adaptation import adapted_to, gain, offer
         from ..lab.training.training import TrainingProgress, train
 
@@ -123,15 +124,15 @@ class Train:
 
 @dataclass(frozen=True)
 class Baseline:
-    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; run it again to go on."""
+    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun it to resume."""
 
     output: Annotated[Path, tyro.conf.Positional]
     """Folder for checkpoint and weights."""
     frames: Path = Path("runs/baseline_frames")
-    """Folder of training frames, made where they are missing, and shared by all baselines."""
+    """Folder of training frames, which all baselines share; missing ones are created."""
     network: Annotated[BaselineNetwork, tyro.conf.arg(name="")] = field(default_factory=BaselineNetwork)
     training: BaselineTraining = field(default_factory=BaselineTraining)
-    """How it is trained."""
+    """Settings of the training."""
 
     def run(self) -> None:
         """Train to the end."""
@@ -151,28 +152,28 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure accuracy and speed of all methods, and write a report; run it again to go on after a stop."""
+    """Measure accuracy and speed of all methods, and write a report; rerun it to resume."""
 
     output: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
     quick: bool = False
     """Few frames and steps: some minutes instead of hours."""
     real: Path | None = None
-    """Sequence file with real frames and masks, to be measured too, also with their instruments in other rooms."""
+    """Sequence file with real frames and masks, measured as recorded and with other backgrounds."""
     rooms: Path | None = None
-    """Folder of photographs to put instruments before, besides made rooms."""
+    """Folder of photographs for further backgrounds."""
     report_only: bool = False
-    """Measure nothing; write the report of what is there."""
+    """Write the report from earlier measurements without new ones."""
     frames: int | None = None
-    """Frames of each sequence to evaluate, if not as many as usual."""
+    """Number of frames of each sequence; by default that of the scope."""
     seed: int | None = None
-    """Seed of the synthetic sequence, if not the usual one."""
+    """Seed of the synthetic sequence."""
     baselines: tuple[Path, ...] = ()
-    """Weights files of `carts baseline`: networks of others, a row each, evaluated on the frames of the main table."""
+    """Weights files of `carts baseline`; each is a row of the main table."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
-        """Measure what is not known yet and write the report."""
+        """Do the missing measurements and write the report."""
         from importlib.metadata import version
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report

@@ -1,4 +1,4 @@
-"""`carts live`: follow the arms while they move."""
+"""`carts live`: tracking of the arms in a stream."""
 
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -19,28 +19,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Live:
-    """Follow the arms in a stream of images and joints, frame by frame; late frames are dropped. Ctrl-C ends it."""
+    """Track the arms in a stream of images and joints; late frames are dropped. Ctrl-C ends it."""
 
     sequence: SequencePath
     """Sequence file: its arms and cameras, and for a replay its images and joints."""
     source: str = "replay"
-    """Where frames come from: `replay` (at the speed of the clock), `camera:0`, `video:FILE`, `folder:PATH` that fills,
-    or `socket:PORT` of 127.0.0.1 (docs/reference/live.md)."""
+    """Source of frames: `replay` (in real time), `camera:0`, `video:FILE`, `folder:PATH` (new files), or `socket:PORT`
+    of 127.0.0.1 (docs/reference/live.md)."""
     joints_port: int | None = None
-    """With `camera` and `video`: port of 127.0.0.1 where joints come from, and where results go."""
+    """With `camera` and `video`: port of 127.0.0.1 for joints and results."""
     rate: float | None = None
     """Replay: frames a second; by default those of the recording."""
     loops: int = 1
-    """Replay: how often."""
+    """Replay: number of repetitions."""
     output: Path | None = None
-    """Write results to this file, a line of JSON each; by default they go to the standard output. With a socket they
-    also go to all its clients."""
+    """File for results, one JSON object a line; by default the standard output. With a socket, all its clients receive
+    them, too."""
     quiet: bool = False
-    """No results on the standard output."""
+    """Print no results on the standard output."""
     masks: bool = False
-    """Results have masks, too."""
+    """Include masks in the results."""
     record: Path | None = None
-    """Keep what is seen as a sequence in this new folder, with the corrections as its project."""
+    """New folder to record the stream to, as a sequence with the corrections as its project."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name."""
     domain: str | None = None
@@ -58,7 +58,7 @@ class Live:
             check_writable(self.output.parent)
 
     def run(self) -> None:
-        """Follow until the stream ends or somebody ends it."""
+        """Track until the stream ends or Ctrl-C."""
         from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
         from ..optimization import Backgrounds
         from ..project import Provenance
@@ -95,7 +95,7 @@ class Live:
             sinks = [show, *([recorder] if recorder is not None else [])]
             statistics = LiveStatistics()
             try:
-                # A stream may have no end but this, and who reads its lines may go away.
+                # Ctrl-C is the normal end; a closed pipe ends it, too.
                 with suppress(KeyboardInterrupt, BrokenPipeError):
                     follow(stream.source, tracker, sinks, statistics)
             finally:
@@ -106,7 +106,7 @@ class Live:
                     console.print(f"wrote {path}. Look at it: carts view {path}")
 
     def _lines(self) -> "list[Callable]":
-        """Where results go as lines of JSON."""
+        """Functions that write a result as a line of JSON."""
         import os
         import sys
 
@@ -126,7 +126,7 @@ class Live:
                 sys.stdout.buffer.write(encoder.encode(message) + b"\n")
                 sys.stdout.buffer.flush()
             except BrokenPipeError:
-                # Or Python would try again, and complain, at its end.
+                # Otherwise Python would flush again at exit, with an error.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise
 

@@ -28,10 +28,10 @@ from .options import (
 
 @dataclass(frozen=True)
 class Optimize(OptimizeOptions):
-    """Correct the kinematics of frames; write masks (PNG) and kinematics (CSV). Run it again to go on."""
+    """Correct the kinematics of frames; write masks (PNG) and kinematics (CSV). Rerun it to resume."""
 
     def run(self) -> None:
-        """Optimize what is not there yet."""
+        """Optimize the frames without an up-to-date result."""
         from .optimizing import Optimizing
 
         Optimizing(self).run()
@@ -39,14 +39,14 @@ class Optimize(OptimizeOptions):
 
 STANDARD_OUTPUT = Path("-")
 _WIDTH = 110
-"""Characters of the table's lines in a file or a pipe."""
+"""Width of the table in a file or a pipe [characters]."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
     """Optimize frames and compare masks and joints with the truth, before and after.
 
-    They start as the project beside the sequence corrects them, or as measured without one.
+    The start has the corrections of the project beside the sequence; without one, it is as measured.
     """
 
     sequence: SequencePath
@@ -55,7 +55,7 @@ class Evaluate:
     """Write the scores of all frames and their means to this file, whose folders are made; `-` for the standard output,
     with everything else on the standard error."""
     mode: Mode = "frame"
-    """Optimize each frame alone, or all together, so that frames inform each other (docs: sequences)."""
+    """Optimize each frame alone, or all frames jointly (docs: sequences)."""
     together: bool = False
     """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
@@ -76,7 +76,7 @@ class Evaluate:
             self.solving.check_surface("--mode sequence")
 
     def run(self) -> None:
-        """Print a table of means, and write the JSON file if one is named."""
+        """Print a table of means, and write the JSON file if a path is given."""
         from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
         from ..files import write_text
         from ..optimization import Backgrounds
@@ -85,7 +85,7 @@ class Evaluate:
 
         console = Terminal(stderr=self.json == STANDARD_OUTPUT)
         if not console.is_terminal:
-            console.width = _WIDTH  # a file or a pipe is not 80 wide, and what is cut off there is lost
+            console.width = _WIDTH  # rich assumes 80 and would cut the table
         sequence = Sequence.open(self.sequence, progress=console.print)
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)

@@ -1,4 +1,4 @@
-"""What `carts optimize` does."""
+"""Optimization and output of `carts optimize`."""
 
 import hashlib
 import json
@@ -37,7 +37,7 @@ from .results_folder import FrameFolder, FrameInputs, FrameResult, InputHashes
 
 @dataclass(frozen=True)
 class _Part:
-    """The frames of a domain, as cameras see them that work together."""
+    """Frames of a domain, seen by cameras that are optimized together."""
 
     domain: str
     cameras: tuple[str, ...]
@@ -45,15 +45,15 @@ class _Part:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for the terminal."""
         return f"{self.domain}, {', '.join(self.cameras)}"
 
 
 class Optimizing:
-    """Corrects frames as a command line asks for.
+    """Corrects the chosen frames and writes the results.
 
     Args:
-        asked: the command line.
+        asked: options of the command.
     """
 
     def __init__(self, asked: OptimizeOptions) -> None:
@@ -62,18 +62,17 @@ class Optimizing:
         self._sequence = Sequence.open(asked.sequence, progress=self._console.print)
         self._frames = asked.select.frame_indices(self._sequence)
         self._keyframes = self._read_keyframes()
-        self._looking: SequenceOptimizer | None = None
+        self._running: SequenceOptimizer | None = None
         self._observer = asked.network.observer(self._solver, self._sequence)
         select = asked.select
         cameras, domains = select.camera_names(self._sequence.scene), select.domain_names(self._sequence)
         self._observer.check(self._sequence, self._frames, cameras, domains)
 
     def run(self) -> None:
-        """Optimize what is not there yet.
+        """Optimize the frames without an up-to-date result.
 
         Raises:
-            CartsError: something cannot be done as asked for; whatever can be known of that is reported before
-                anything is written.
+            CartsError: an option or a file is not usable; most such errors are raised before anything is written.
         """
         scene, select = self._sequence.scene, self._asked.select
         groups = camera_groups(select.camera_names(scene), self._asked.together)
@@ -89,7 +88,7 @@ class Optimizing:
         asked, sequence = self._asked, self._sequence
         scene = sequence.scene.with_cameras(cameras)
         start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
-        # Made for its errors: no name of what is free or locked may be wrong.
+        # Raises for unknown names of free or locked parameters.
         Variables(scene, start, self._free, self._solver.length_scale)
         folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
         return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
@@ -105,18 +104,18 @@ class Optimizing:
         else:
             now = {index: origins.of(index) for index in frames}
         todo = self._to_do(part, now)
-        self._tell_of_others(part, common)
+        self._report_others(part, common)
         if todo and isinstance(self._solver, SurfaceSolver):
             known = Backgrounds.of(sequence, part.cameras, part.domain).covers(scene)
             warned = self._observer.warnings(sequence, todo[0], part.domain, part.cameras, background=known)
             print_hints(self._console, *warned)
         if not together:
-            self._each_alone(todo, part, now)
+            self._solve_frames(todo, part, now)
         elif todo:
-            # Every frame depends on all others, so one that is missing has all of them done again.
-            self._as_sequence(part, now, common)
+            # Every frame depends on all others, so a missing one requires solving all again.
+            self._solve_sequence(part, now, common)
         else:
-            # A kill between the last result and the end leaves it.
+            # Left behind by a kill after the last result.
             remove_file(output.checkpoint)
         if todo:
             print_hints(self._console, constant_correction_hint(part.name, sequence, output.rows))
@@ -125,7 +124,7 @@ class Optimizing:
             )
 
     def _to_do(self, part: _Part, now: Mapping[int, InputHashes]) -> list[int]:
-        """Positions of the chosen frames that are not there as they would be made now; says why."""
+        """Positions of the chosen frames without an up-to-date result; prints the reasons."""
         output, ids = part.output, self._sequence.frame_ids
         there = {row.frame_id for row in output.rows}
         faults = {index: output.fault(ids[index], origin) for index, origin in now.items() if ids[index] in there}
@@ -137,8 +136,8 @@ class Optimizing:
             self._console.print(f"{output.folder}: {count} of {total} redone: {reason}")
         return [index for index in now if index not in faults or faults[index]]
 
-    def _tell_of_others(self, part: _Part, common: InputHashes) -> None:
-        """Of frames in the folder that were not chosen."""
+    def _report_others(self, part: _Part, common: InputHashes) -> None:
+        """Report outdated results of frames that were not chosen."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
             note = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
@@ -164,14 +163,14 @@ class Optimizing:
         return FrameInputs(sequence, part.cameras, part.domain, self._observer, start, backgrounds.images, settings)
 
     def _kept(self, part: _Part) -> str:
-        """What there is of a part that was stopped."""
+        """Message on what a stopped run has kept."""
         there = f"{part.output.folder} holds {counted(len(part.output.rows), 'frame')}"
-        if self._looking is not None:
-            done, total = self._looking.progress
+        if self._running is not None:
+            done, total = self._running.progress
             there = f"{done} of {counted(total, 'frame')} are solved and kept in {part.output.checkpoint}"
         return f"{there}; the same command goes on from there"
 
-    def _each_alone(self, todo: list[int], part: _Part, origins: Mapping[int, InputHashes]) -> None:
+    def _solve_frames(self, todo: list[int], part: _Part, origins: Mapping[int, InputHashes]) -> None:
         asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         if not todo:
             return
@@ -212,7 +211,7 @@ class Optimizing:
             *verdict_hints(part.name, assessed),
         )
 
-    def _as_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
+    def _solve_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
         asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
         backgrounds = Backgrounds.of(sequence, cameras, part.domain)
         starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
@@ -232,12 +231,12 @@ class Optimizing:
             cameras=cameras,
             checkpoint=checkpoint,
         )
-        self._looking = optimizer
+        self._running = optimizer
         with Bar(console=self._console) as bar:
             task = bar.add_task(part.name, total=len(frames))
             for _ in optimizer:
                 bar.update(task, completed=optimizer.progress[0])
-        self._looking = None
+        self._running = None
         found = []
         for index, estimate in optimizer.estimates.items():
             source = {Origin.KEYFRAME: "edited", Origin.MEASURED: "measured"}.get(estimate.start, "optimized")
@@ -260,14 +259,14 @@ class Optimizing:
         )
 
     def _print_verdicts(self, part: _Part, frame_ids: list[str]) -> None:
-        """What was found for these frames: verdicts on masks, and how many joints are not determined."""
+        """Print verdicts on masks, and how many joints are not determined."""
         rows = [row for row in part.output.rows if row.frame_id in set(frame_ids)]
         joints = [row.undetermined(self._sequence.scene) for row in rows]
         if line := verdict_line(part.name, [row.verdict for row in rows], joints):
             self._console.print(line, soft_wrap=True)
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
-        """Position -> joint positions of the chosen frames that a person set."""
+        """Position -> joint positions of the chosen keyframes."""
         if self._asked.keyframes is None:
             return {}
         ids = self._sequence.frame_ids
@@ -279,7 +278,7 @@ class Optimizing:
         return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
     def _settings(self) -> dict[str, Any]:
-        """What was asked for; what it is applied to has fingerprints (`FrameInputs`)."""
+        """Settings stored with the results; inputs have fingerprints (`FrameInputs`)."""
         asked = self._asked
         settings = {
             "sequence": str(asked.sequence.resolve()),

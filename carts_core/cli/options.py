@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 ALL = "all"
 
 Mode = Literal["frame", "sequence"]
-"""Each frame alone, or all together, each knowing what the others found (docs: sequences)."""
+"""Solve each frame alone, or all frames jointly (docs: sequences)."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What of a sequence is worked on."""
+    """Frames, cameras and domains of a sequence."""
 
     frames: str | None = None
     """Frames by their ids, as the recording and the page name them: `all` (the default), `007`, `001-010` in the
@@ -147,12 +147,12 @@ def _counted_from_0(text: str, ids: Names[str]) -> str | None:
 
 
 NO_PROJECT = "none"
-"""The recording as measured, whatever project lies beside it."""
+"""Value of `--project` for the recording as measured."""
 
 
 @dataclass(frozen=True)
 class FromProject:
-    """Whose corrections are used."""
+    """Project whose corrections are applied."""
 
     project: str | None = None
     """Project whose corrections (joints, calibration, time offset, masks) are used: by default that beside the
@@ -226,13 +226,13 @@ class FromProject:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Wrong joint positions on purpose, to see what becomes of them."""
+    """Offset of the initial joint positions, for experiments."""
 
     perturb_deg: float = 0.0
-    """Start that many degrees (and millimetres) off on every measured joint: off the true joint positions where the
-    sequence has them, else off the measured ones. 0 starts at the measured ones."""
+    """Offset of every measured joint at the start [deg, mm]: from the true joint positions where the sequence has them,
+    else from the measured ones. 0 starts at the measured positions."""
     seed: int = 0
-    """Seed of the error's signs; these are the same in all frames in sequence mode."""
+    """Seed of the offset's signs, which are the same in all frames in sequence mode."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.perturb_deg <= 180:
@@ -244,19 +244,19 @@ class Perturbation:
 
 
 _ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}
-"""Devices that say who runs the surface network there."""
+"""Names of the CPU with an inference engine of the surface network."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """The networks and where they run."""
+    """Weights of the networks, and the device that runs them."""
 
     weights: tuple[Path, ...] = ()
-    """Weights files; a network that none is given of is the shipped one."""
+    """Weights files; a network without one has the shipped weights."""
     device: str = "cpu"
-    """`cpu`, or a CUDA device such as `cuda` or `cuda:1` for the networks. On a CPU the surface network is run by torch
-    or ONNX Runtime (the same to 1e-4), whichever was faster when it was measured here, once; `cpu:torch` and `cpu:onnx`
-    name one."""
+    """Device of the networks: `cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU the surface network runs in
+    torch or ONNX Runtime (equal to 1e-4), whichever is faster in a measurement that is made once; `cpu:torch` and
+    `cpu:onnx` select one."""
 
     def __post_init__(self) -> None:
         if self.device not in _ENGINES:
@@ -269,7 +269,7 @@ class Network:
 
     @property
     def inference(self) -> Inference:
-        """Who runs the surface network."""
+        """Inference engine of the surface network."""
         return _ENGINES.get(self.device, "auto")
 
     def load(self) -> "FeatureExtractor":
@@ -277,7 +277,7 @@ class Network:
 
         Raises:
             WeightsError: a weights file cannot be used.
-            SettingsError: nobody here can run them as asked for.
+            SettingsError: the device or engine is not available.
         """
         from ..networks.extractor import FeatureExtractor
 
@@ -285,7 +285,7 @@ class Network:
 
 
 def check_device(device: str) -> None:
-    """See that a device exists.
+    """Check that a device exists.
 
     Raises:
         SettingsError: it does not.
@@ -303,7 +303,7 @@ def check_device(device: str) -> None:
 
 
 def output_folder(named: Path | None, *default: str) -> OutputPath:
-    """The folder that a command writes to: the one that a person named, else the one of these names in `runs`.
+    """Output folder of a command: the one given, else the one with these names in `runs`.
 
     Raises:
         OutputError: one of the names cannot be part of a path.
@@ -312,7 +312,7 @@ def output_folder(named: Path | None, *default: str) -> OutputPath:
 
 
 def check_writable(folder: Path) -> None:
-    """See that a folder can be written to or made, before any work is done.
+    """Check that a folder can be written to or created, before any work is done.
 
     Raises:
         SettingsError: it cannot.
@@ -328,14 +328,14 @@ SequencePath = Annotated[Path, tyro.conf.Positional]
 
 @dataclass(frozen=True)
 class FreeInFrames(FreeParameters):
-    """The same without what is rarely needed for frames; --settings has it."""
+    """Free parameters of frames; rarely used ones are left to --settings."""
 
     locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
 
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Which solver, and with what settings."""
+    """Solver and its settings."""
 
     solver: Annotated[SolverName, tyro.conf.EnumChoicesFromValues] = SolverName.SURFACE
     """Solver: `surface` is the default; `occluded` runs again without occluded pixels; `acs`, `acs_reference`, `l1` and
@@ -358,11 +358,11 @@ class SolverOptions:
         return changed(SequenceSettings(), _table(self.settings, "sequence"), "[sequence]")
 
     def freed(self, free: FreeParameters) -> FreeParameters:
-        """What is free, from options and settings."""
+        """Free parameters from options and settings."""
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver is the one that estimates its uncertainty.
+        """Check that the solver is `surface`, which estimates standard deviations.
 
         Raises:
             SettingsError: it is not.
@@ -458,15 +458,15 @@ LAYERS: dict[str, "MaskLayer"] = {"imported": "imported", "painted": "painted"}
 
 @dataclass(frozen=True)
 class Observer:
-    """Who says what images show."""
+    """Source of the observations: a network, given masks, or both."""
 
     predictor: "FeatureExtractor | MaskPredictor"
     weights: str
-    """Fingerprint of the networks and of who runs them; empty without any."""
+    """Fingerprint of the networks and their engine; empty without any."""
     masked: bool
     """Whether masks are fitted."""
     given: "GivenMasks | None" = None
-    """The masks that are fitted, where they are not those of the sequence file."""
+    """Fitted masks, unless they are those of the sequence file."""
     every: bool = False
     """Whether each frame needs a mask."""
 
@@ -476,7 +476,7 @@ class Observer:
         return (lambda _: {}) if self.given is None else self.given.ignored
 
     def completed(self, frame: "Frame") -> "Frame":
-        """A frame with the masks that are fitted, for cameras that the recording has no mask of."""
+        """A copy of a frame, with given masks for cameras without a recorded one."""
         return frame if self.given is None else self.given.filled(frame)
 
     def mask_inputs(
@@ -490,10 +490,10 @@ class Observer:
     def check(
         self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
     ) -> None:
-        """See that all frames have what is to be fitted, before any of them is solved.
+        """Check that all frames have the masks to be fitted, before any of them is solved.
 
         Raises:
-            SettingsError: they have not.
+            SettingsError: masks are missing.
         """
         if not self.masked:
             return
@@ -520,8 +520,7 @@ class Observer:
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
     ) -> list[str]:
-        """What speaks against the network for these arms and images, from one frame; where masks are fitted, whether
-        some of the cameras that look together have none.
+        """Warnings from one frame: the network is not suited to these arms or images, or masks of cameras are missing.
 
         Args:
             sequence, index, domain, cameras: which frame.
@@ -545,11 +544,11 @@ class Observer:
 
 @dataclass(frozen=True)
 class Observing(Network):
-    """What is fitted, the networks, and where they run."""
+    """Observations that are fitted: predictions of the network, masks, or both."""
 
     observe: Literal["network", "masks", "both"] = "network"
-    """What is fitted: predictions of the network, the sequence's masks (no network is loaded), or both: the masks, with
-    parts and normals from the network, which serves frames without a mask alone."""
+    """Fitted observations: predictions of the network, the sequence's masks (no network is loaded), or both: masks,
+    with parts and normals from the network, which alone serves frames without a mask."""
     masks: str = RECORDING
     """Which masks are fitted: `recording` for those of the sequence file, `imported` or `painted` for those of its
     project (`carts import-masks`, `carts view`) or, as in `other.carts:painted`, of another one, or a file or folder of
@@ -569,7 +568,7 @@ class Observing(Network):
             )
 
     def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
-        """Who says what the images of a sequence show, for a solver.
+        """Observer of a sequence, for a solver.
 
         Raises:
             SettingsError: the solver compares features of images.
@@ -598,7 +597,7 @@ class Observing(Network):
 
     @property
     def _layer(self) -> "tuple[Path | None, MaskLayer | None]":
-        """Project (None for the one beside the sequence) and its layer that are fitted; no layer where others are."""
+        """Project (None for the one beside the sequence) and fitted layer; None for masks from elsewhere."""
         from ..project.identity import SUFFIX
 
         project, _, name = self.masks.rpartition(":")
@@ -608,7 +607,7 @@ class Observing(Network):
         return Path(project) if project else None, layer
 
     def _given(self, sequence: "Sequence") -> "GivenMasks | None":
-        """The masks to be fitted, where they are not those of the sequence file."""
+        """Masks to be fitted; None for those of the sequence file."""
         if self.masks == RECORDING:
             return None
         from ..project import Project
@@ -623,13 +622,13 @@ class Observing(Network):
 
     @property
     def observed(self) -> dict[str, str]:
-        """What is fitted, for a file of results."""
+        """Description of the observations, for a results file."""
         elsewhere = {} if self.masks == RECORDING else {"masks": self.masks}
         return {"observed": self.observe, **elsewhere}
 
     @property
     def caution(self) -> str | None:
-        """What to know of Dice scores: whether they are against what was fitted."""
+        """Remark on Dice scores that are measured against the fitted masks; None if there are none."""
         if self.observe == "network":
             return None
         against = "the masks that were fitted" if self.masks == RECORDING else "them where the recording has no masks"
@@ -638,20 +637,20 @@ class Observing(Network):
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """The sequence, the chosen frames, and how they are corrected."""
+    """Options of `carts optimize`."""
 
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
     """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras under --together."""
     overwrite: bool = False
-    """Start over: everything that the folder holds is made again."""
+    """Discard earlier results in the folder and start over."""
     mode: Mode = "frame"
-    """Correct each frame alone, or all together, so that frames inform each other (docs: sequences)."""
+    """Correct each frame alone, or all frames jointly (docs: sequences)."""
     together: bool = False
     """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
     keyframes: Path | None = None
-    """`sequence` mode: kinematics table of frames that a person set (its rows with the source `edited`)."""
+    """`sequence` mode: kinematics table; its rows with the source `edited` are keyframes."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)

@@ -18,18 +18,18 @@ _NAMED = 5
 
 
 def print_hints(console: Console, *hints: str | None) -> None:
-    """Print those that there are."""
+    """Print hints, leaving out None."""
     for hint in hints:
         if hint is not None:
             console.print(hint, style="yellow")
 
 
 def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
-    """Why some estimates are nothing but the start, or None if none is.
+    """Hint where estimates are equal to their start; None if there are none.
 
     Args:
-        where: as below.
-        stopped: why each optimization ended.
+        where: camera, or another description of the frames.
+        stopped: reason why each optimization ended.
     """
     kept = sum(reason == "start kept" for reason in stopped)
     if not kept:
@@ -43,12 +43,12 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 def verdict_line(
     where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
 ) -> str | None:
-    """Verdicts on masks, and how many joints the images leave open; None where nothing was assessed.
+    """Verdicts on masks, and numbers of undetermined joints; None where nothing was assessed.
 
     Args:
-        where: as below.
+        where: camera, or another description of the frames.
         verdicts: of each run, None where it was not assessed.
-        undetermined: `ARM.JOINT` of the joints that each run leaves open, None where that is not known.
+        undetermined: `ARM.JOINT` of the undetermined joints of each run, None where that is not known.
     """
     runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]
     counts = Counter(
@@ -59,11 +59,11 @@ def verdict_line(
 
 
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
-    """A line for each reason why results are not to be relied on, or only in part.
+    """A line for each reason why results are doubtful or failed.
 
     Args:
-        where: as below.
-        assessed: id of each frame -> how far its result can be relied on.
+        where: camera, or another description of the frames.
+        assessed: id of each frame -> its assessment.
     """
     frames: dict[tuple[str, str, str], list[str]] = {}
     for frame_id, found in assessed.items():
@@ -77,7 +77,7 @@ def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list
 
 
 def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
-    """Why a sequence as a whole is not to be relied on, or None if it is, or is not assessed."""
+    """Reason why a sequence is doubtful or failed; None if it is good or was not assessed."""
     if found is None or found.verdict is Verdict.GOOD:
         return None
     kept = " Its failed frames keep the measured values." if found.verdict is Verdict.FAILED else ""
@@ -85,7 +85,7 @@ def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
 
 
 def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | None:
-    """The verdict on a calibration; None if it was not assessed."""
+    """Verdict on a calibration; None if it was not assessed."""
     if found is None:
         return None
     kept = " The calibration is kept as it was." if stopped in (StopReason.FAILED, StopReason.START_KEPT) else ""
@@ -93,11 +93,11 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
-    """A suggestion, if on average over frames the base frames are probably wrong, else None.
+    """Hint where base frames are probably wrong, on average over frames; None elsewhere.
 
     Args:
-        where: camera, or what else tells people which frames are meant.
-        gains: what free base frames would explain of each frame's remaining difference, None where that is not known.
+        where: camera, or another description of the frames.
+        gains: share of each frame's residual that free base frames would explain, None where that is not known.
     """
     known = [gain for gain in gains if gain is not None]
     if not known or np.mean(known) < BASE_FRAME_GAIN:
@@ -110,20 +110,20 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
 
 
 _FRAMES = 4
-"""Frames from which corrections can be called the same in all of them."""
+"""Least number of frames for this hint."""
 _LARGE = 5.0
-"""What joints are seldom off by in all frames, twice the prior of the default solver [deg, mm]."""
+"""Threshold of constant corrections, twice the prior of the default solver [deg, mm]."""
 
 
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
-    """What large corrections that are much the same in all frames may come from, or None if there are none.
+    """Hint on large corrections that are nearly equal in all frames; None if there are none.
 
-    Joints make up for a wrong focal length or base frame, so the image fits and the joints are wrong.
+    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong.
 
     Args:
-        where: what tells people which frames are meant.
+        where: description of the frames.
         sequence: with the measured joint positions.
-        rows: results; those that were not optimized do not count.
+        rows: results; only optimized ones count.
     """
     scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     rows = [row for row in rows if row.source == "optimized"]
@@ -150,7 +150,7 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
 
 
 def score_table(scores: list[FrameScore], title: str) -> Table:
-    """Means per domain and camera."""
+    """Table of means per domain and camera, as `carts evaluate` prints it."""
     table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
     for column in (
         "domain",

@@ -40,7 +40,7 @@ _CHANGED = {
     "background": "the background changed",
     "together": "they were solved together with other frames",
 }
-"""What to say where the fingerprint of an input is another one."""
+"""Message where the fingerprint of an input differs."""
 
 _CODE = (
     "*.py",
@@ -91,11 +91,11 @@ class FrameInputs:
 
     @property
     def common(self) -> InputHashes:
-        """What all frames have in common."""
+        """Fingerprints of inputs that all frames share."""
         return self._common
 
     def of(self, index: int) -> InputHashes:
-        """Of a frame that is corrected alone.
+        """Fingerprints of a frame that is corrected alone.
 
         Raises:
             SequenceError: one of its images is missing.
@@ -111,7 +111,7 @@ class FrameInputs:
         return origin
 
     def of_all(self, indices: Several[int]) -> InputHashes:
-        """Of frames that are corrected together: each depends on what all are made from."""
+        """Fingerprints of frames that are corrected jointly: each depends on the inputs of all."""
         each = [self.of(index) for index in indices]
         stamps = self._sequence.timestamps
         times = [None if stamps is None else float(stamps[index]) for index in indices]
@@ -126,10 +126,10 @@ class FrameInputs:
 
 
 def changes(before: InputHashes, now: InputHashes) -> str | None:
-    """What has changed, for people; None if nothing that both tell of has."""
+    """Message on changed inputs; None if none of those in both has changed."""
     different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
     if "together" in different:
-        # With other frames, these are of other frames too.
+        # Other frames imply other joints, images and masks.
         different = [kind for kind in different if kind not in ("joints", "images", "masks")]
     if "calibration" in different:
         # Masks and backgrounds are compared without their distortion, which belongs to the calibration.
@@ -145,7 +145,7 @@ _FORMAT = "carts-results/1"
 
 @dataclass(frozen=True)
 class Record:
-    """Of one frame."""
+    """Provenance of a frame's result."""
 
     origin: Mapping[str, str]
     """Kind of input -> its fingerprint."""
@@ -154,39 +154,39 @@ class Record:
     row: str
     """Fingerprint of the row in the table."""
     threads: int
-    """How many threads torch had; results do not depend on it."""
+    """Number of threads of torch; results do not depend on it."""
     verdict: str = ""
-    """`good`, `doubtful` or `failed`; empty where it was not asked for."""
+    """`good`, `doubtful` or `failed`; empty without an assessment."""
     reason: str = ""
-    """For the verdict, one sentence."""
+    """Reason for the verdict, one sentence."""
     probability: float | None = None
-    """That the mask is wrong [1]."""
+    """Probability that the mask is wrong [1]."""
     not_determined: Several[str] | None = None
-    """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
+    """`ARM.JOINT` of joints that the images do not determine; None without standard deviations."""
 
 
 def judged(found: Assessment | None) -> dict[str, Any]:
-    """The fields of a record that tell of a verdict."""
+    """Fields of a record that describe the verdict."""
     if found is None:
         return {}
     return {"verdict": found.verdict.value, "reason": found.reason, "probability": round(found.probability, 6)}
 
 
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
-    """Of a row of the table, with the digits that it has there."""
+    """Fingerprint of a row of the table, with the digits written there."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
     verdict = [row.verdict] if row.verdict else []
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
 
 
 def records_text(records: Mapping[str, Record]) -> str:
-    """The file, one frame a line."""
+    """Contents of results.json, one frame a line."""
     lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in records.items()]
     return f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
 
 
 def read_records(path: OutputPath) -> dict[str, Record]:
-    """Frame -> record. Nothing where the file is missing or damaged: then nothing there counts as known.
+    """Records by frame; empty where the file is missing or damaged, so that all results are redone.
 
     Raises:
         SettingsError: a newer version of the program wrote the file.
@@ -207,31 +207,31 @@ def read_records(path: OutputPath) -> dict[str, Record]:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What was found for a frame."""
+    """Result of a frame."""
 
     row: KinematicsRow
     state: SceneState
     origin: InputHashes
-    """What it was made from."""
+    """Fingerprints of its inputs."""
     assessment: Assessment | None = None
-    """How far it can be relied on, where that is known."""
+    """Verdict on the result, where it was assessed."""
 
 
 class FrameFolder:
-    """Masks, kinematics (`kinematics.csv`) and what they were made with (`settings.json`) and from (`results.json`).
+    """Folder with masks, kinematics (`kinematics.csv`), settings (`settings.json`) and provenance (`results.json`).
 
-    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` where there are several cameras. No file is half written,
-    and no frame counts that was not written whole. No file is made or changed before the first frame is written.
+    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` with several cameras. Files are written atomically, and a
+    frame counts only if all its files were written. Nothing is created or changed before the first frame is written.
 
     Args:
         sequence, cameras: whose frames these are.
         folder: where to write.
-        settings: what was asked for; a folder whose own are of another `sequence` is not written to.
-        overwrite: start over, whatever is there.
+        settings: of the run; a folder with results of another `sequence` is not written to.
+        overwrite: discard earlier results.
 
     Attributes:
-        rows: what is in the table.
-        checkpoint: file for what sequence mode has found before it is done.
+        rows: of the kinematics table.
+        checkpoint: file with intermediate results of sequence mode.
 
     Raises:
         SettingsError: the folder holds results of another sequence, or cannot be written to.
@@ -261,12 +261,12 @@ class FrameFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Read what is there, and keep other processes from writing to it.
+        """Read existing results and lock the folder for other processes.
 
         Raises:
             OutputError: another process writes there.
             SequenceError: the table cannot be read.
-            SettingsError: the folder has come to hold results of another sequence.
+            SettingsError: the folder holds results of another sequence by now.
         """
         with locked_folder(self.folder):
             self._check_settings()
@@ -279,11 +279,11 @@ class FrameFolder:
             yield
 
     def fault(self, frame_id: str, origin: InputHashes) -> str | None:
-        """Why a frame in the table does not count, for people; None if it does.
+        """Reason why the result of a frame is not up to date; None if it is.
 
         Args:
             frame_id: of a frame in `rows`.
-            origin: what it would be made from now; kinds of inputs that are not in it are not compared.
+            origin: fingerprints of its present inputs; kinds that are missing here are not compared.
         """
         record = self._records.get(frame_id)
         row = self._row(frame_id)
@@ -298,13 +298,13 @@ class FrameFolder:
         return None
 
     def others_dropped(self, chosen: Several[str]) -> int:
-        """How many frames besides the chosen ones are in the folder and go when the first result is written."""
+        """Number of other frames whose results are removed when the first result is written."""
         if not self._overwrite or not holds_file(self._table):
             return 0
         return len(set(self._written_before()) - set(chosen))
 
     def write(self, found: Several[FrameResult]) -> None:
-        """Write masks and rows of frames, in place of earlier ones; a signal waits until that is done."""
+        """Write masks and rows of frames; signals are handled afterwards."""
         if not found:
             return
         with finished_first():
@@ -330,7 +330,7 @@ class FrameFolder:
             new = {result.row.frame_id: result.row for result in found}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
-            # A frame counts when all three tell of it: what a kill leaves between them is done again.
+            # A frame counts if all three files list it, so that a kill between them has it redone.
             write_text(self._table, kinematics_csv(self._scene, self.rows))
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
             write_text(self._records_file, records_text(known))
@@ -344,7 +344,7 @@ class FrameFolder:
         self._goes_on = True
 
     def _written_before(self) -> list[str]:
-        """Frames of this sequence that the folder has results of, whatever their settings."""
+        """Frames of this sequence with results in the folder, under any settings."""
         if not holds_file(self._table):
             return []
         lines = self._table.path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -373,7 +373,7 @@ class FrameFolder:
             )
 
     def _settings_written(self) -> dict[str, Any]:
-        """What the newest results in the folder were asked for with; nothing where that is missing or damaged."""
+        """Settings of the newest results in the folder; empty where the file is missing or damaged."""
         if not holds_file(self._settings_file):
             return {}
         try:

@@ -15,13 +15,13 @@ from ..stopping import when_stopped
 
 @dataclass(frozen=True)
 class Robots:
-    """List the robots that are built in, for `robot = "builtin:NAME"` in a sequence file."""
+    """List the built-in robots, for `robot = "builtin:NAME"` in a sequence file."""
 
     pictures: Path | None = None
     """Folder for a picture of each, NAME.png."""
 
     def run(self) -> None:
-        """Print the list; make pictures if asked for."""
+        """Print the list, and write pictures if a folder is given."""
         from ..model.instruments import INSTRUMENTS, SHIPPED, builtin_names
 
         console = Terminal()
@@ -60,7 +60,7 @@ class Robots:
 
 @dataclass(frozen=True)
 class RobotCommand:
-    """Make a URDF of an arm with one of the instruments of dvrk_model; without --instrument, list these."""
+    """Make a URDF of an arm with an instrument of dvrk_model; without --instrument, list the instruments."""
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """Checkout of https://github.com/jhu-dvrk/dvrk_model: the folder with `urdf` and `meshes`."""
@@ -72,7 +72,7 @@ class RobotCommand:
     """Replace a file that is there."""
 
     def run(self) -> None:
-        """Write the URDF, once all its meshes have been read."""
+        """Write the URDF after all its meshes have been read."""
         from ..files import write_text
         from ..model.dvrk_model import dvrk_urdf, list_instruments
         from ..model.robot import Robot

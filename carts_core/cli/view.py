@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """Open a sequence in the browser; without one, a page to choose a recording, or to begin a new one."""
+    """Open a sequence in the browser; without one, the start page to choose or create one."""
 
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file, or the folder of a batch."""
     root: tuple[Path, ...] = ()
-    """Folders that the page to choose a recording may look into, and nothing outside; by default the working folder.
-    With a sequence, folders that masks of others may be imported from, besides its own."""
+    """Folders that the start page may read; by default the working folder. With a sequence: further folders that masks
+    may be imported from."""
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
@@ -33,7 +33,7 @@ class View:
     open_browser: bool = False
     """Open the page in the default browser."""
     segmenter: tuple[Path, Path] | None = None
-    """Encoder and decoder of a SAM-type model as ONNX files, for the tool *Prompt*; by default the one that ships."""
+    """Encoder and decoder of a SAM-type model as ONNX files, for the tool *Prompt*; by default the shipped model."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
@@ -42,7 +42,7 @@ class View:
             from carts_viewer.serving import serve, serve_site
 
             from ..batch.folder import is_batch
-        # Modules stay; every search for garbage among them would stop whatever moves on the page for 0.2 s.
+        # Otherwise each garbage collection would search all modules and stop the page for 0.2 s.
         gc.freeze()
         segmenter = self._segmenter()
         if self.sequence is None or is_batch(self.sequence):

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -19,6 +19,8 @@ from ...errors import SettingsError, WeightsError
 from ...files import output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json
 from ...networks.weights import tensor_bytes
+from ...settings import TrainingConfig
+from ...settings.baseline import BaselineTraining
 from ...stopping import finished_first
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
@@ -119,25 +121,6 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
 Batch = TypeVar("Batch")
 
 
-class LoopSettings(Protocol):
-    """Settings that every training run has; see `TrainingConfig` and `BaselineTraining`."""
-
-    @property
-    def steps(self) -> int: ...
-    @property
-    def minutes(self) -> float | None: ...
-    @property
-    def learning_rate(self) -> float: ...
-    @property
-    def weight_decay(self) -> float: ...
-    @property
-    def warmup(self) -> int: ...
-    @property
-    def checkpoint_every(self) -> int: ...
-    @property
-    def threads(self) -> int: ...
-
-
 class TrainingLoop:
     """Trains a network with AdamW, or resumes the run whose checkpoint lies in a folder.
 
@@ -162,7 +145,7 @@ class TrainingLoop:
         self,
         output: Path,
         network: nn.Module,
-        settings: LoopSettings,
+        settings: TrainingConfig | BaselineTraining,
         config_json: str,
         may_change: tuple[str, ...],
         further: Mapping[str, nn.Module] | None = None,
