@@ -20,7 +20,7 @@ from ...files import output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json
 from ...networks.weights import tensor_bytes
 from ...settings import TrainingConfig
-from ...settings.baseline import BaselineTraining
+from ...settings.training import BaselineTraining
 from ...stopping import finished_first
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
