@@ -40,7 +40,7 @@ _DO: dict[str, intents.Intent] = {
 
 
 class Listening:
-    """Hands what a page says to its tab; what makes no sense is not answered."""
+    """Dispatches browser events to tabs; invalid ones are ignored."""
 
     def __init__(self, page: Page, tabs: Tabs, worker: Worker, sequence: Sequence) -> None:
         self._page, self._tabs, self._worker, self._sequence = page, tabs, worker, sequence
@@ -78,7 +78,7 @@ class Listening:
             self._put(client_id, _DO[rest])
 
     def _come(self, client_id: int, hello: Hello) -> None:
-        # Said more than once until it is heard, and perhaps gone by now.
+        # A page repeats its greeting until it is answered, and may have closed by now.
         client = self._page.server.get_clients().get(client_id)
         if client is not None and self._tabs.of_client(client_id) is None:
             self._tabs.attach(client, hello)
@@ -127,7 +127,7 @@ class Listening:
             cameras = {camera.name: camera for camera in self._sequence.scene.cameras}
             stroke = read_stroke(text, len(self._sequence), cameras, self._classes)
         except CartsError as error:
-            # Our page sends no such thing.
+            # The viewer's own page sends no such strokes.
             _log.info("Refused: %s", error)
         else:
             self._put(client_id, intents.Paint(client_id, stroke))
@@ -140,7 +140,7 @@ def _range(text: str) -> tuple[int, int] | None:
 
 
 Report = Callable[[str], None]
-"""Called with a line for people about what takes long."""
+"""Called with a line for the user about long operations."""
 
 
 class ViewerApp:
@@ -149,7 +149,7 @@ class ViewerApp:
     Attributes:
         url: Where the page is.
         page: The page, for tests and scripts.
-        tabs: Everybody's places.
+        tabs: All tabs.
         sequence: The recording.
         scene: The recording's arms and cameras.
         project: The sequence's corrections.
@@ -263,7 +263,7 @@ class ViewerApp:
 
     @property
     def notice(self) -> str | None:
-        """What people must know of where corrections are kept, see `Storage.notice`; None if nothing."""
+        """Message about where corrections are kept, see `Storage.notice`; None without one."""
         return self._storage.notice
 
     def close(self) -> None:

@@ -20,7 +20,7 @@ from carts_viewer.picture.layers import Rgba
 
 
 class Against(StrEnum):
-    """The pose that the present one is compared with; the value is what people read."""
+    """The pose that the present one is compared with; the value is the label in the page."""
 
     MEASURED = "Measured"
     BEFORE_RUN = "Before the run"
@@ -28,7 +28,7 @@ class Against(StrEnum):
 
 @dataclass(frozen=True)
 class Compare:
-    """What is compared, and how much of it is seen."""
+    """The compared pose, and the share of the picture that shows it."""
 
     against: Against | None = None
     """None: nothing, but for a key that is held."""
@@ -58,7 +58,7 @@ def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
 
 
 class Reach(StrEnum):
-    """How far sliders reach from the measured values, as people read it."""
+    """Range of the sliders around the measured values; the value is the label in the page."""
 
     NEAR = "± 5"
     FAR = "± 20"
@@ -72,7 +72,7 @@ class Reach(StrEnum):
 
 @dataclass(frozen=True)
 class JointRange:
-    """What a joint may be set to."""
+    """Allowed range of a joint."""
 
     arm: str
     joint: str
@@ -116,7 +116,7 @@ Masks = Literal["recording", "imported", "painted"]
 
 @dataclass(frozen=True)
 class Observed:
-    """What somebody has chosen to be fitted.
+    """Choice of what a run fits.
 
     Raises:
         SettingsError: a value is none of those that there are.
@@ -135,7 +135,7 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a run fits, as it was when it began: the project's masks of that moment."""
+    """What a run fits: network predictions or masks, with the project's masks at its start."""
 
     observed: Observed = Observed()
     given: GivenMasks | None = None
@@ -160,15 +160,15 @@ class Target:
 
 
 NETWORK = Target()
-"""What the network sees."""
+"""Predictions of the network."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings that belong together."""
+    """A named set of solver settings."""
 
     meaning: str
-    """When to take it, for people."""
+    """When to use it, as text for the user."""
     changes: Callable[[SurfaceSolver], dict[str, Any]]
     """What differs from the default settings of a solver of surface maps; others have no presets but the default."""
 

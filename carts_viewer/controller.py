@@ -13,7 +13,7 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import BrowsingHandler
 from carts_viewer.actions.context import Context, unknown
 from carts_viewer.actions.exchange import Deliver, ExportingHandler, ImportingHandler, shown_mask
-from carts_viewer.actions.jobs import Asker, JobsHandler
+from carts_viewer.actions.jobs import JobRequester, JobsHandler
 from carts_viewer.actions.live import LiveHandler
 from carts_viewer.actions.optimizing import OptimizingHandler
 from carts_viewer.actions.painting import PaintingHandler
@@ -28,7 +28,7 @@ from carts_viewer.state import ViewState
 
 
 class NoRun:
-    """In the background, no run of a shown frame is open."""
+    """Stands for the run of a shown frame, of which the background has none."""
 
     def end(self, reason: str | None) -> None:
         """There is none."""
@@ -38,7 +38,7 @@ class NoRun:
 
 
 class Background:
-    """Works on jobs bit by bit, whoever has asked for them and whether or not they are still there."""
+    """Works on jobs step by step, independent of the tabs that requested them."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Background:
         """
         Args:
             state: with what jobs of an earlier viewer are done.
-            session: the recording and its project, for nobody else.
+            session: recording and project of the background alone.
             renderer: renders poses.
             optimizers: makes optimizers.
             deliver: sends a file to a tab.
@@ -61,7 +61,7 @@ class Background:
         self._exporting = ExportingHandler(context, NoRun(), deliver)
         self._jobs = JobsHandler(context, NoRun(), optimizers, self._propagating, self._exporting)
         # What takes long is queued; the rest of its kind is done at once.
-        self._kinds: dict[type[intents.Intent], Callable[[Any, Asker], None]] = {
+        self._kinds: dict[type[intents.Intent], Callable[[Any, JobRequester], None]] = {
             intents.Solve: self._jobs.ask,
             intents.Export: self._jobs.ask,
             intents.Jobs: self._jobs.ask,
@@ -71,7 +71,7 @@ class Background:
 
     @property
     def state(self) -> ViewState:
-        """Of which `jobs`, `solve` and `export` are for everybody."""
+        """Own state; tabs share its `jobs`, `solve` and `export`."""
         return self._context.state
 
     def takes(self, intent: intents.Intent) -> bool:
@@ -79,30 +79,30 @@ class Background:
         return isinstance(intent, tuple(self._kinds))
 
     def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
-        """Do what somebody's intent asks for.
+        """Carry out an intent of a user.
 
         Args:
-            intent: what.
-            person: who.
-            state: what they see and have chosen.
+            intent: the request.
+            person: its user.
+            state: state of their tab.
 
         Raises:
-            CartsError: with a text for people.
+            CartsError: the intent cannot be carried out.
         """
         self._context.refresh()
         handle = next((handle for kind, handle in self._kinds.items() if isinstance(intent, kind)), None)
         if handle is None:
             raise unknown(intent)
-        handle(intent, Asker(person, state))
+        handle(intent, JobRequester(person, state))
         self._jobs.settle()
 
     def wait_time(self) -> float | None:
-        """How long nothing needs to be done unless somebody asks [s]; None for ever."""
+        """Time until work is due without a request [s]; None for ever."""
         handlers = (self._propagating, self._exporting, self._jobs)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def advance(self) -> None:
-        """Do one bit of what is going on: a frame to be solved or exported, a step of a job.
+        """Do one step of the work under way: a frame to solve or export, a step of a job.
 
         Raises:
             CartsError: it failed, and so did its job.
@@ -116,7 +116,7 @@ class Background:
         self._jobs.advance()
 
     def fail(self, text: str) -> None:
-        """Stop whatever is going on, because of an error of it."""
+        """Stop the work under way after its error."""
         # What is solved is not lost to an error of something else; its own errors have saved it already.
         with suppress(CartsError):
             self._propagating.finish()
@@ -143,9 +143,9 @@ _BEGINNING = (
     intents.Calibrate,
     intents.RepeatJob,
 )
-"""What ends a run here before it begins."""
+"""Intents that end a run of the tab before they begin."""
 _COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
-"""What of the background's state is for everybody."""
+"""Fields of the background's state that all tabs share."""
 WATCH_EVERY = 1.0
 """How often the project's file is checked while nothing is edited [s]."""
 
@@ -207,10 +207,10 @@ class Controller:
         return self._context.state
 
     def handle(self, intent: intents.Intent) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         if self._live.takes(intent):
             return
@@ -223,7 +223,7 @@ class Controller:
         handle(intent)
 
     def _hand_on(self, intent: intents.Intent) -> None:
-        """Have the background do something, with what is saved here and chosen here."""
+        """Pass an intent to the background, after saving the edits of this tab."""
         if isinstance(intent, _BEGINNING):
             self._optimizing.end("Stopped: a job was started")
             self._context.save()
@@ -234,7 +234,7 @@ class Controller:
             self.follow()
 
     def follow(self) -> None:
-        """Bring the state up to date with what others, and the background, have done."""
+        """Update the state from the background and from edits of other users."""
         state, shared = self.state, self._background.state
         if any(getattr(shared, name) != getattr(state, name) for name in _COMMON):
             self._share()
@@ -249,7 +249,7 @@ class Controller:
             self._context.refresh()
 
     def _share(self) -> None:
-        """Take over what the background's state has for everybody."""
+        """Copy the shared fields of the background's state."""
         self._context.change(**{name: getattr(self._background.state, name) for name in _COMMON})
 
     def _name(self, name: str) -> None:
@@ -258,12 +258,12 @@ class Controller:
         self._context.change(name=chosen)
 
     def wait_time(self) -> float | None:
-        """How long nothing needs to be done unless somebody asks [s]; None for ever."""
+        """Time until work is due without a request [s]; None for ever."""
         handlers = (self._optimizing, self._browsing, self._live)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
-        """How long until `advance` has to save a gesture that nobody has ended, or check the file [s].
+        """Time until `advance` has to save an unfinished gesture, or check the file [s].
 
         None: for ever.
         """
@@ -274,7 +274,7 @@ class Controller:
         return watch if draft is None else min(draft, watch)
 
     def advance(self) -> None:
-        """Do one bit of what is going on: an iteration, the next frame of playing."""
+        """Do one step of the work under way: an iteration, or the next frame of playback."""
         self._optimizing.advance()
         self._browsing.advance()
         self._live.advance()
@@ -283,7 +283,7 @@ class Controller:
         self._watch()
 
     def _watch(self) -> None:
-        """Check now and then that the project's file still exists: it may be deleted while nobody edits."""
+        """Check regularly that the project's file still exists: it may be deleted between edits."""
         project = self._editor.project
         if project.writable and time.monotonic() >= self._watch_at:
             self._watch_at = time.monotonic() + WATCH_EVERY
@@ -307,7 +307,7 @@ class Controller:
             self._context.change(playing=False)
 
     def leave(self) -> None:
-        """End the run, as nobody sees it any more; where it is, is saved. Errors as `close`."""
+        """End the run of a closed tab and save its pose. Errors as `close`."""
         if self._optimizing.active:
             self._optimizing.end("Stopped: its tab was closed; Run starts anew from here")
 
@@ -337,8 +337,8 @@ class Controller:
     def _released(self) -> None:
         self._annotating.released()
         if self._context.state.time_error is not None:
-            # Whoever leaves the field means what is in it.
+            # The value is final once the field is left.
             self._context.change(error=self._context.state.time_error, time_error=None)
-        # A run is no gesture of a hand, so nobody's letting go of something ends it.
+        # A run is no gesture, so releasing a control does not end it.
         if not self._optimizing.active:
             self._context.save()

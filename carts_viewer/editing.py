@@ -18,12 +18,12 @@ LONGEST_NAME = 30
 
 @dataclass(eq=False)
 class Person:
-    """Somebody who works in one tab."""
+    """The user of one tab."""
 
     number: int
-    """From 1, in the order in which they came."""
+    """From 1, in order of arrival."""
     chosen: str = ""
-    """The name that they have chosen; empty if none."""
+    """Chosen name; empty without one."""
     present: bool = True
     """Whether their tab is open."""
     index: int = 0
@@ -33,12 +33,12 @@ class Person:
 
     @property
     def name(self) -> str:
-        """What others call them."""
+        """Name that other users see."""
         return self.chosen or f"Tab {self.number}"
 
 
 class People:
-    """Everybody who works on a project, and their way into its history. Used on the worker's thread alone.
+    """Users of a project, and their access to its history. Used on the worker's thread alone.
 
     Attributes:
         project: the project.
@@ -49,18 +49,18 @@ class People:
         self.project = project
         self.persons: list[Person] = []
         self._makers: dict[int, Person] = {}
-        """By number of step, as far as it was made since the viewer started."""
+        """Owner by number of step, since the viewer started."""
         self._reverted: set[int] = set()
         """Steps that were taken back by a later one, and those later ones."""
 
     def join(self) -> Person:
-        """Somebody new."""
+        """Add a user."""
         person = Person(max((person.number for person in self.persons), default=0) + 1)
         self.persons.append(person)
         return person
 
     def leave(self, person: Person) -> None:
-        """Forget somebody; their steps are nobody's then."""
+        """Remove a user; their steps have no owner then."""
         self.persons.remove(person)
         self._makers = {number: maker for number, maker in self._makers.items() if maker is not person}
 
@@ -72,12 +72,12 @@ class People:
     def apply(
         self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
     ) -> Change | None:
-        """Save a step of somebody's, with their name where they have one or are not alone; errors as `Project.apply`.
+        """Save a step of a user, with their name if chosen or if there are several users; errors as `Project.apply`.
 
         Args:
-            person: who.
+            person: the user.
             name: of the step.
-            edits: what changes.
+            edits: the changes.
             figures: of frames with these edits.
         """
         person.undone.clear()
@@ -117,7 +117,7 @@ class People:
         return change
 
     def redo(self, person: Person) -> Change | None:
-        """Do again what somebody took back last; None if there is nothing. Errors as `undo`."""
+        """Redo the last step that this user has undone; None without one. Errors as `undo`."""
         if person.undone:
             number = person.undone[-1]
             person.undone.pop()
@@ -131,7 +131,7 @@ class People:
         """Go to a place in the history.
 
         Raises:
-            CartsError: that would take back what somebody else at work has done.
+            CartsError: that would undo steps of another user at work.
             ProjectError: it could not be saved.
         """
         project = self.project
@@ -163,7 +163,7 @@ class People:
         return next((one for one in self.persons if one.chosen and name.startswith(f"{one.chosen}: ")), None)
 
     def _next_is_free(self, person: Person) -> bool:
-        """Whether the step that was undone last is nobody else's at work."""
+        """Whether the step that was undone last belongs to no other user at work."""
         state = self.project.state
         if state.position == len(state.steps):
             return False
@@ -194,7 +194,7 @@ class People:
 
 
 LONGEST_DRAFT = 5.0
-"""After this long without a change, an edit counts as finished even if nobody said so [s]."""
+"""Time without a change after which an edit counts as finished [s]."""
 
 
 class Editor:
@@ -202,7 +202,7 @@ class Editor:
 
     Attributes:
         project: where finished gestures go.
-        people: everybody who edits it.
+        people: users of the project.
         person: who edits here.
     """
 
@@ -223,7 +223,7 @@ class Editor:
         if self._view is None:
             return self.project.state
         if self._view[0] is not self.project.state:
-            # Somebody else has saved something meanwhile.
+            # Another user has saved meanwhile.
             self._lay_draft()
         return self._view[1]
 
@@ -295,7 +295,7 @@ class Editor:
         """Take back this person's last step. A draft that cannot be saved is dropped, as undo would.
 
         Raises:
-            ProjectError: it could not be saved, the project is read-only, or somebody has changed the same since.
+            ProjectError: it could not be saved, the project is read-only, or another user has changed the same since.
         """
         return None if self._dropped() else self.people.undo(self.person)
 
@@ -307,7 +307,7 @@ class Editor:
         """Undo or redo until so many steps are done; drafts as `undo`.
 
         Raises:
-            CartsError: steps of somebody else who is at work are in between.
+            CartsError: steps of another user at work are in between.
             ProjectError: it could not be saved, or the project is read-only.
         """
         if self._dropped():

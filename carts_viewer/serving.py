@@ -163,7 +163,7 @@ def _say_doing(line: str) -> None:
 
 
 def _say(text: str, to: TextIO | None = None) -> None:
-    """Print; a terminal that is gone, as it is after SIGHUP, keeps nothing from being saved."""
+    """Print; ignores write errors on a closed terminal, as after SIGHUP."""
     stream: TextIO = to or sys.stdout
     try:
         print(text, file=stream, flush=True)
@@ -230,7 +230,7 @@ _PAGE = '<!DOCTYPE html><meta charset="utf-8"><meta http-equiv="refresh" content
 def opened_in_browser(url: str) -> Iterator[None]:
     """Open a page; until the block ends, the file that leads there is kept.
 
-    The command line of a browser can be read by everybody on this computer. So a url with a token is not put there but
+    Every user of this computer can read the command line of a browser. So a url with a token is not put there but
     into a file in a folder that this user alone may look into, and the browser is given that file.
     """
     if "token=" not in url:

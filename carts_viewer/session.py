@@ -38,13 +38,13 @@ from carts_viewer.state import Pose
 class Session:
     """Frames of one sequence and its project's corrections of them.
 
-    A frame's pose is the measured one until somebody corrects it; neither camera nor domain touches corrections.
+    A frame's pose is the measured one until it is corrected; neither camera nor domain touches corrections.
 
     Attributes:
         scene: its arms and cameras.
         editor: its project, and what is on the way there.
         ranges: what each joint may be set to, arm by arm.
-        roots: folders that files may be brought in from: that of the sequence, and others that somebody allowed.
+        roots: folders that files may be brought in from: that of the sequence, and others that were allowed.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class Session:
         """
         Args:
             sequence: the recording.
-            people: everybody who edits its project.
-            person: who edits it here; None: somebody new.
+            people: users of its project.
+            person: the user of this session; None: a new one.
             folders: what files may be brought in from, besides the sequence's own.
         """
         self._sequence = sequence
@@ -275,7 +275,7 @@ class Storage:
 
     project: Project
     reason: str | None
-    """Why what people do is not kept; None if it is."""
+    """Why edits are not kept; None if they are."""
     scratch: tempfile.TemporaryDirectory | None = None
     """The folder of a project that ends with the viewer."""
     hint: str | None = None
@@ -283,13 +283,13 @@ class Storage:
 
     @property
     def kept(self) -> bool:
-        """Whether what people do is kept, in the file at `project.path`."""
+        """Whether edits are kept, in the file at `project.path`."""
         return self.reason is None and self.project.safe
 
     @property
     def notice(self) -> str | None:
-        """What people must know: why what they do is not kept, or that it is kept in another file, or that another one
-        holds more; None if nothing."""
+        """Message for the user: why edits are not kept, that they are kept in another file, or that another file holds
+        more; None without one."""
         return self.project.incident or self.reason or self.hint
 
     def close(self) -> None:

@@ -24,18 +24,18 @@ from carts_viewer.picture.strokes import Brush
 
 @dataclass(frozen=True)
 class ListedFrame:
-    """A frame that somebody should look at after many were solved together."""
+    """A frame to inspect after sequence mode."""
 
     index: int
     reason: str
-    """For people."""
+    """Text for the user."""
     taken: bool
-    """Whether what was solved is in the project; otherwise the frame is as it was, until somebody takes it."""
+    """Whether what was solved is in the project; otherwise the frame is unchanged."""
 
 
 @dataclass(frozen=True)
 class SolveState:
-    """Solving many frames together, or how it ended."""
+    """Progress or result of sequence mode."""
 
     frames: range
     """From the first to the last one, kept frames included."""
@@ -45,7 +45,7 @@ class SolveState:
     """Frames that were compared with how they were, which comes after that."""
     running: bool = True
     text: str = ""
-    """How it goes, for people."""
+    """Progress, as text for the user."""
     listed: tuple[ListedFrame, ...] = ()
     """Frames whose fit became worse, or is doubtful."""
     base_frame_gain: float | None = None
@@ -78,7 +78,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where the arms and cameras are in one frame, and who says so."""
+    """Pose of arms and cameras in one frame, and its source."""
 
     scene: SceneState
     """Joint positions, base frames, extrinsics and intrinsics of the whole scene."""
@@ -125,7 +125,7 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """What the optimizer saw at the shown pose, at its working resolution."""
+    """Maps of the optimizer at the shown pose, at its working resolution."""
 
     iterate: Iterate
     cameras: tuple[str, ...]
@@ -136,12 +136,12 @@ class Maps:
 
 @dataclass(frozen=True)
 class RunState:
-    """The optimizer's doings."""
+    """State of the run on the shown frame."""
 
     phase: Phase = Phase.IDLE
     curves: Curves = field(default_factory=Curves)
     reason: str | None = None
-    """Why the run stopped, for people."""
+    """Reason for the end of the run, as text for the user."""
     start: SceneState | None = None
     """Where the run began."""
     base_frame_gain: float | None = None
@@ -153,7 +153,7 @@ class ExportState:
     """The present or the last export."""
 
     format: str
-    """For people."""
+    """Text for the user."""
     frames: int
     """How many frames are exported."""
     done: int = 0
@@ -168,9 +168,9 @@ class LiveState:
     """A live stream that is shown in the place of the recording, or how the last one went."""
 
     source: str
-    """For people."""
+    """Text for the user."""
     text: str = ""
-    """How it goes, for people."""
+    """Progress, as text for the user."""
     on: bool = True
     busy: bool = False
     """Whether no frame has come yet."""
@@ -226,7 +226,7 @@ class ViewState:
     compare: Compare = field(default_factory=Compare)
     """The other pose that the picture shows, if any."""
     filter: FrameFilter = field(default_factory=FrameFilter)
-    """What frames somebody looks for."""
+    """The frame filter."""
     reach: Reach = Reach.NEAR
     """How far the joints' sliders reach."""
     range: tuple[int, int] | None = None
@@ -245,7 +245,7 @@ class ViewState:
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
-    """Of the shown pose, frame and domain; None while nobody needs them."""
+    """Of the shown pose, frame and domain; None until needed."""
     scores: Scores | None = None
     """Of the shown pose; None until they are computed, which is after its picture has been sent."""
     networks: tuple[str, ...] = ()
@@ -255,28 +255,28 @@ class ViewState:
     asked_network: str = ""
     """The one that was chosen, and is not used before its weights are accepted; empty if there is none."""
     problems: tuple[str, ...] = ()
-    """Damage of files beside the project, and what follows, for people."""
+    """Messages about damaged files beside the project."""
     unfamiliar: tuple[str, ...] = ()
-    """What speaks against the network for these arms and images, for people."""
+    """Warnings that arms or images are outside the domain of the network."""
     jobs: tuple[Job, ...] = ()
-    """What takes long, oldest first."""
+    """Jobs, oldest first."""
     can_undo: bool = False
-    """Whether there may be something that whoever works here can take back."""
+    """Whether this user may have a step to undo."""
     can_redo: bool = False
-    """Whether there is something that they can do again."""
+    """Whether this user has a step to redo."""
     name: str = ""
-    """How others call whoever works here."""
+    """Name of this user."""
     others: tuple[tuple[str, int], ...] = ()
-    """Who else is at work now, and on which frame."""
+    """Name and frame of the other users at work."""
     busy: str | None = None
-    """What the worker is preparing, for people."""
+    """What the worker is preparing, as text for the user."""
     export: ExportState | None = None
     live: LiveState | None = None
     error: str | None = None
     notice: str | None = None
-    """What somebody should read once, and which is no error."""
+    """A message that is no error."""
     imported: str = ""
-    """What masks of others were imported last, for people."""
+    """Summary of the last import of masks, as text for the user."""
 
     @property
     def part(self) -> Frames:

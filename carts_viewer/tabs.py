@@ -121,7 +121,7 @@ class View:
 
 
 class Tab:
-    """Somebody's place: frame, camera, tools and run, and the page that shows it.
+    """State of one browser tab: frame, camera, tools and run, and the page that shows it.
 
     Attributes:
         key: what the tab calls itself; None until one has taken this place.
@@ -205,14 +205,14 @@ class Tab:
             attempt(controller.map)
             if display is not None:
                 attempt(lambda: display.show_picture(controller.state))
-            # Numbers come after the picture: somebody may be dragging.
+            # Scores come after the picture, which matters more during a drag.
             attempt(controller.score)
             # Also after an error, which would otherwise be met again at once, and for ever.
             self._pictured = controller.state
         self.show_panels()
 
     def show_panels(self) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         if self._shown is not self.controller.state:
             self._shown = self.controller.state
             if self.view is not None:
@@ -232,14 +232,14 @@ class Tab:
 
 _log = logging.getLogger(__name__)
 _KEPT = 8
-"""Places of pages that are gone; who reloads or comes back finds theirs."""
+"""Tabs that are kept after their pages closed."""
 _LONGEST_KEY = 64
 """Characters."""
 
 
 @dataclass(frozen=True)
 class Hello:
-    """What a page says when it comes: who it is, and where it wants to be."""
+    """Greeting of a page: name of its tab, and the frame, camera and domain to show."""
 
     key: str
     name: str = ""
@@ -249,11 +249,11 @@ class Hello:
     camera: str | None = None
     domain: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """What was chosen there earlier, see `page_state.remembered`; anything, if the page is none of ours."""
+    """What was chosen there earlier, see `page_state.remembered`; anything, if the page is not the viewer's."""
 
 
 def read_hello(text: str) -> Hello | None:
-    """What a page has said, as far as it makes sense; None if it does not say who it is."""
+    """The greeting of a page, as far as it is valid; None without the name of its tab."""
     try:
         said: dict[str, Any] = json.loads(text)
         key, name = str(said["tab"])[:_LONGEST_KEY], " ".join(str(said.get("name") or "").split())[:LONGEST_NAME]
@@ -269,12 +269,12 @@ def read_hello(text: str) -> Hello | None:
 
 
 class Tabs:
-    """Everybody's places, and what they share. Used on the worker's thread, but for `of_client` and `first`.
+    """All tabs, and what they share. Used on the worker's thread, but for `of_client` and `first`.
 
     Attributes:
-        background: what takes long.
-        people: who works on the project.
-        first: the place that is there from the beginning; the first page takes it.
+        background: long-running work.
+        people: users of the project.
+        first: the initial tab, which the first page takes.
     """
 
     def __init__(
@@ -315,7 +315,7 @@ class Tabs:
         return next((tab for tab in self._tabs if tab.client_id == client_id), None)
 
     def attach(self, client: viser.ClientHandle, hello: Hello) -> None:
-        """Show a page its place: the one it had, one that nobody has had yet, or a new one.
+        """Assign a tab to a page: its earlier one, an unused one, or a new one.
 
         Raises:
             CartsError: a place could not be given up.
@@ -366,20 +366,20 @@ class Tabs:
         if tab.controller.state.streaming:
             return
         sequence = self._sequence
-        wishes: list[intents.Intent] = []
+        found: list[intents.Intent] = []
         if hello.domain in sequence.domains:
-            wishes.append(intents.ShowDomain(hello.domain))
+            found.append(intents.ShowDomain(hello.domain))
         if hello.camera in [camera.name for camera in sequence.scene.cameras]:
-            wishes.append(intents.ShowCamera(hello.camera))
+            found.append(intents.ShowCamera(hello.camera))
         if hello.frame is not None and hello.frame != tab.controller.state.index:
-            wishes.append(intents.ShowFrame(hello.frame))
-        self._do(tab, wishes)
+            found.append(intents.ShowFrame(hello.frame))
+        self._do(tab, found)
 
     @staticmethod
-    def _do(tab: Tab, wishes: Iterable[intents.Intent]) -> None:
-        for wish in wishes:
+    def _do(tab: Tab, requests: Iterable[intents.Intent]) -> None:
+        for intent in requests:
             try:
-                tab.controller.handle(wish)
+                tab.controller.handle(intent)
             except CartsError as error:
                 tab.controller.fail(error, stop=False)
 
@@ -402,7 +402,7 @@ class Tabs:
             tab.close()
 
     def _begin(self, session: Session) -> ViewState:
-        """What somebody new sees."""
+        """Initial state of a tab."""
         sequence = session.sequence
         domain, camera = sequence.domains[0], sequence.scene.cameras[0].name
         frame = session.frame(0, domain, camera)

@@ -1,4 +1,4 @@
-"""The one thread that computes: takes intents, changes the state, and shows what came out."""
+"""The worker thread: carries out intents, advances work, and publishes states."""
 
 import gc
 import logging
@@ -15,11 +15,11 @@ from carts_viewer.tabs import Asked, IntentQueue, Tab, Tabs
 _log = logging.getLogger(__name__)
 
 MEMORY_KEPT = 10.0
-"""How long freed memory is kept for what comes next [s]."""
+"""Idle time after which freed memory is returned to the system [s]."""
 MEMORY_KEPT_AT_WORK = 30.0
 """The same during work beside an open page, where the return may delay a picture by some milliseconds [s]."""
 _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
-"""Intents that may begin what takes long."""
+"""Intents that may begin long work."""
 
 
 class Worker:
@@ -48,7 +48,7 @@ class Worker:
         self._thread.start()
 
     def stop(self) -> None:
-        """Finish what is being done and end the thread."""
+        """Finish the current work and end the thread."""
         self._stop.set()
         self._queue.wake()
         self._thread.join(timeout=30.0)
@@ -80,7 +80,7 @@ class Worker:
             if self._startup is not None and any(tab.pictured for tab in self._tabs):
                 self._attempt(self._startup, *self._tabs)
                 self._startup = None
-        # What somebody did just before the end is saved, too; nothing long is begun.
+        # Edits that came just before the end are saved, too; no long work is begun.
         for asked in self._queue.take(0.0):
             if not isinstance(asked.intent, _BEGINNING):
                 self._handle(asked)
@@ -138,7 +138,7 @@ class Worker:
         self._returned_at = time.monotonic()
 
     def _handle(self, asked: Asked[Tab]) -> None:
-        # One of a tab that is gone for good has nobody to do it for.
+        # Intents of removed tabs are dropped.
         if asked.tab in self._tabs:
             self._attempt(lambda: asked.tab.controller.handle(asked.intent), asked.tab)
 
@@ -174,7 +174,7 @@ class Worker:
 
     def _fail(self, error: Exception, *tabs: Tab, stop: bool = False) -> str:
         if not isinstance(error, CartsError):
-            # The traceback helps whoever reads the terminal; the page shows what happened.
+            # The terminal gets the traceback; the page shows the error.
             _log.error("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"), exc_info=error)
         for tab in tabs:
             tab.controller.fail(error, stop=stop)

@@ -1,4 +1,4 @@
-// A document over the page: HTML from the server, and what people choose in it. Also says where the picture is clicked.
+// A document over the page: HTML from the server, and the choices made in it. Also reports clicks in the picture.
 (() => {
   "use strict";
 

@@ -13,7 +13,7 @@
     window.carts.report("dragged", [held.gesture, ...held.from, ...held.to, held.camera].join(" "));
   }
 
-  setInterval(send, 2000); // whoever rests with the button down is still dragging
+  setInterval(send, 2000); // a pointer that rests with its button down is still dragging
 
   function cursor(name) {
     const canvas = window.__viserMutable?.canvas;

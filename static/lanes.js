@@ -5,7 +5,7 @@
 
   const KEPT = 800; // pictures
   const AT_ONCE = 2;
-  const WAIT = 90; // before a curve is asked for anew while somebody zooms [ms]
+  const WAIT = 90; // before a curve is requested anew during a zoom [ms]
   const COLOURS = ["#8b98a5", "#2dd4a7"]; // of a curve: as measured, and corrected
 
   // ---- Thumbnails -----------------------------------------------------------------------------------------------------

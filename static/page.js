@@ -210,7 +210,7 @@
       if (!box) return;
       for (const corner of [box.min, box.max]) {
         const at = corner.clone().applyMatrix4(child.matrixWorld).applyMatrix4(inverse).toArray();
-        // A shaft is longer than anybody wants to see; what lies far behind the picture does not count.
+        // Shafts are long; what lies far behind the picture does not count.
         if (Math.hypot(...at) > 14 * depth) continue;
         at.forEach((value, axis) => {
           low[axis] = Math.min(low[axis], value);
@@ -333,7 +333,7 @@
     let place = null;
     let pressed = null; // where the picture was pressed, and nothing else began
     let latest = null; // where something is dragged to
-    // Whoever rests for long with the button down is still dragging; an edit that nobody goes on with would be saved.
+    // A pointer that rests with its button down is still dragging; without reports its edit would be saved.
     setInterval(() => { if (pointing !== null && latest) point(latest); }, 2000);
     /** Say where in the image the pointer is, at most 30 times a second, the last place always. */
     const point = (event) => {
@@ -465,7 +465,7 @@
     setTimeout(() => field.blur(), 0);
   }, { capture: true });
 
-  // ---- Say when nobody listens any more ------------------------------------------------------------------------------
+  // ---- Show a lost connection -------------------------------------------------------------------------------------
 
   /** While there is no connection, viser's client replaces what sends by a function that only writes to the log. */
   const connected = () => !/not connected/i.test(String(viser()?.sendMessage));

@@ -1,4 +1,4 @@
-// The strip below the picture: all frames with what was said and found about them, to be zoomed, dragged and clicked.
+// The strip below the picture: all frames with review, fit and source, to be zoomed, dragged and clicked.
 // A line of the whole sequence lies below it. Needs page.js and lanes.js.
 (() => {
   "use strict";
@@ -166,7 +166,7 @@
     rangeTimer ??= setTimeout(tellRange, 40);
   }
 
-  /** Say what the range is now, if that was not said: at once when it is let go of, or it would undo what comes next. */
+  /** Report a changed range: at once when it is let go of, or it would undo what comes next. */
   function tellRange() {
     if (rangeTimer === null) return;
     clearTimeout(rangeTimer);
@@ -372,7 +372,7 @@
     if (detail.frame === here) return;
     here = detail.frame;
     const count = view[1] - view[0];
-    // What is shown follows the frame, but not while somebody drags.
+    // The view follows the frame, except during a drag.
     if (dragging === null && (here < view[0] || here >= view[1])) show(here - count / 2, count);
   });
   Object.assign(window.carts, {

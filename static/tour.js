@@ -14,7 +14,7 @@
     ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
     [".carts-strip", "The timeline", "All frames: high bars fit badly, and of frames without a bar nothing is known yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "Legend explains colours and marks."],
-    ["Review", "Review", "Accept (G) goes on to the next frame that nobody has reviewed. Here are also keyframes, Solve between, " +
+    ["Review", "Review", "Accept (G) goes on to the next unreviewed frame. Here are also keyframes, Solve between, " +
       "search and history."],
     ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Everything is saved at once; Undo takes back anything."],

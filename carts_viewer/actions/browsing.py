@@ -29,10 +29,10 @@ class BrowsingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Browsing) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 

@@ -17,20 +17,20 @@ from carts_viewer.state import Maps, ViewState
 
 
 class OpenRun(Protocol):
-    """The run of the optimizer on the shown frame, as far as other handlers have to do with it."""
+    """The run of the optimizer on the shown frame, as other handlers see it."""
 
     def end(self, reason: str | None) -> None:
         """End the run, if there is one, and save where it is.
 
         Args:
-            reason: for people; None if they need none.
+            reason: text for the user; None without one.
 
         Raises:
             ProjectError: it could not be saved.
         """
 
     def forget(self) -> None:
-        """Another frame is shown, where there is no run to go back to the start of."""
+        """Forget the start of the run, since another frame is shown."""
 
 
 class Context:
@@ -123,7 +123,7 @@ class Context:
         self._follow()
 
     def _follow(self) -> None:
-        """Bring what is said of the project up to date."""
+        """Update the fields that depend on the project."""
         editor = self._editor
         self.change(project=editor.view, unsaved=editor.unsaved, can_undo=editor.can_undo, can_redo=editor.can_redo)
 
@@ -177,7 +177,7 @@ class Context:
             self.change(project=self._editor.view)
 
     def _measure_pins(self) -> None:
-        """Say anew how far the pins are from their keypoints."""
+        """Update the residuals of the placed keypoints."""
         keypoints = self.state.keypoints
         if keypoints.pins:
             distances = []
@@ -187,7 +187,7 @@ class Context:
             self.change(keypoints=replace(keypoints, residuals=tuple(distances)))
 
     def forget_pins(self) -> None:
-        """Drop what was said about where keypoints are."""
+        """Remove the placed keypoints."""
         if self.state.keypoints.pins:
             self.change(keypoints=replace(self.state.keypoints, pins=(), residuals=()))
 

@@ -32,7 +32,7 @@ FRAME_CHOICES = {
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
     "Unreviewed": UNREVIEWED,
 }
-"""What people can choose: review states of the frames that are exported."""
+"""Choices of the frames to export, as review states."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
 """What may get a category of its own."""
 _STEMS = {
@@ -53,22 +53,22 @@ Deliver = Callable[[int, str, bytes], None]
 
 
 class ExportingHandler:
-    """The handler that makes files."""
+    """Handler of exports and downloads."""
 
     def __init__(self, context: Context, run: OpenRun, deliver: Deliver) -> None:
         self._context = context
         self._open_run = run
         self._deliver = deliver
         self._session = context.session
-        self._job: Stepped[Path] | None = None
+        self._job: CooperativeThread[Path] | None = None
         self._intent: intents.Export | None = None
 
     @singledispatchmethod
     def handle(self, intent: intents.Exporting) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -121,7 +121,7 @@ class ExportingHandler:
         make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
         self._intent = intent
-        self._job = Stepped(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
+        self._job = CooperativeThread(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
         self._context.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
 
     @handle.register
@@ -234,7 +234,7 @@ _NAMED = 6
 
 
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
-    """Warnings for people, none where there is nothing to say.
+    """Warnings about the frames of an export.
 
     Args:
         project: as it is exported.
@@ -256,7 +256,7 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
 
 
 def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:
-    """Whether all exported cameras took part in fitting a frame; where nobody knows, they did."""
+    """Whether all exported cameras took part in fitting a frame; assumed where it is not recorded."""
     used = [_cameras(correction.provenance.settings) for correction in project.joints(frame).values()]
     return all(names is None or set(cameras) <= names for names in used)
 
@@ -279,7 +279,7 @@ def _line(project: ProjectState, frames: Sequence[int], text: str) -> list[str]:
 T = TypeVar("T")
 
 
-class Stepped(Generic[T]):
+class CooperativeThread(Generic[T]):
     """A function that asks a `Monitor` whether to go on, between two of its steps.
 
     It runs on a thread of its own, but only while `advance` waits for it. So nothing happens at the same time, and what
@@ -298,7 +298,7 @@ class Stepped(Generic[T]):
         self._cancelled = False
         self._result: T | None = None
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="carts-stepped", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="carts-export", daemon=True)
 
     def advance(self, seconds: float) -> T | None:
         """Go on for about so long [s]; the function's result once there is one.
@@ -345,7 +345,7 @@ _LONGEST = 4096
 
 
 class ImportingHandler:
-    """The handler that brings in what others marked."""
+    """Handler of imported masks and keypoints."""
 
     def __init__(self, context: Context, run: OpenRun) -> None:
         self._context = context
@@ -353,7 +353,7 @@ class ImportingHandler:
         self._session = context.session
 
     def handle(self, intent: intents.ImportMasks) -> None:
-        """Import, show it, and say what it was.
+        """Import masks and show them.
 
         Raises:
             CartsError: it is outside of the allowed folders, cannot be read, or would replace something; nothing is

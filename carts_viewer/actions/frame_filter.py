@@ -1,4 +1,4 @@
-"""Frames by what was said and found about them."""
+"""Filter of frames by review, verdict, Dice, note and corrected arm."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from carts_core.project.values import UNREVIEWED
 ANY = "Any"
 NOT_CHECKED = "not checked"
 UNJUDGED = "unreviewed"
-"""Of frames that nobody has judged, whatever made their joint positions."""
+"""Frames without a review, whatever the source of their joint positions."""
 BY_HAND = "moved by hand"
 SOLVED = "solved together"
 
 
 @dataclass(frozen=True)
 class FrameFilter:
-    """What frames are looked for; all conditions hold."""
+    """Conditions on frames, all of which have to hold."""
 
     review: str = ANY
-    """What `review_name` says, or `UNJUDGED`."""
+    """A result of `review_name`, or `UNJUDGED`."""
     fit: str = ANY
     """A verdict, or `NOT_CHECKED`."""
     dice: float = 1.0
@@ -35,7 +35,7 @@ class FrameFilter:
 
 
 def review_name(project: ProjectState, index: int) -> str:
-    """What people read about a frame: how it was judged or, where nobody has, what made its joint positions."""
+    """Label of a frame: its review state or, without a review, the source of its joint positions."""
     record = project.records.get(index)
     if by_hand(project, index):
         return BY_HAND

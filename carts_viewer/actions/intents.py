@@ -18,7 +18,7 @@ from carts_viewer.picture.strokes import Stroke, Target, Tool
 
 @dataclass(frozen=True)
 class Intent:
-    """One thing that a person, or the page, asks for."""
+    """A request of a user or of the page."""
 
     @property
     def key(self) -> Hashable | None:
@@ -48,7 +48,7 @@ class Drawn(Latest):
 
 @dataclass(frozen=True)
 class Released(Latest):
-    """The slider or field was let go of; what comes next is another step of undo."""
+    """A slider or field was released; the next edit is another step of undo."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class SetSpeed(Browsing, Latest):
 
 @dataclass(frozen=True)
 class SetTimeOffset(Browsing, Latest):
-    """Say how far the clocks of images and kinematics are apart: time in the table minus time of the image."""
+    """Set the time offset: time in the kinematics table minus time of the image [s]."""
 
     seconds: float
 
@@ -126,7 +126,7 @@ class ShowBeside(Browsing):
 
 @dataclass(frozen=True)
 class SetReach(Browsing, Latest):
-    """Let the joints' sliders reach so far from the measured values."""
+    """Set the range of the joints' sliders around the measured values."""
 
     reach: Reach
 
@@ -280,7 +280,7 @@ class Reset(Optimizing):
 
 @dataclass(frozen=True)
 class Assess(Optimizing):
-    """Say how well the shown pose fits the images, and move nothing."""
+    """Assess the fit of the shown pose, without moving it."""
 
 
 @dataclass(frozen=True)
@@ -439,7 +439,7 @@ class GoToStep(Annotation):
 
 @dataclass(frozen=True)
 class SetReview(Annotation):
-    """Say what the shown frame is like."""
+    """Set the review state of the shown frame."""
 
     state: ReviewState
 
@@ -453,12 +453,12 @@ class SetNote(Annotation, Latest):
 
 @dataclass(frozen=True)
 class AcceptAndNext(Annotation):
-    """Accept the shown frame, then show the next one that nobody has judged; within the range, where it lies there."""
+    """Accept the shown frame, then show the next one without a review; within the range, where it lies there."""
 
 
 @dataclass(frozen=True)
 class ShowUnreviewed(Annotation):
-    """Show the next frame that nobody has judged."""
+    """Show the next frame without a review."""
 
     step: int = 1
     """1 forwards, -1 backwards."""
@@ -508,7 +508,7 @@ class PointAt(Annotation, Latest):
 
 @dataclass(frozen=True)
 class ForgetPins(Annotation):
-    """Begin anew with saying where keypoints are; joints stay."""
+    """Remove the placed keypoints; joints stay."""
 
 
 @dataclass(frozen=True)
@@ -565,7 +565,7 @@ Frames = Literal["found", "unreviewed", "range", "all"]
 
 @dataclass(frozen=True)
 class Jobs(Intent):
-    """An intent about what takes long."""
+    """An intent about jobs."""
 
 
 @dataclass(frozen=True)
@@ -573,12 +573,12 @@ class OptimizeFrames(Jobs):
     """Run the optimizer on many frames, each alone, from where it is."""
 
     frames: Frames = "unreviewed"
-    """Those that the filter finds, those that nobody has judged, those in the chosen range, or all."""
+    """Those that the filter finds, those without a review, those in the chosen range, or all."""
 
 
 @dataclass(frozen=True)
 class Calibrate(Jobs):
-    """Fit base frames, and cameras if somebody frees them, to some frames of the sequence together."""
+    """Fit base frames, and cameras where they are free, to some frames of the sequence together."""
 
     frames: int = 20
     """How many, spread evenly."""
@@ -594,7 +594,7 @@ class Adapt(Jobs):
 
 @dataclass(frozen=True)
 class UseNetwork(Jobs):
-    """Have another network run, for everybody."""
+    """Use another network in all tabs."""
 
     name: str
     """One of `ViewState.networks`."""
@@ -676,7 +676,7 @@ class Download(Exporting):
 
 @dataclass(frozen=True)
 class ImportMasks(Intent):
-    """Put masks and keypoints of a file or folder into the project, as one step."""
+    """Import masks and keypoints of a file or folder into the project, as one step of undo."""
 
     place: str
     """Path of the file or folder; relative to the sequence's folder, or absolute in an allowed one."""
@@ -688,7 +688,7 @@ class ImportMasks(Intent):
 
 @dataclass(frozen=True)
 class Finding(Intent):
-    """An intent about the frames that somebody looks for."""
+    """An intent about the frame filter."""
 
 
 @dataclass(frozen=True)
@@ -713,7 +713,7 @@ class ShowFound(Finding):
 
 @dataclass(frozen=True)
 class ReviewFound(Finding):
-    """Say the same about all frames that were found, as one step of undo; notes stay."""
+    """Set the review state of all frames found, as one step of undo; notes stay."""
 
     state: ReviewState
 

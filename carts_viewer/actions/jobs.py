@@ -33,14 +33,14 @@ from carts_viewer.jobs.work import Progress, adapt, calibrate, optimize_frames
 from carts_viewer.state import ViewState
 
 _SAVE_EVERY = 5.0
-"""How often it is written down how far a job is [s]."""
+"""Interval between saves of a job's progress [s]."""
 _CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
 """Fields of a tab's state that a job depends on."""
 
 
 @dataclass(frozen=True, eq=False)
-class Asker:
-    """Person who has asked for a job, and the state of their tab then."""
+class JobRequester:
+    """User who has requested a job, and the state of their tab then."""
 
     person: Person
     state: ViewState
@@ -52,7 +52,7 @@ class Asker:
 
 
 class JobsHandler:
-    """The handler of what takes long; everything else goes on meanwhile."""
+    """Queues, starts, follows and stops jobs."""
 
     def __init__(
         self,
@@ -76,9 +76,9 @@ class JobsHandler:
             recording=identity.kinematics_sha256,
             decisions=decisions,
         )
-        self._asker: Asker | None = None
+        self._requester: JobRequester | None = None
         """Who asks for what is queued now."""
-        self._asked: dict[int, Asker] = {}
+        self._asked: dict[int, JobRequester] = {}
         """By number of job; a job of an earlier viewer has none."""
         self._work: Generator[Progress] | None = None
         self._wait = 0.0
@@ -86,17 +86,17 @@ class JobsHandler:
         self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers, decisions=decisions)
         self._publish()
 
-    def ask(self, intent: intents.Intent, asker: Asker) -> None:
-        """Do what somebody's intent asks for, with what they have chosen; errors as `handle`."""
-        self._asker = asker
+    def ask(self, intent: intents.Intent, requester: JobRequester) -> None:
+        """Carry out an intent with the choices of its user; errors as `handle`."""
+        self._requester = requester
         self.handle(intent)
 
     @singledispatchmethod
     def handle(self, intent: intents.Intent) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -180,7 +180,7 @@ class JobsHandler:
         """Begin the next job, or follow the one that runs.
 
         Raises:
-            CartsError: the job could not be done; it is said to have failed, and the next one is begun later.
+            CartsError: the job failed and is marked so; the next one is begun later.
         """
         job = self._running()
         if job is None:
@@ -192,7 +192,7 @@ class JobsHandler:
             self._follow(job)
 
     def settle(self) -> None:
-        """Notice that what runs was stopped by somebody who did not ask for the job."""
+        """End a running job whose work was stopped from another tab."""
         job = self._running()
         if job is not None and job.kind in ("solve", "export"):
             self._follow(job)
@@ -211,8 +211,8 @@ class JobsHandler:
 
     def _queue(self, kind: str, values: dict[str, Any]) -> None:
         job = self._list.add(kind, values)
-        if self._asker is not None:
-            self._asked[job.number] = self._asker
+        if self._requester is not None:
+            self._asked[job.number] = self._requester
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
             # At once, so that an error of what was asked for is shown now.
             self._begin(job)
@@ -227,9 +227,9 @@ class JobsHandler:
 
     def _begin(self, job: Job) -> None:
         self._list.change(job.number, "begun", state=JobState.RUNNING, began=time.time())
-        asker = self._asked.pop(job.number, None)
-        if asker is not None:
-            asker.choose(self._context)
+        requester = self._asked.pop(job.number, None)
+        if requester is not None:
+            requester.choose(self._context)
         try:
             match job.options:
                 case SolveOptions() as options:
@@ -336,7 +336,7 @@ class JobsHandler:
 
     @property
     def _choices(self) -> ViewState:
-        return self._context.state if self._asker is None else self._asker.state
+        return self._context.state if self._requester is None else self._requester.state
 
     def _publish(self) -> None:
         networks = self._networks

@@ -83,9 +83,9 @@ class LiveRun:
 
 
 _LOOK_EVERY = 0.01
-"""How often a new result is looked for [s]."""
+"""Interval between checks for a new result [s]."""
 _TELL_EVERY = 0.5
-"""How often it is said how the stream goes [s]."""
+"""Interval between updates of the statistics [s]."""
 _FOR_EVER = 1_000_000
 ALLOWED = (
     intents.Live,
@@ -113,7 +113,7 @@ class Show(Protocol):
 
 
 class LiveHandler:
-    """The handler that follows a stream in the place of the recording."""
+    """Handler of live streams, which are shown in place of the recording."""
 
     def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory, show: Show) -> None:
         self._context, self._open_run, self._optimizers, self._show = context, run, optimizers, show
@@ -127,7 +127,7 @@ class LiveHandler:
         return self._live is not None
 
     def handle(self, intent: intents.Live) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
             CartsError: the stream cannot be opened, or what was recorded not be written.
@@ -195,7 +195,7 @@ class LiveHandler:
         try:
             self._show(again=True)
         finally:
-            # After the frame: nobody may see a frame of the stream as one of the recording.
+            # After the frame, so that no frame of the stream is shown as one of the recording.
             self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
         if run.recorder is not None:
             self._context.change(live=replace(state, on=False, text=f"{text} {_written(run.recorder.close())}"))

@@ -38,16 +38,16 @@ class OptimizingHandler:
         self._check = FitCheck(context.session, optimizers)
         self._run: ActiveRun | None = None
         self._target = NETWORK
-        """What the last run fits."""
+        """Target of the last run."""
         self._before: Edits | None = None
-        """What brings the frame back to where the last run began."""
+        """Edits that restore the frame to the start of the last run."""
 
     @singledispatchmethod
     def handle(self, intent: intents.Optimizing) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -80,7 +80,7 @@ class OptimizingHandler:
                 self._context.save()
 
     def forget(self) -> None:
-        """Another frame is shown, where there is no run to go back to the start of."""
+        """Forget the start of the run, since another frame is shown."""
         self._before = None
 
     def map(self) -> None:
@@ -213,7 +213,7 @@ class OptimizingHandler:
         self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._doubts())
 
     def _doubts(self) -> tuple[str, ...]:
-        """What speaks against the network that the run relies on."""
+        """Warnings about the network that the run relies on."""
         state = self._context.state
         if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
             return ()

@@ -27,7 +27,7 @@ _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the 
 
 
 class PaintingHandler:
-    """The handler that painting is about."""
+    """Handler of painting."""
 
     def __init__(self, context: Context, run: OpenRun, segmenter: Callable[[], Segmenter]) -> None:
         self._context = context
@@ -37,10 +37,10 @@ class PaintingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Painting) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -69,7 +69,7 @@ class PaintingHandler:
             raise CartsError(f"There is no class {intent.number!r} to paint; there are: {sorted(known)}.")
         self._hold(label=intent.number, target=Target.MASK)
         if intent.number:
-            # Otherwise nobody would see which class is where.
+            # The layer of parts shows the painted classes.
             self._context.change(layer=Layer.PARTS)
 
     @handle.register
@@ -166,7 +166,7 @@ Layers = Mapping[Key[Any], Any]
 
 @dataclass(frozen=True)
 class _Begun:
-    """A thing that was pointed at, which further clicks are about."""
+    """A segmented object that further clicks refine."""
 
     place: tuple[int, str, Target, int]
     """Frame, camera, target and class."""

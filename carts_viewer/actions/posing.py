@@ -25,10 +25,10 @@ class PosingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Posing) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -109,10 +109,10 @@ class DraggingHandler:
         """What is dragged; None where nothing was under the pointer."""
 
     def handle(self, intent: intents.DragLink) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         if not all(map(math.isfinite, (*intent.start, *intent.end))):
             raise CartsError(f"{intent.start} to {intent.end} are no places in the image.")

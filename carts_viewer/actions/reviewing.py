@@ -30,7 +30,7 @@ _REVIEW_STEPS = {
 
 
 class AnnotatingHandler:
-    """The handler that the project is about."""
+    """Handler of history, review, copied corrections and keypoints."""
 
     def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
         """
@@ -45,7 +45,7 @@ class AnnotatingHandler:
         self._session = context.session
         self._keypoints = labelled_keypoints(context.session.scene)
         self._held: str | None = None
-        """The keypoint under somebody's pointer."""
+        """The keypoint that is dragged."""
         self._pinned_from: SceneState | None = None
         """The pose before the first of the present pins."""
         self._fitted: SceneState | None = None
@@ -55,10 +55,10 @@ class AnnotatingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Annotation) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -116,7 +116,7 @@ class AnnotatingHandler:
         if index is not None:
             self._go(index)
             return
-        # Whoever accepts the last frame is done, which is no error.
+        # After the last frame there is no next one, which is no error.
         where = " of the range" if within is not None and state.range is not None else ""
         count = len(within or range(len(self._session.sequence)))
         self._context.change(notice=f"All {count} frames{where} are reviewed.")
@@ -149,7 +149,7 @@ class AnnotatingHandler:
         self._mark(_REVIEW_STEPS[state], Review(state, note))
 
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
-        """Say something about the shown frame, which ends a run."""
+        """Set the review of the shown frame, which ends a run."""
         self._open_run.end("Stopped: the frame was reviewed")
         # What says nothing is none, so that clearing what is clear is no step.
         edits = {Key.review(self._context.state.index): None if review == Review() else review}
@@ -236,7 +236,7 @@ _STEPS = {
 
 
 class FindingHandler:
-    """The handler that looks for frames."""
+    """Handler of the frame filter."""
 
     def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
         self._context = context
@@ -245,10 +245,10 @@ class FindingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Finding) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 

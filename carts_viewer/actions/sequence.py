@@ -19,7 +19,7 @@ from carts_viewer.state import ListedFrame, SolveState
 
 
 class PropagatingHandler:
-    """The handler that solves many frames, one at a time."""
+    """Handler of sequence mode: solves many frames, one at a time."""
 
     def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory) -> None:
         self._context = context
@@ -28,18 +28,18 @@ class PropagatingHandler:
         self._optimizers = optimizers
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         self._held: dict[int, Outcome] = {}
-        """Frames that would fit worse than before, and are as they were."""
+        """Results that fit worse than before and are not applied."""
         self._run: SequenceRun | None = None
         self._work: Iterator[None] = iter(())
         self._before: ProjectState = context.session.editor.view
-        """What the project said when the run began."""
+        """The project at the start of the run."""
 
     @singledispatchmethod
     def handle(self, intent: intents.Propagating) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 
@@ -167,7 +167,7 @@ class PropagatingHandler:
                 self._report(text=self._save(run, outcomes))
 
     def _solved(self, estimate: FrameEstimate) -> bool:
-        """Whether an estimate is for the project: what somebody has done to a frame meanwhile counts more."""
+        """Whether an estimate may be saved: edits made to its frame meanwhile take precedence."""
         now, index = self._session.editor.view, estimate.index
         kept = estimate.start == "keyframe" or index in now.kept_frames
         return not kept and now.joints(index) == self._before.joints(index)
@@ -254,10 +254,10 @@ class MarkingHandler:
 
     @singledispatchmethod
     def handle(self, intent: intents.Marking) -> None:
-        """Do what an intent asks for.
+        """Carry out an intent.
 
         Raises:
-            CartsError: with a text for people; the state is still a valid one.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         raise unknown(intent)
 

@@ -20,7 +20,7 @@ _ACCEPTED, _REFUSED = "accepted", "refused"
 
 
 class Decisions:
-    """Contents that this user has made, accepted or refused; only in memory where the data folder cannot be written."""
+    """Decisions of this user on file contents; only in memory where the data folder cannot be written."""
 
     def __init__(self) -> None:
         self._made: dict[str, bool] = {}
@@ -69,7 +69,7 @@ def damage(path: Path, what: str, error: Exception, effect: str, *, writable: bo
         writable: whether the file may be renamed.
 
     Returns:
-        Cause, effect and new name, for people.
+        Cause, effect and new name, as text for the user.
     """
     kept = "The file was left as it is"
     if writable:

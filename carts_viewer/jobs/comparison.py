@@ -20,7 +20,7 @@ from carts_viewer.state import Pose, ViewState
 _OUT_OF_VIEW = 5e-4
 """Share of an image below which no arm is in view of a camera [1]."""
 _WORSE_LOSS, _WORSE_FAILURE, _WORSE_DICE = 1.1, 0.02, 0.005
-"""What counts as worse: a loss by this factor, a probability or Dice by this much [1]."""
+"""Thresholds of a worse fit: factor of the loss, difference of probability and of Dice [1]."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Fit:
     """Overlap with the true mask; None where there is none."""
 
     def worse_than(self, other: "Fit") -> str | None:
-        """By what this fit is worse than another one of the same frame, for people; None where it is not."""
+        """Text on how this fit is worse than another one of the same frame; None where it is not."""
         if other.dice is not None and self.dice is not None:
             # Where the truth is known, nothing else counts.
             return f"Dice {self.dice:.3f}, was {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
@@ -48,7 +48,7 @@ class Fit:
 
 
 class FitCheck:
-    """Compares poses with images; nothing moves."""
+    """Assesses poses against images, without moving anything."""
 
     def __init__(self, session: Session, optimizers: OptimizerFactory) -> None:
         self._session = session
@@ -65,14 +65,14 @@ class FitCheck:
         for name in target.seen(sequence, index, domain, cameras) or cameras:
             ignore = self._session.ignored(index, [name], target)
             found[name] = self._optimizers.assess(sequence, index, domain, [name], pose, settings, target, ignore)
-        # A camera that sees no arm says nothing, unless none sees any.
+        # Cameras that see no arm are left out, unless none sees any.
         seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
         loss = sum(loss for _, loss in seeing.values()) / len(seeing)
         return Fit(of_cameras({name: assessment for name, (assessment, _) in seeing.items()}), loss)
 
 
 def of_cameras(assessed: dict[str, Assessment]) -> FitVerdict:
-    """The verdict on a frame: that of the camera that speaks most against it."""
+    """Verdict on a frame: the worst one of its cameras."""
     worst = max(assessed, key=lambda name: (VERDICTS.index(assessed[name].verdict.value), assessed[name].probability))
     found = assessed[worst]
     verdict = FitVerdict(found.verdict.value, found.reason, found.remedy, found.probability)
@@ -85,18 +85,18 @@ def of_cameras(assessed: dict[str, Assessment]) -> FitVerdict:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What solving found for one frame."""
+    """Result of solving one frame."""
 
     edits: Edits
     figures: Figures
     remark: str | None = None
-    """Why somebody should look at it, for people."""
+    """Reason to inspect the frame, as text for the user."""
     held: bool = False
-    """Whether it fits worse than before, so that the frame stays as it was."""
+    """Whether it fits worse than before, so that the earlier pose is kept."""
 
 
 class Comparison:
-    """Compares what was solved with how a frame was."""
+    """Compares a solved pose with the earlier pose of the frame."""
 
     def __init__(self, session: Session, renderer: OverlayRenderer, optimizers: OptimizerFactory) -> None:
         self._session = session
@@ -200,6 +200,6 @@ def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
 
 
 def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
-    """What was solved of a frame and not compared, because somebody stopped it."""
+    """The result of a frame that was not compared, because solving was stopped."""
     edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
     return Outcome(edits, Figures(estimate.loss), "not compared with how it was, because solving was stopped")

@@ -128,7 +128,7 @@ def _within(value: int, low: int, high: int) -> int:
 
 
 def job_title(options: Options, frame_ids: Sequence[str]) -> str:
-    """What a job with these options does, for people."""
+    """Title of a job with these options."""
     part = getattr(options, "range", None)
     between = None if part is None else f"frames {frame_ids[part[0]]} to {frame_ids[part[1]]}"
     match options:
@@ -151,7 +151,7 @@ def job_title(options: Options, frame_ids: Sequence[str]) -> str:
 
 
 class JobState(StrEnum):
-    """Where a job is."""
+    """State of a job."""
 
     ASKED = "asked"
     """It was not queued by this user on this machine, and waits for their decision."""
@@ -164,12 +164,12 @@ class JobState(StrEnum):
 
 @dataclass(frozen=True)
 class Job:
-    """Something that takes long."""
+    """A long-running task."""
 
     number: Annotated[int, msgspec.Meta(ge=1)]
     kind: str
     title: str
-    """For people."""
+    """Text for the user."""
     options: Options
     """With the kind, all that is needed to do it again."""
     state: JobState = JobState.WAITING
@@ -180,7 +180,7 @@ class Job:
     """[s since 1970]; 0 before."""
     ended: float = 0.0
     text: str = ""
-    """How it goes, or what came of it, for people."""
+    """Progress or result, as text for the user."""
     log: tuple[str, ...] = ()
     token: str = ""
     """Random; with kind, options and recording it tells this user's jobs from those that another user has queued."""
@@ -192,12 +192,12 @@ class Job:
 
     @property
     def frames(self) -> range | None:
-        """The part of the sequence that it is about; None for all of it."""
+        """Frames of the job; None for the whole sequence."""
         ends = getattr(self.options, "range", None)
         return None if ends is None else range(ends[0], ends[1] + 1)
 
     def seconds_left(self, now: float) -> float | None:
-        """How long it will go on if it goes on like that [s]; None where nobody knows."""
+        """Estimated remaining time [s]; None where unknown."""
         if self.state is not JobState.RUNNING or not self.done or not self.total:
             return None
         return max(0.0, (now - self.began) / self.done * (self.total - self.done))
@@ -215,7 +215,7 @@ class JobList:
 
     Attributes:
         jobs: the list.
-        problem: that the file was damaged, and where it is kept, for people; empty if it was not.
+        problem: that the file was damaged, and where it is kept; empty if it was not.
     """
 
     def __init__(
@@ -271,11 +271,11 @@ class JobList:
         return bool(job.token) and self._decisions.find(self._identity(job)) is True
 
     def save(self) -> None:
-        """Write how far jobs are."""
+        """Write the list."""
         self._write()
 
     def forget(self) -> None:
-        """Take what is over off the list."""
+        """Remove ended jobs from the list."""
         self._drop([job for job in self.jobs if job.over])
         self._write()
 

@@ -13,7 +13,7 @@ from carts_viewer.jobs.companions import Decisions, damage
 from carts_viewer.jobs.optimizers import OptimizerFactory
 
 STARTED = "As started"
-"""What people read for the network that the viewer was started with: the shipped one, or that of `--weights`."""
+"""Label of the network that the viewer was started with: the shipped one, or that of `--weights`."""
 _WEIGHTS_FILE = "surface.safetensors"
 _ADAPTED = "Adapted {}"
 _FILE = Kind("choice of a network", 2**12)
@@ -29,15 +29,15 @@ class _Choice:
 
 
 class Networks:
-    """Which network runs, for everybody; the choice is kept in `PROJECT_network.json` beside the project.
+    """The surface network that all tabs use; the choice is kept in `PROJECT_network.json` beside the project.
 
     Weights that this user has neither trained here nor accepted are not used before they are accepted, once a file.
 
     Attributes:
-        names: what people can choose from.
-        used: the one that runs.
-        asked: the one that was chosen, and waits to be accepted or refused; empty if there is none.
-        problem: why the remembered choice is not used, for people; empty if it is.
+        names: labels of the networks to choose from.
+        used: label of the network in use.
+        asked: label of a chosen network whose weights are not accepted yet; empty without one.
+        problem: why the saved choice is not used; empty if it is.
     """
 
     def __init__(self, project: Path, *, kept: bool, optimizers: OptimizerFactory, decisions: Decisions) -> None:
@@ -62,20 +62,20 @@ class Networks:
             self.problem = f"The network {remembered!r}, which was chosen last, cannot be used: {error}."
 
     def look(self) -> None:
-        """See which there are."""
+        """Update `names`."""
         numbers = [number for number in self._numbers() if is_regular(self.folder(number) / _WEIGHTS_FILE)]
         self.names = (STARTED, *(_ADAPTED.format(number) for number in numbers))
 
     def folder(self, number: int) -> Path:
-        """Of a run that adapts, by its number."""
+        """Folder of an adapted network, by its number."""
         return self._project.with_name(f"{self._project.stem}_adapted_{number}")
 
     def next_number(self) -> int:
-        """Of a run that is begun now."""
+        """Number of the next adapted network."""
         return max(self._numbers(), default=0) + 1
 
     def use(self, name: str) -> None:
-        """Have a network run from now on, and remember it; one of another user's weights waits to be accepted.
+        """Use a network from now on and save the choice; weights of another user have to be accepted first.
 
         Raises:
             CartsError: there is none of this name, or its weights cannot be used.

@@ -46,7 +46,7 @@ from carts_viewer.state import Pose
 
 
 class Optimizer(Protocol):
-    """What the viewer needs of an optimizer; `FrameOptimizer` is the one that the app uses."""
+    """Interface of an optimizer of one frame; the app uses `FrameOptimizer`."""
 
     @property
     def best(self) -> Iterate | None:
@@ -54,7 +54,7 @@ class Optimizer(Protocol):
 
     @property
     def stop_reason(self) -> str | None:
-        """Why there are no more iterates, None before."""
+        """Reason for the end of the run; None before."""
 
     @property
     def assessment(self) -> Assessment | None:
@@ -77,7 +77,7 @@ class Optimizer(Protocol):
 
 
 class ActiveRun:
-    """One run on one frame: the optimizer, and where it started."""
+    """One run on one frame: the optimizer and its start."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class ActiveRun:
 
     @property
     def stop_reason(self) -> str | None:
-        """Why the run ended, None before."""
+        """Reason for the end of the run; None before."""
         return self._optimizer.stop_reason
 
     def step(self) -> Iterate | None:
@@ -147,7 +147,7 @@ class ActiveRun:
 
 
 class SequenceRun:
-    """One run on many frames: the optimizer, and what a project keeps about it."""
+    """One run on many frames: the optimizer and its provenance."""
 
     def __init__(self, optimizer: SequenceOptimizer, provenance: Provenance) -> None:
         self.provenance = provenance
@@ -182,7 +182,7 @@ class SequenceRun:
         return self._optimizer.base_frame_gain()
 
     def status(self) -> str:
-        """How it goes, for people."""
+        """Progress, as text for the user."""
         done, total = self._optimizer.progress
         if done == 0:
             return "Solving a few frames alone, for a first estimate of the error of all"
@@ -194,7 +194,7 @@ class SequenceRun:
 
 
 REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
-"""What people can do where the network does not know what it sees."""
+"""Remedy for images outside the domain of the network."""
 
 
 class NetworkOptions(TypedDict, total=False):
@@ -211,7 +211,7 @@ class NetworkOptions(TypedDict, total=False):
 
 
 class OptimizerFactory:
-    """Makes optimizers; networks are loaded once, when they are first needed."""
+    """Makes optimizers; loads the networks once, when they are first needed."""
 
     def __init__(self, *, report: Callable[[str], None], **options: Unpack[NetworkOptions]) -> None:
         """
@@ -238,7 +238,7 @@ class OptimizerFactory:
         return any(read_weights(path).network.kind == SurfaceNetwork.kind for path in self._weights)
 
     def use(self, surface: Path | None) -> None:
-        """Run another surface network from now on; None: the one of the beginning.
+        """Use another surface network from now on; None: the one that the viewer was started with.
 
         Raises:
             WeightsError: the weights cannot be read, or are no surface network's.
@@ -248,10 +248,10 @@ class OptimizerFactory:
         self._surface, self._extractor = surface, None
 
     def prepare(self) -> FeatureExtractor:
-        """The networks.
+        """Load the networks, if they are not loaded yet.
 
         Raises:
-            WeightsError: it cannot be loaded.
+            WeightsError: they cannot be loaded.
         """
         if self._extractor is None:
             self.report("Loading the networks")
@@ -263,7 +263,7 @@ class OptimizerFactory:
         return self._extractor
 
     def segmenter(self) -> Segmenter:
-        """What segments what people point at.
+        """The segmenter of the tool *Prompt*.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -278,7 +278,7 @@ class OptimizerFactory:
     def unfamiliar(
         self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]
     ) -> tuple[str, ...]:
-        """What speaks against the network for these arms and images, from one frame; asked once for each network.
+        """Warnings that these arms and images are outside the domain of the network, from one frame; cached.
 
         Raises:
             CartsError: weights or an image is not usable.
@@ -293,7 +293,7 @@ class OptimizerFactory:
         return self._unfamiliar[known]
 
     def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
-        """What says what images show; with masks alone no network is loaded.
+        """Predictor of a target; with masks alone no network is loaded.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -307,7 +307,7 @@ class OptimizerFactory:
     def provenance(
         self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters, target: Target = NETWORK
     ) -> Provenance:
-        """What a project keeps about a run with these settings.
+        """Provenance of a run with these settings.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -361,7 +361,7 @@ class OptimizerFactory:
         target: Target,
         ignore: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> tuple[Assessment, float]:
-        """What the images say of a pose, and its loss; nothing moves. Arguments and errors as in `make`."""
+        """Assessment and loss of a pose, without moving it. Arguments and errors as in `make`."""
         surface = settings if isinstance(settings, SurfaceSolver) else SurfaceSolver()
         optimizer = self._frame_optimizer(
             sequence,

@@ -40,15 +40,15 @@ _ACCEPTED, _OPTIMIZED = ReviewState.ACCEPTED, ReviewState.OPTIMIZED
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is."""
+    """Progress of a job."""
 
     done: int
     total: int
     text: str
     line: str | None = None
-    """For the log."""
+    """Line for the log."""
     wait: float = 0.0
-    """How long there is nothing to do [s]."""
+    """Time until the next step is due [s]."""
 
 
 def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
@@ -141,7 +141,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
 
 
 def _moved(before: Scene, after: Scene) -> str:
-    """Which poses a calibration has moved, and by how much, for people; empty if none."""
+    """Text on the poses that a calibration has moved, with angle and distance; empty if none."""
     found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
     return f" Moved: {', '.join(found)}." if found else ""
 
@@ -171,13 +171,13 @@ def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> d
 OPTIONS: tuple[str, ...] = ()
 """Options of `carts train` besides the recording and the time."""
 _POLL = 0.25
-"""How often it is seen how training goes [s]."""
+"""Interval between checks of the training [s]."""
 _LONGEST_END = 30.0
-"""How long training that is stopped has for its checkpoint [s]."""
+"""Time that a stopped training has for its checkpoint [s]."""
 
 
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
-    """Train, and say each minute what is reached; whoever closes the iterator stops the training.
+    """Train in a process of its own and report progress; closing the iterator stops the training.
 
     Args:
         sequence: the sequence file.
@@ -191,7 +191,7 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
     total, text, lines = max(1, round(minutes)), "Making images to measure with", []
     try:
         yield Progress(0, total, text, f"in {folder}")
-        while training.running or training.said:
+        while training.running or training.unread:
             line = training.next_line()
             if line is not None:
                 lines.append(line)
@@ -229,12 +229,12 @@ class _Training:
 
     @property
     def running(self) -> bool:
-        """Whether more may be said."""
+        """Whether more output may come."""
         return self._reader.is_alive() or self._process.poll() is None
 
     @property
-    def said(self) -> bool:
-        """Whether there are lines that nobody has taken."""
+    def unread(self) -> bool:
+        """Whether there are unread lines."""
         return not self._lines.empty()
 
     @property
@@ -244,17 +244,17 @@ class _Training:
 
     @property
     def minutes(self) -> int:
-        """Since it began."""
+        """Minutes since the start."""
         return int((time.monotonic() - self._began) / 60)
 
     def next_line(self) -> str | None:
-        """What was said next; None where nothing is there yet."""
+        """The next unread line; None without one."""
         with suppress(Empty):
             return self._lines.get_nowait()
         return None
 
     def end(self) -> None:
-        """Have it keep what it has and end; nobody waits for that."""
+        """Ask the process to save and end, without waiting for it."""
         if self._process.poll() is None:
             self._process.terminate()
             threading.Thread(target=self._reap, daemon=True).start()

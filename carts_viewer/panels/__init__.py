@@ -1,1 +1,1 @@
-"""The panels: each builds its widgets, turns what people do into intents, and shows a state."""
+"""The panels: each builds its widgets, turns input into intents, and shows a state."""

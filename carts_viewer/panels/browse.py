@@ -79,7 +79,7 @@ class BrowsePanel:
         on_input(self._camera, intents.ShowCamera, emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         if not self._waits(intents.ShowFrame):
             write(self._frame, state.index + 1)
         if not self._waits(intents.SetSpeed):
@@ -124,7 +124,7 @@ _CALENDAR = 1e8
 
 
 def _time(stamp: float, began: float) -> str:
-    """When a frame was taken, as people read it: since the first one, and the date where it is known."""
+    """Time of a frame as text: since the first frame, and the date where it is known."""
     since = f"{stamp - began:.3f} s after the first"
     if stamp < _CALENDAR:
         return f"at {stamp:.3f} s"
@@ -161,7 +161,7 @@ class OverlayPanel:
         on_input(self._opacity, lambda value: intents.SetOpacity(value / 100), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         write(self._layer, str(state.layer))
         if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))

@@ -60,7 +60,7 @@ class ExportPanel:
             on_input(widget, lambda _: intents.Refresh(), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         name = self._formats.get(self._format.value)
         self._parts.visible = name not in _WITHOUT_PARTS
         self._images.visible = name is not None and (FORMATS[name].images or name == "masks")

@@ -57,7 +57,7 @@ class LivePanel:
         )
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         on = state.live is not None and state.live.on
         self._device.visible = self._source.value == _CAMERA
         self._port.visible = self._source.value != _REPLAY
@@ -143,7 +143,7 @@ def fit_text(
         running: whether the pose is still moving.
         scores: Dice of the cameras with a true mask.
         undetermined: joints that the images leave open; None where no deviation is known.
-        busy: what is being prepared, for people.
+        busy: what is being prepared.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
     chips = []

@@ -43,7 +43,7 @@ class Shortcut:
 
     @property
     def key(self) -> str:
-        """As people read it."""
+        """Label of the key."""
         held = {None: "", "cmd/ctrl": "Ctrl+", "shift": "Shift+", "cmd/ctrl+shift": "Ctrl+Shift+"}[self.modifier]
         return held + self.hotkey.capitalize()
 
@@ -210,15 +210,15 @@ HINTS = {
     "Camera pose": "Let runs and calibrations move the cameras",
     "Camera intrinsics": "Let runs and calibrations change focal length and principal point [px]",
     # Review
-    "Accept + next": "Accept this frame, and go to the next one that nobody has judged (G)",
+    "Accept + next": "Accept this frame, and go to the next unreviewed one (G)",
     "Accept": "Accept this frame: solving leaves it as it is",
     "Needs work": "Mark this frame for later (F)",
     "Reject": "Mark this frame as unusable; exports leave it out if you say so (J)",
     "Note": "Anything worth remembering about this frame; saved when you leave the field",
     "Previous worst": "Go to the frame that fits next better than this one (Shift+L)",
-    "Next worst": "Go to the frame that fits worst of those that are neither accepted nor rejected; frames that nobody "
-    "has solved or checked come last, in order (L)",
-    "Next unreviewed": "Go to the next frame that nobody has judged (Y)",
+    "Next worst": "Go to the frame that fits worst of those that are neither accepted nor rejected; frames "
+    "without a verdict come last, in order (L)",
+    "Next unreviewed": "Go to the next frame without a review (Y)",
     "Solve between": "Fit the frames between the kept ones around this frame together (Shift+K)",
     "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames stay as they are",
     "Begin at": "From which end of the sequence solving goes on",

@@ -23,7 +23,7 @@ class Panel(Protocol):
     """A group of widgets."""
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
 
 
 def on_input(handle: Any, intent: Callable[[Any], Intent], emit: Emit) -> None:
@@ -66,6 +66,6 @@ def swatch(color: tuple[int, int, int], name: str) -> str:
 
 
 def humanized(name: str) -> str:
-    """A joint's or field's identifier as people write it: `outer_yaw_joint` -> `Outer yaw`."""
+    """Label of a joint's or field's identifier: `outer_yaw_joint` -> `Outer yaw`."""
     words = name.removesuffix("_joint").replace("_", " ").replace("-", " ").strip()
     return words[:1].upper() + words[1:]

@@ -69,7 +69,7 @@ class JobsPanel:
                 "All masks move with it: solve again afterwards; accepted frames have to be accepted again. Solving "
                 "and exports queue up here, too.</p>"
             )
-        self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="For everybody; remembered")
+        self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="Used in all tabs; saved")
         self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)
         with gui.add_folder("Jobs"):
             self._list = gui.add_html("")

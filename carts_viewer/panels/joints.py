@@ -79,7 +79,7 @@ class JointsPanel:
         return self._sliders[arm, joint][1]
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         joints = self._session.joints(state.pose.scene)
         with self._page.atomic():
             for (arm, joint), (limits, slider) in self._sliders.items():
@@ -124,7 +124,7 @@ class JointsPanel:
     ) -> None:
         """Put a slider's ends around the measured value, within the joint's limits, and the slider where it is.
 
-        The ends reach as far as the shown value, and come back when it does; not while somebody drags, or what is under
+        The ends reach as far as the shown value, and come back when it does; not during a drag, or what is under
         the pointer would be another value.
         """
         low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
@@ -203,7 +203,7 @@ def _signed(difference: float) -> str:
 
 
 def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
-    """Standard deviation of a joint as people read it; nothing where it is not known."""
+    """Standard deviation of a joint as text; empty where it is not known."""
     value = known[joint] if known else None
     if value is None:
         return ""
@@ -240,7 +240,7 @@ class KeypointsPanel:
         on_click(self._forget, lambda _: intents.ForgetPins(), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         keypoints = state.keypoints
         write(self._chosen, keypoints.chosen or _NEAREST)
         write(self._shown, keypoints.shown)

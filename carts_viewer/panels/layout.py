@@ -93,7 +93,7 @@ class Layout:
 
 
 def _review(page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> list[Panel]:
-    """What is said and known of frames."""
+    """Panels of reviews, keyframes, imports and history."""
     return [
         ReviewPanel(page, emit, waits),
         KeyframesPanel(page, session, emit),

@@ -32,13 +32,13 @@ SOLVER_LABELS = {
     SolverName.L1: "L1 on predictions",
     SolverName.NONE: "None: compare only",
 }
-"""What people read for the solvers."""
+"""Labels of the solvers."""
 OBSERVED = {"What the network sees": "network", "Masks": "masks", "Masks, and parts by the network": "both"}
-"""What people read for what is fitted."""
+"""Labels of what a run fits."""
 MASKS = {"Of the recording": "recording", "Imported": "imported", "Painted": "painted"}
-"""The same for whose masks."""
+"""Labels of the masks that a run fits."""
 UNDETERMINED = "Not determined by this image"
-"""What people read for unknowns that an image says nothing of."""
+"""Label of unknowns that the image does not determine."""
 _CONSEQUENCE = "The mask hardly depends on these, so it can be right although their values are guesses."
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
@@ -46,7 +46,7 @@ _BEFORE_RUN = {
     ReviewState.REJECTED: "This frame is rejected. Run would fit it all the same.",
     ReviewState.OPTIMIZED: "This frame has been fitted. Run goes on from where it is.",
 }
-"""What people read before a run."""
+"""Status before a run, by review state."""
 
 
 class OptimizePanel:
@@ -72,7 +72,7 @@ class OptimizePanel:
             "Whose masks",
             list(MASKS),
             visible=False,
-            hint="Imported: by Review, Masks of others. Painted: rendered masks that somebody corrected with a brush.",
+            hint="Imported: by Review, Masks of others. Painted: rendered masks corrected with a brush.",
         )
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
@@ -87,7 +87,7 @@ class OptimizePanel:
         on_input(self._cameras, lambda label: intents.SetCameras(label == "All cameras"), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         running = state.run.phase is Phase.RUNNING
         self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
         self._run.disabled = self._step.disabled = running or state.busy is not None
@@ -199,7 +199,7 @@ class SettingsPanel:
             self._window.visible = False
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         self._show_error(state)
         for kind, widgets in self._widgets.items():
             chosen = isinstance(state.settings, kind)
@@ -255,7 +255,7 @@ class FreePanel:
             page.columns(list(self._groups.values()))
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         for (arm, joint), box in self._joints.items():
             write(box, is_free(state, arm, joint))
         for name, box in self._groups.items():
@@ -332,7 +332,7 @@ class CurvesPanel:
 
 
 def note(curves: Curves, outdated: bool) -> str:
-    """What the curves show, for people."""
+    """Note on the curves."""
     if outdated:
         return "Of the last run; the pose, the image or a setting was changed since."
     if curves.comparable:

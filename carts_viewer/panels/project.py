@@ -74,14 +74,14 @@ class HistoryPanel:
             for step in project.steps[first : first + _LISTED]
         }
         if positions != self._positions:
-            # Before the widget offers them: whoever chooses one must find it here.
+            # Before the widget offers them, so that every choice is known.
             self._positions = positions
             self._steps.options = tuple(positions)
         write(self._steps, next(label for label, number in positions.items() if number == project.position))
 
 
 class PeoplePanel:
-    """One's own name, everybody else with the frame that they are on, and a button that copies the link."""
+    """Name of the user, other users with their frames, and a button that copies the link."""
 
     def __init__(self, page: TabPage, state: ViewState, emit: Emit, waits: Waits) -> None:
         gui = page.gui
@@ -113,7 +113,7 @@ class PeoplePanel:
             + (" <b>(this one)</b>" if index == state.index else "")
             for name, index in state.others
         ]
-        text = "<br>".join(rows) if rows else "Nobody else is at work."
+        text = "<br>".join(rows) if rows else "No other user."
         self._others.content = f'<p class="carts-caption">{text}</p>'
 
 

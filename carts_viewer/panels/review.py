@@ -49,7 +49,7 @@ class ReviewPanel:
             page.row(accept, keep, weights=(3, 2))
             work = gui.add_button("Needs work", color="gray")
             reject = gui.add_button("Reject", color="gray")
-            clear = gui.add_button("Clear", color="gray", hint="Forget what was said about this frame (Shift+G)")
+            clear = gui.add_button("Clear", color="gray", hint="Clear the review of this frame (Shift+G)")
             page.row(work, reject, clear, weights=(11, 7.65, 7.35))
             self._note = gui.add_text("Note", "")
             previous = gui.add_button("Previous worst", color="gray")
@@ -71,7 +71,7 @@ class ReviewPanel:
         on_input(self._note, intents.SetNote, emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         review = state.review
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
         name = review_name(state.project, state.index)

@@ -129,7 +129,7 @@ class KeyframesPanel:
         on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]), emit)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets up to date."""
+        """Update the widgets."""
         write(self._held, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
         self._all.label = whole_label(state)
@@ -172,7 +172,7 @@ class KeyframesPanel:
         self._listed.content = f'<ul class="carts-list" aria-label="Frames to look at">{rows}{more}</ul>'
 
     def _plan_ahead(self, state: ViewState) -> None:
-        """Find out what "between" means here; while somebody is moving a joint, what it meant before."""
+        """Update the text on what would be solved; not during an unfinished gesture."""
         seen = (state.project, state.index, state.range)
         if self._seen == seen or (state.unsaved and self._seen[1:] == seen[1:]):
             return

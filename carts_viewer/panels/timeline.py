@@ -127,7 +127,7 @@ class Thumbnails:
         self._sources: dict[tuple[int, int], ImageSource] = {}
         self._kept: OrderedDict[str, bytes] = OrderedDict()
         self._lock = threading.Lock()
-        # One at a time: whoever scrubs meanwhile needs the processor more.
+        # One at a time, since scrubbing needs the processor more.
         self._thread = ThreadPoolExecutor(1, "carts-thumbnails")
 
     async def answer(self, path: str) -> Response:
@@ -147,7 +147,7 @@ class Thumbnails:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _source(self, camera: int, domain: int) -> ImageSource:
-        """Images as recorded; a video is read apart from whoever goes through its frames meanwhile."""
+        """Images as recorded; a video gets a reader of its own."""
         if (camera, domain) not in self._sources:
             source = self._sequence.image_source(self._cameras[camera], self._sequence.domains[domain])
             self._sources[camera, domain] = source.another() if isinstance(source, Video) else source
@@ -256,7 +256,7 @@ class TimelineData:
         }
 
     def _drafted(self, state: ViewState) -> list[int]:
-        """As `_changed`, of the shown frame alone, while somebody or the optimizer moves it."""
+        """As `_changed`, of the shown frame alone, during an unfinished gesture or a run."""
         self._draft, number = state.index, code(state.project, state.index, self._session.scene)
         if self._codes.get(state.index, 0) == number:
             return []

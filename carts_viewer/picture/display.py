@@ -152,7 +152,7 @@ def _picture(state: ViewState) -> tuple:
 def _draw_paint(
     overlay: Rgba, state: ViewState, corrected: MaskCorrection | None, ignored: IgnoreRegion | None
 ) -> None:
-    """Draw what was painted, unless somebody wants to see nothing but the frame."""
+    """Draw painted layers, unless only the frame is shown."""
     at_work = state.brush.tool is not Tool.OFF
     if at_work or state.layer is not Layer.NONE:
         # The comparison with the truth, and the parts, show the corrected mask itself.

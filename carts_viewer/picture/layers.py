@@ -1,4 +1,4 @@
-"""What can be drawn over the frame: pure functions from arm ids, masks and maps to RGBA pictures."""
+"""Layers over the frame: pure functions from arm ids, masks and maps to RGBA pictures."""
 
 import colorsys
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from carts_core.project import IgnoreRegion, MaskCorrection
 
 
 class Layer(StrEnum):
-    """A way to show the arm over the frame; the value is what people read."""
+    """A way to show the arm over the frame; the value is the label in the page."""
 
     SHADED = "Shaded arm"
     MASK = "Mask"
@@ -38,7 +38,7 @@ TRUTH_COLORS = {
 """The paper's colours for the comparison with a true mask."""
 
 ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
-"""Colours of pixels that somebody added to the mask, removed from it, or excluded from the optimizer."""
+"""Colours of pixels added to the mask, removed from it, or excluded from the optimizer."""
 
 Rgba = UInt8[np.ndarray, "height width 4"]
 ArmIds = Int[np.ndarray, "height width"]

@@ -143,7 +143,7 @@ def with_imported(frame: Frame, scene: Scene, project: ProjectState) -> Frame:
 
 
 def labelled_keypoints(scene: Scene) -> dict[str, Keypoint]:
-    """All keypoints of a scene by what people read; the arm is named where there are several."""
+    """All keypoints of a scene by label, which names the arm where there are several."""
     points = [point for arm in scene.arms for point in keypoints(arm)]
     several = len(scene.arms) > 1
     return {f"{point.arm} {point.name}" if several else point.name: point for point in points}

@@ -1,4 +1,4 @@
-"""What people draw over a frame: tools, strokes as a browser sends them, and what strokes do to painted layers."""
+"""Strokes over a frame: tools, parsing of strokes from a browser, and their effect on painted layers."""
 
 import json
 import math
@@ -27,7 +27,7 @@ Mask = Bool[np.ndarray, "height width"]
 
 
 class Tool(StrEnum):
-    """What the pointer does to the picture; the value is what people read."""
+    """What the pointer does to the picture; the value is the label in the page."""
 
     OFF = "Off"
     BRUSH = "Brush"
@@ -37,7 +37,7 @@ class Tool(StrEnum):
 
 
 class Target(StrEnum):
-    """The layer that a stroke changes; the value is what people read."""
+    """The layer that a stroke changes; the value is the label in the page."""
 
     MASK = "Mask"
     IGNORE = "Ignore region"
@@ -45,7 +45,7 @@ class Target(StrEnum):
 
 @dataclass(frozen=True)
 class Brush:
-    """What is in everybody's hand."""
+    """Tool of a tab."""
 
     tool: Tool = Tool.OFF
     target: Target = Target.MASK

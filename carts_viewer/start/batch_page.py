@@ -59,7 +59,7 @@ class BatchPage:
             self._look_again()
 
     def choose(self, name: str, value: str) -> None:
-        """Do what somebody has chosen."""
+        """Carry out a choice."""
         self._problem = ""
         match name:
             case "back":

@@ -16,13 +16,13 @@ class Place(Protocol):
     """What a page shows at one time. Everything but the constructor is called on the site's thread."""
 
     def show(self) -> None:
-        """Bring the document up to date."""
+        """Update the document."""
 
     def choose(self, name: str, value: str) -> None:
-        """Do what somebody has chosen in the document; any two texts."""
+        """Carry out a choice in the document; a tab can send any two texts."""
 
     def click(self, u: float, v: float) -> None:
-        """Somebody has clicked in the image; shares of its width and height."""
+        """Handle a click in the image, at shares of its width and height."""
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong."""
@@ -39,7 +39,7 @@ class Host(Protocol):
     roots: Roots
 
     def post(self, job: Callable[[], None]) -> None:
-        """Do something on the site's thread, after everything that was asked for before. Any thread may ask."""
+        """Queue a function for the site's thread. Any thread may call this."""
 
     def load_networks(self) -> FeatureExtractor:
         """Load the networks. Any thread may ask.
@@ -76,11 +76,11 @@ Wanted = Callable[[Entry], bool]
 
 
 class FileBrowser:
-    """Where somebody is in the allowed folders.
+    """File browser of the allowed folders.
 
     Attributes:
         folder: what is listed; None for the list of the allowed folders.
-        problem: why the last choice was not possible, for people; empty if it was.
+        problem: why the last choice was not possible; empty if it was.
     """
 
     def __init__(self, roots: Roots, *, wanted: Wanted, folders: bool, purpose: str) -> None:
@@ -89,7 +89,7 @@ class FileBrowser:
             roots: the allowed folders.
             wanted: which files may be picked; others are shown greyed out.
             folders: whether a folder may be picked.
-            purpose: what is looked for, for people.
+            purpose: instruction for the user.
         """
         self._roots = roots
         self._wanted = wanted

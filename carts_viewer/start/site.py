@@ -35,7 +35,7 @@ class Site:
     Attributes:
         page: the page.
         document: what lies over it.
-        roots: the folders that people may look into.
+        roots: the allowed folders.
         place: what is shown; None while a sequence is open.
         app: the viewer of the open sequence, if there is one.
         url: where the page is.
@@ -55,7 +55,7 @@ class Site:
         """Start serving the start page, or a batch.
 
         Args:
-            folders: what people may look into, and nothing outside.
+            folders: the allowed folders.
             batch: folder of the batch that is shown first.
             host: the address to listen on; one that other computers can reach makes the url carry a token.
             port: 0 picks a free port; a busy one moves up to the next free one.
@@ -87,7 +87,7 @@ class Site:
         self.close()
 
     def post(self, job: Callable[[], None]) -> None:
-        """Do something on the site's thread, after everything that was asked for before. Any thread may ask."""
+        """Queue a function for the site's thread. Any thread may call this."""
         self._jobs.put(job)
 
     def wait(self, timeout: float = 60.0) -> None:

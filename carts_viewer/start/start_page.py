@@ -66,7 +66,7 @@ def recent_projects() -> list[RecentProject]:
 
 
 def set_damaged_aside() -> str:
-    """Set the list aside where it is damaged; what happened, for people, or an empty text."""
+    """Set a damaged list aside; gives a text for the user, empty where it is not damaged."""
     try:
         _read()
     except (OSError, ValueError) as error:
@@ -174,7 +174,7 @@ class StartPage:
         self._browser: FileBrowser | None = None
 
     def show(self) -> None:
-        """Bring the document up to date."""
+        """Update the document."""
         projects = recent_projects()
         cards = "".join(self._card(project) for project in projects)
         shown = f'<h2>Recent</h2><div class="cards">{cards}</div>' if projects else ""
@@ -190,7 +190,7 @@ class StartPage:
         )
 
     def choose(self, name: str, value: str) -> None:
-        """Do what somebody has chosen."""
+        """Carry out a choice."""
         self._problem = ""
         browser = self._browser
         match name:
@@ -230,7 +230,7 @@ class StartPage:
         self.show()
 
     def close(self) -> None:
-        """Nothing is under way here."""
+        """Nothing to close."""
 
     def _open(self) -> str:
         return "" if self._browser is None else f"<h2>Open</h2>{self._browser.html()}"
@@ -289,7 +289,7 @@ def _is_toml(entry: Entry) -> bool:
 
 
 def _ago(seconds: float) -> str:
-    """When something was, as people say it."""
+    """Time since a moment, as text."""
     minutes = max(time.time() - seconds, 0.0) / 60
     if minutes < 2:
         return "just now"

@@ -1,7 +1,7 @@
-"""A document over the page: HTML that the server writes, and what people choose in it.
+"""A document over the page: HTML from the server, and the choices made in it.
 
-An element with `data-do="NAME"` says so when it is clicked (a button) or its value changes (a list, a field). What is
-said is checked by whoever handles the name: a tab can send anything.
+An element with `data-do="NAME"` reports a click (a button) or a change of its value (a list, a field). The handler of
+the name checks the value: a tab can send anything.
 """
 
 import html

@@ -191,7 +191,7 @@ class Page:
         self._orient()
 
     def _orient(self) -> None:
-        """OpenCV's axes, and everybody's first view along the lens."""
+        """Set OpenCV's axes and the initial view along the lens."""
         self.server.scene.set_up_direction("-y")
         initial = self.server.initial_camera
         initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)

@@ -30,7 +30,7 @@ class TabPage:
         call(self.client, name, *arguments)
 
     def on_pressed(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; any text, if it is none of ours."""
+        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; a tab can send any text."""
         self._pressed.append(callback)
 
     def press(self, key: str) -> None:

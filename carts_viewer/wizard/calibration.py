@@ -37,10 +37,10 @@ FRAMES = 20
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is."""
+    """Progress of a calibration."""
 
     text: str
-    """For people."""
+    """Text for the user."""
     share: float
     """Of its stages, in [0, 1]."""
     scene: Scene | None = None
@@ -48,12 +48,12 @@ class Progress:
     result: CalibrationResult | None = None
     """At its end."""
     error: str = ""
-    """Why it failed, for people; empty if it did not."""
+    """Why it failed; empty if it did not."""
     ended: bool = False
 
 
 STOPPED = Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
-"""The end of a calibration whose result nobody wants."""
+"""End of a stopped calibration."""
 
 
 class CalibrationJob:
@@ -149,7 +149,7 @@ def as_plain(scene: Scene) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PoseReport:
-    """What became of an arm's pose before a camera."""
+    """Change of an arm's pose in a camera."""
 
     arm: str
     camera: str
@@ -170,7 +170,7 @@ class CalibrationReport:
     verdict: str
     """good, doubtful or failed; empty without a verdict."""
     reason: str
-    """Of the verdict, with a remedy; for people."""
+    """Reason of the verdict, with a remedy."""
     poses: tuple[PoseReport, ...]
     before: tuple[float | None, ...]
     """Residuals of the draft's points [px]; None for points that were not used."""
@@ -178,7 +178,7 @@ class CalibrationReport:
     disagreeing: tuple[int, ...]
     """Points whose residual has grown beyond what noise explains."""
     objection: str
-    """Why the points speak against the calibration, for people; empty where they agree."""
+    """Why the points speak against the calibration; empty where they agree."""
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
@@ -288,7 +288,7 @@ def calibrated_recording(
         recording: as found, with stand-ins.
         before: the scene that it describes.
         calibration: `as_plain`.
-        text: where the calibration comes from, for people.
+        text: origin of the calibration.
 
     Raises:
         SettingsError: the calibration is of other arms or cameras.

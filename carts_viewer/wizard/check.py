@@ -88,14 +88,14 @@ FOLDER = "folder"
 
 @dataclass(frozen=True)
 class Guess:
-    """What was found, or why not."""
+    """Content of a draft's files, with the problems of each part."""
 
     kind: str
     """Name of the source."""
     recording: FoundRecording | None
     """None while something is wrong."""
     problems: Mapping[str, str] = field(default_factory=dict)
-    """"images NAME", "calibration NAME", "kinematics", "columns" or "recording" -> what is wrong there, for people."""
+    """"images NAME", "calibration NAME", "kinematics", "columns" or "recording" -> problem of that part."""
     table: ForeignTable | None = None
     """Of the kinematics, where they are a table of named columns."""
     meanings: ColumnMeanings | None = None
@@ -236,7 +236,7 @@ def check_form(
     """All that was found, part by part, with its problems and with what can be changed.
 
     Args:
-        draft: what a person has said.
+        draft: choices of the user.
         guess: what follows from it.
         pictures: camera -> name and address of its previews.
         delay: between images and table, where it was estimated.

@@ -26,7 +26,7 @@ _LONGEST_NAME = 200
 
 
 class Step(StrEnum):
-    """Where in New recording somebody is."""
+    """Step of New recording."""
 
     FILES = "Files"
     CHECK = "Check"
@@ -36,7 +36,7 @@ class Step(StrEnum):
 
 @dataclass(frozen=True)
 class Draft:
-    """What a person has said. Nothing changes it; a change makes a new one."""
+    """Choices of the user in New recording; immutable."""
 
     step: Step = Step.FILES
     source: str = ""

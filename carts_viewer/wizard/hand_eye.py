@@ -37,7 +37,7 @@ from carts_viewer.wizard.calibration import (
 )
 from carts_viewer.wizard.check import opened
 from carts_viewer.wizard.draft import Draft
-from carts_viewer.wizard.points import Clicking, Wish, unknown_cameras
+from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
 _GOOD, _WRONG, _EDGE = (250, 204, 21, 255), (239, 68, 68, 255), (0, 0, 0, 255)
 _OPACITY = 0.9
@@ -100,7 +100,7 @@ def _cross(picture: Rgba, point: ImagePoint, color: tuple[int, int, int, int]) -
 def hand_eye_panel(
     draft: Draft,
     clicking: Clicking,
-    wish: Wish | None,
+    prompt: ClickPrompt | None,
     progress: Progress | None,
     problem: str,
     folder: str,
@@ -111,7 +111,7 @@ def hand_eye_panel(
     Args:
         draft: with its points and its calibration.
         clicking: what is asked for, and what follows from the points.
-        wish: what is to be clicked now.
+        prompt: what is to be clicked now.
         progress: of a calibration that runs or has just ended.
         problem: what went wrong last; empty if nothing did.
         folder: where the sequence would be saved.
@@ -127,7 +127,7 @@ def hand_eye_panel(
     if running:
         assert progress is not None
         return head + _running(progress)
-    asked = _asked(clicking, wish, draft.points)
+    asked = _asked(clicking, prompt, draft.points)
     parts = [_calibration(draft, clicking), asked, _known(draft, clicking), _refine(draft, clicking, progress)]
     return head + "".join(parts) + _save(draft, clicking, folder)
 
@@ -186,26 +186,27 @@ def _residuals(draft: Draft, clicking: Clicking) -> str:
     )
 
 
-def _asked(clicking: Clicking, wish: Wish | None, points: Rows[ImagePoint]) -> str:
+def _asked(clicking: Clicking, prompt: ClickPrompt | None, points: Rows[ImagePoint]) -> str:
     """What to click now; nothing once there is enough."""
-    if wish is None:
-        return "<h2>Points</h2><p>All points are there. More can be chosen below.</p>" + _other(clicking, wish)
-    arms = f"{wish.arm}: " if len(clicking.sequence.scene.arms) > 1 else ""
+    if prompt is None:
+        return "<h2>Points</h2><p>All points are there. More can be chosen below.</p>" + _other(clicking, prompt)
+    arms = f"{prompt.arm}: " if len(clicking.sequence.scene.arms) > 1 else ""
     done = len({(p.camera, p.frame, p.arm, p.landmark) for p in points})
-    frame = clicking.sequence.frame_ids[wish.frame]
+    frame = clicking.sequence.frame_ids[prompt.frame]
     return (
-        f"<h2>Click the {escaped(arms + wish.landmark)}</h2><p>{escaped(clicking.hint(wish.arm, wish.landmark))}</p>"
-        f'<p class="quiet-text">Camera {escaped(wish.camera)}, frame {escaped(frame)} · '
+        f"<h2>Click the {escaped(arms + prompt.landmark)}</h2>"
+        f"<p>{escaped(clicking.hint(prompt.arm, prompt.landmark))}</p>"
+        f'<p class="quiet-text">Camera {escaped(prompt.camera)}, frame {escaped(frame)} · '
         f"{counted(done, 'point')} so far, {len(clicking.plan)} are good. Zoom with the wheel.</p>"
         f'<div class="bar">{button("skip", "Not visible")}{button("skip-frame", "Other frame")}</div>'
-        f"{_other(clicking, wish)}"
+        f"{_other(clicking, prompt)}"
     )
 
 
-def _other(clicking: Clicking, wish: Wish | None) -> str:
+def _other(clicking: Clicking, prompt: ClickPrompt | None) -> str:
     """Any camera, frame and landmark."""
     scene, sequence = clicking.sequence.scene, clicking.sequence
-    at = wish or clicking.plan[-1]
+    at = prompt or clicking.plan[-1]
     cameras = {camera.name: camera.name for camera in scene.cameras}
     arms = {arm.name: arm.name for arm in scene.arms}
     frames = {str(index): name for index, name in enumerate(sequence.frame_ids[:2000])}
@@ -313,7 +314,7 @@ class HandEyeStep:
     """The recording opened, with what was clicked in it.
 
     Attributes:
-        problem: what went wrong last, for people; empty if nothing did.
+        problem: what went wrong last; empty without one.
     """
 
     def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Report) -> None:
@@ -332,8 +333,8 @@ class HandEyeStep:
         self._sequence, self._folder = opened(recording)
         self._clicking = Clicking(self._sequence, focal_length=draft.focal_length)
         self._solved: tuple[object, ...] | None = None
-        self._skipped: frozenset[Wish] = frozenset()
-        self._wanted: Wish | None = None
+        self._skipped: frozenset[ClickPrompt] = frozenset()
+        self._wanted: ClickPrompt | None = None
         self._job: CalibrationJob | None = None
         self._progress: Progress | None = None
         panel = host.page.server.gui.main_panel
@@ -352,24 +353,26 @@ class HandEyeStep:
     def show(self, draft: Draft, *, undoable: bool) -> None:
         """Bring picture and panel up to date."""
         self._solve(draft)
-        wish = self.wish(draft)
-        at = wish or (self._clicking.plan[0] if not draft.points else _wish_of(draft.points[-1]))
+        prompt = self.prompt(draft)
+        at = prompt or (self._clicking.plan[0] if not draft.points else _prompt_of(draft.points[-1]))
         wrong = frozenset(() if self._clicking.result is None else self._clicking.result.contradicting)
         self._picture.show(at.frame, at.camera, self.shown_scene(draft), draft.points, wrong)
         folder = self._target(draft)
-        content = hand_eye_panel(draft, self._clicking, wish, self._progress, self.problem, folder, undoable)
+        content = hand_eye_panel(draft, self._clicking, prompt, self._progress, self.problem, folder, undoable)
         self._host.document.show(content, "side")
 
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
         """The draft with what was asked for at this place; a click where nothing is asked for changes nothing."""
-        wish, self.problem = self.wish(draft), ""
-        if wish is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
+        prompt, self.problem = self.prompt(draft), ""
+        if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
             return draft
-        camera = self._sequence.scene.camera(wish.camera)
-        point = ImagePoint(wish.frame, wish.camera, wish.arm, wish.landmark, (u * camera.width, v * camera.height))
-        if self._wanted == wish:
+        camera = self._sequence.scene.camera(prompt.camera)
+        point = ImagePoint(
+            prompt.frame, prompt.camera, prompt.arm, prompt.landmark, (u * camera.width, v * camera.height)
+        )
+        if self._wanted == prompt:
             self._wanted = None
-        kept = tuple(each for each in draft.points if _wish_of(each) != wish)
+        kept = tuple(each for each in draft.points if _prompt_of(each) != prompt)
         self._progress = None
         return draft.uncalibrated(points=(*kept, point))
 
@@ -381,19 +384,19 @@ class HandEyeStep:
         """
         self.problem = ""
         kind, _, which = name.partition(" ")
-        wish = self.wish(draft)
+        prompt = self.prompt(draft)
         if name == "cancel" and self._job is not None:
             self._job.cancel()
             if self._running():
                 self._progress = Progress("Stopping …", 1.0)
         if self._running():
             return draft
-        if name == "skip" and wish is not None:
-            self._skip({wish})
-        elif name == "skip-frame" and wish is not None:
-            self._skip_frame(draft, wish)
+        if name == "skip" and prompt is not None:
+            self._skip({prompt})
+        elif name == "skip-frame" and prompt is not None:
+            self._skip_frame(draft, prompt)
         elif kind == "look":
-            self._look(wish or self._clicking.plan[-1], which, value)
+            self._look(prompt or self._clicking.plan[-1], which, value)
         elif name == "calibrate":
             self._calibrate()
         else:
@@ -412,7 +415,7 @@ class HandEyeStep:
             draft = draft.uncalibrated()
         elif name == "remove-point" and value.isdecimal() and int(value) < len(draft.points):
             row = int(value)
-            self._wanted = _wish_of(draft.points[row])
+            self._wanted = _prompt_of(draft.points[row])
             draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
 
@@ -443,27 +446,27 @@ class HandEyeStep:
             self._clicking.solve(draft.points)
             self._solved = wanted
 
-    def wish(self, draft: Draft) -> Wish | None:
+    def prompt(self, draft: Draft) -> ClickPrompt | None:
         """What is to be clicked now; None if nothing is."""
-        return self._wanted or self._clicking.next_wish(draft.points, self._skipped)
+        return self._wanted or self._clicking.next_prompt(draft.points, self._skipped)
 
-    def _skip(self, wishes: set[Wish]) -> None:
-        self._skipped |= wishes
+    def _skip(self, prompts: set[ClickPrompt]) -> None:
+        self._skipped |= prompts
         self._wanted = None
 
-    def _skip_frame(self, draft: Draft, wish: Wish) -> None:
+    def _skip_frame(self, draft: Draft, prompt: ClickPrompt) -> None:
         """Ask for the same in a frame that nothing is asked about yet, next to this one."""
         used = {(entry.camera, entry.frame) for entry in self._clicking.plan}
         used |= {(point.camera, point.frame) for point in draft.points}
         frames = range(len(self._sequence))
-        free = [frame for frame in frames if (wish.camera, frame) not in used]
+        free = [frame for frame in frames if (prompt.camera, frame) not in used]
         if not free:
             raise SettingsError("there is no other frame. Use the list below, or leave out what is not visible.")
-        other = min(free, key=lambda frame: abs(frame - wish.frame))
-        self._clicking.move_frame(wish.camera, wish.frame, other)
+        other = min(free, key=lambda frame: abs(frame - prompt.frame))
+        self._clicking.move_frame(prompt.camera, prompt.frame, other)
         self._wanted = None
 
-    def _look(self, at: Wish, which: str, value: str) -> None:
+    def _look(self, at: ClickPrompt, which: str, value: str) -> None:
         """Ask for what a person has chosen."""
         names = {
             "camera": [camera.name for camera in self._sequence.scene.cameras],
@@ -472,9 +475,9 @@ class HandEyeStep:
             "landmark": self._clicking.names(at.arm),
         }
         if value in names.get(which, ()):
-            wish = replace(at, **{which: int(value) if which == "frame" else value})
-            known = self._clicking.names(wish.arm)
-            self._wanted = wish if wish.landmark in known else replace(wish, landmark=known[0])
+            prompt = replace(at, **{which: int(value) if which == "frame" else value})
+            known = self._clicking.names(prompt.arm)
+            self._wanted = prompt if prompt.landmark in known else replace(prompt, landmark=known[0])
 
     def _running(self) -> bool:
         return self._progress is not None and not self._progress.ended
@@ -531,5 +534,5 @@ class HandEyeStep:
             return str(error)
 
 
-def _wish_of(point: ImagePoint) -> Wish:
-    return Wish(point.camera, point.frame, point.arm, point.landmark)
+def _prompt_of(point: ImagePoint) -> ClickPrompt:
+    return ClickPrompt(point.camera, point.frame, point.arm, point.landmark)

@@ -18,8 +18,8 @@ _FURTHER_FRAMES = 2
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What a person is asked to click."""
+class ClickPrompt:
+    """A landmark to click, in a frame of a camera."""
 
     camera: str
     frame: int
@@ -28,13 +28,13 @@ class Wish:
 
 
 class Clicking:
-    """Which points there are, which are wanted next, and what follows from them.
+    """The planned points, the next one to click, and the calibration computed from the clicked ones.
 
     Attributes:
         sequence: the recording, with base frames that mean nothing.
-        plan: all that is asked for, in order.
-        result: where the arms are according to the points; None while there are too few.
-        problem: why there is no result, for people; empty if there is.
+        plan: all prompts, in order.
+        result: calibration from the points; None while there are too few.
+        problem: why there is no result; empty if there is.
     """
 
     def __init__(self, sequence: Sequence, *, focal_length: bool = False) -> None:
@@ -53,19 +53,20 @@ class Clicking:
         """Solve for focal lengths, too, or not; takes effect with the next `solve`."""
         self._settings = replace(self._settings, focal_length=free)
 
-    def next_wish(self, points: Rows[ImagePoint], skipped: frozenset[Wish]) -> Wish | None:
-        """The first that is neither clicked nor skipped; None when there is no more."""
-        done = {Wish(point.camera, point.frame, point.arm, point.landmark) for point in points} | skipped
-        return next((wish for wish in self.plan if wish not in done), None)
+    def next_prompt(self, points: Rows[ImagePoint], skipped: frozenset[ClickPrompt]) -> ClickPrompt | None:
+        """The first prompt that is neither clicked nor skipped; None without one."""
+        done = {ClickPrompt(point.camera, point.frame, point.arm, point.landmark) for point in points} | skipped
+        return next((prompt for prompt in self.plan if prompt not in done), None)
 
     def move_frame(self, camera: str, frame: int, other: int) -> None:
-        """Ask in another frame for what was to be asked for in this one."""
+        """Move the prompts of a frame to another frame."""
         self.plan = tuple(
-            replace(wish, frame=other) if (wish.camera, wish.frame) == (camera, frame) else wish for wish in self.plan
+            replace(prompt, frame=other) if (prompt.camera, prompt.frame) == (camera, frame) else prompt
+            for prompt in self.plan
         )
 
     def solve(self, points: Rows[ImagePoint]) -> None:
-        """Find the calibration that the points show."""
+        """Compute the calibration from the points."""
         self.result, self.problem = None, ""
         try:
             self.result = solve_hand_eye(self.sequence.scene, self.sequence.measured, points, self._settings)
@@ -89,22 +90,24 @@ def unknown_cameras(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def _plan(sequence: Sequence) -> tuple[Wish, ...]:
-    """For each camera some frames in which the arms are far from where they are in the others."""
+def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
+    """Prompts in frames with arm positions far from each other."""
     scene = sequence.scene
     arms = [arm for arm in scene.arms if len(sequence.measured[arm.name])]
     tips = np.concatenate([link_transforms(arm, sequence.measured[arm.name])[:, -1, :3, 3] for arm in arms], axis=-1)
     frames = spread_out(tips, _FRAMES)
     unknown = unknown_cameras(scene)
-    wishes = []
+    prompts = []
     for number, camera in enumerate(scene.cameras):
         if number and camera.name not in unknown:
-            # The first camera says all that there is to know of a calibrated pair.
+            # The first camera suffices for a calibrated pair.
             continue
         chosen = frames if number == 0 else [frames[row] for row in (0, -1)][:_FURTHER_FRAMES]
         for frame in dict.fromkeys(chosen):
-            wishes += [Wish(camera.name, frame, arm.name, name) for arm in arms for name in _asked(scene, arm.name)]
-    return tuple(wishes)
+            prompts += [
+                ClickPrompt(camera.name, frame, arm.name, name) for arm in arms for name in _asked(scene, arm.name)
+            ]
+    return tuple(prompts)
 
 
 def _asked(scene: Scene, arm: str) -> list[str]:

@@ -15,7 +15,7 @@ from carts_viewer.transport.document import alert, button, escaped
 from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
-from carts_viewer.wizard.points import Wish
+from carts_viewer.wizard.points import ClickPrompt
 
 _SOURCES = (*SUFFIXES, ".bag", ".mcap", ".parquet")
 _TABLES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
@@ -53,13 +53,13 @@ class RecordingPlace:
 
     @property
     def draft(self) -> Draft:
-        """What a person has said so far."""
+        """The draft: all choices so far."""
         return self._draft
 
     @property
-    def wish(self) -> Wish | None:
+    def prompt(self) -> ClickPrompt | None:
         """What is to be clicked now; None if nothing is."""
-        return None if self._step is None else self._step.wish(self._draft)
+        return None if self._step is None else self._step.prompt(self._draft)
 
     @property
     def shown_scene(self) -> Scene | None:
@@ -67,7 +67,7 @@ class RecordingPlace:
         return None if self._step is None else self._step.shown_scene(self._draft)
 
     def show(self) -> None:
-        """Bring the document up to date."""
+        """Update the document."""
         if self._draft.step is Step.HAND_EYE and self._enter_hand_eye():
             assert self._step is not None
             try:
@@ -80,7 +80,7 @@ class RecordingPlace:
         self._host.document.show(self._browsing() if self._browser is not None else self._checking())
 
     def choose(self, name: str, value: str) -> None:
-        """Do what somebody has chosen."""
+        """Carry out a choice."""
         self._problem = ""
         actions: dict[str, Callable[[], None]] = {
             "leave": self._host.show_start,

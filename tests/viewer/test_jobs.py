@@ -14,6 +14,7 @@ from viewer_tab import Tab
 
 from carts_core.errors import CartsError
 from carts_core.project import ReviewState, Source
+from carts_core.project.identity import data_dir
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.companions import Decisions
@@ -208,7 +209,7 @@ def test_only_jobs_that_have_ended_are_forgotten_however_many_wait(tmp_path: Pat
     assert kept[:3] == [2, 4, 6] and len([n for n in kept if n % 2 == 0]) == 60
     assert [job.number for job in jobs.jobs if job.over][-1] == 119 and len([n for n in kept if n % 2]) == 50
     # Nothing is remembered of jobs that are not in the list any more.
-    assert len(list((tmp_path / "data" / "decisions").iterdir())) == len(kept)
+    assert len(list((data_dir() / "decisions").iterdir())) == len(kept)
 
 
 def test_a_line_says_how_far_a_job_is_and_how_long_it_will_take() -> None:

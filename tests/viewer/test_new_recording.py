@@ -29,6 +29,7 @@ from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationOptimizer, ImagePredictor
+from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_viewer.start.site import Site
@@ -65,12 +66,14 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
     """Click each landmark where a calibration says that it is, until no more is asked for."""
     for number in range(60):
         place = place_of(visitor)
-        wish = place.wish
-        if wish is None:
+        prompt = place.prompt
+        if prompt is None:
             return
-        camera = scene.camera(wish.camera)
-        points = clicked(scene, measured, [wish.frame], [wish.camera], noise=noise, seed=number, names=(wish.landmark,))
-        point = next(point for point in points if point.arm == wish.arm)
+        camera = scene.camera(prompt.camera)
+        points = clicked(
+            scene, measured, [prompt.frame], [prompt.camera], noise=noise, seed=number, names=(prompt.landmark,)
+        )
+        point = next(point for point in points if point.arm == prompt.arm)
         before = len(place.draft.points)
         visitor.point_at(point.pixel, (camera.width, camera.height))
         eventually(lambda: len(place_of(visitor).draft.points), lambda count, before=before: count == before + 1)
@@ -134,7 +137,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     assert "points clicked in carts view" in text and "no base frame" not in text
     visitor.page.get_by_role("button", name="All recordings", exact=True).click()
     visitor.reads("0 of 8 frames reviewed")
-    assert not (tmp_path / "data" / "drafts").exists() or not list((tmp_path / "data" / "drafts").glob("*.json"))
+    assert not (data_dir() / "drafts").exists() or not list((data_dir() / "drafts").glob("*.json"))
 
 
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:

@@ -9,6 +9,7 @@ import pytest
 from carts_core.errors import SettingsError
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
+from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.settings.interchange import ImportOptions
 from carts_viewer.actions import intents
@@ -175,7 +176,7 @@ def test_only_a_listed_recent_sequence_is_opened_by_its_card(site: Site, tiny_se
 
 
 def test_a_damaged_list_of_recent_sequences_is_an_empty_one(tmp_path: Path) -> None:
-    folder = tmp_path / "data" / "recent"
+    folder = data_dir() / "recent"
     folder.mkdir(parents=True)
     for text in ("", "[1, 2]", '{"a": 1}', '[{"sequence": 3}]', "[" * 100_000, '[{"sequence": "a", "name": 1}]'):
         (folder / "recent.json").write_text(text)
@@ -199,10 +200,10 @@ def test_drafts_are_listed_newest_first_and_damaged_ones_can_be_deleted(tmp_path
     first, second = DraftFile(), DraftFile()
     first.write(Draft(source="/a/first"))
     second.write(Draft(source="/a/second", name="named"))
-    os.utime(Path(os.environ["CARTS_DATA"]) / "drafts" / f"{first.key}.json", (1, 1))
+    os.utime(data_dir() / "drafts" / f"{first.key}.json", (1, 1))
     assert [draft.name for draft in drafts()] == ["named", "first"]
     assert DraftFile(second.key).read().name == "named"
-    (tmp_path / "data" / "drafts" / "bad.json").write_text("{")
+    (data_dir() / "drafts" / "bad.json").write_text("{")
     assert "a damaged import" in {draft.name for draft in drafts()}
     with pytest.raises(SettingsError, match="cannot be gone on with"):
         DraftFile("bad").read()
